@@ -30,7 +30,7 @@ def chain(weight: Float[Array | np.ndarray, "times *rest"], ts: Float[Array | np
     """Return for each sample of a channel the time index of its last present predecessor (itself if there is
     none), and the time between, s.
 
-    That time is infinite where there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
+    That time is infinite if there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
     """
     index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
     last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)
@@ -64,7 +64,9 @@ class Chains:
     def of(
         weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], unknown: list[slice]
     ) -> "Chains":
-        """The chains of samples with weights (runs, members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
+        """Return the chains of samples with weights (runs, members, times, *channel), times (runs, times) and
+        correlation times (runs,) of some channels.
+        """
         parts, known, (runs, times) = [], [], ts.shape
         for name, where in channels.items():
             count = (where.stop - where.start) // times
@@ -99,7 +101,9 @@ def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns
 
 
 def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where f, of each member, is lowest between a and b, by golden section: the interval shrinks to 7e-5."""
+    """Return where f, of each member, is lowest between a and b, by golden section: the interval shrinks to
+    7e-5.
+    """
     golden = (np.sqrt(5) - 1) / 2
     inner = [b - golden * (b - a), a + golden * (b - a)]
     values = [f(x) for x in inner]

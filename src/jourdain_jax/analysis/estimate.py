@@ -68,7 +68,7 @@ class Range:
         return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
 
     def constrain(self, x: Numbers) -> Numbers:
-        """The unknown, in its unit, that a real number stands for."""
+        """Return the unknown, in its unit, that a real number stands for."""
         if self.kind in ("positive", "unbounded"):
             return jnp.exp(x) if self.kind == "positive" else x
         inside = self.low + (self.high - self.low) * jax.nn.sigmoid(x)
@@ -81,7 +81,7 @@ class Range:
         return x if self.kind == "positive" else jnp.zeros_like(x)
 
     def unconstrain(self, theta: Numbers) -> Numbers:
-        """The inverse of `constrain`; infinite at a bound, NaN beyond it."""
+        """Return the inverse of `constrain`; infinite at a bound, NaN beyond it."""
         if self.kind not in ("bounds", "memory"):
             return jnp.log(theta) if self.kind == "positive" else theta
         inside = jnp.arcsin(jnp.exp(-self.interval / theta)) if self.kind == "memory" else theta
@@ -89,7 +89,7 @@ class Range:
         return jnp.log(share) - jnp.log1p(-share)
 
     def refusal(self, guess: np.ndarray) -> str:
-        """Why a first guess cannot be taken; empty where it can."""
+        """Return why a first guess cannot be taken; empty where it can."""
         if np.all((self.low < guess) & (guess < self.high)):
             return ""
         if self.kind == "positive":
@@ -200,7 +200,7 @@ class Estimate:
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg
 
-    - `guess`: where the fit begins, in the unit of the number. It may be left out where the number has a value already: a parameter, a start value.
+    - `guess`: where the fit begins, in the unit of the number. It may be omitted where the number has a value already: a parameter, a start value.
     - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; by default what suits the number.
     - `per_run`: whether each run has one of its own; otherwise all runs share it. Start values are each run's own, parameters are shared.
     - `prior`: what is known beforehand, as `Normal(mean, sigma)`; it counts as one measured value.

@@ -44,8 +44,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[str, ...]:
-    """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts, or not the one that was observed, or crosses
-    a jump of its loads.
+    """Return one sentence for each run whose motion, with these unknowns, meets an event before a sample that
+    counts, or not the one that was observed, or crosses a jump of its loads.
     """
     shared, local = problem.unknowns.split(theta)
     found, layout, options = [], problem.unknowns.layout, problem.asked.options
@@ -103,7 +103,7 @@ class Statistics:
     samples: Counts  # with a finite sigma
     degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
     of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
-    from_prior: PerUnknown  # in standard deviations of the prior; zero where there is none
+    from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs
     events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
@@ -163,7 +163,7 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
 
 
 def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
-    """How many unknowns the samples determined: rank - tr(C P)."""
+    """Return how many unknowns the samples determined: rank - tr(C P)."""
     p, weight = len(unknowns.whitening), unknowns.prior_weight
     rows = unknowns.whitening * weight[:p]
     of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
@@ -201,7 +201,7 @@ class ChannelResiduals(Printed, eqx.Module):
 
     @staticmethod
     def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
-        """The summary of the residuals `r` of a channel, NaN where a sample is missing."""
+        """Return the summary of the residuals `r` of a channel, NaN where a sample is missing."""
         r = r[~np.isnan(r)]
         numbers = (r.mean(), np.sqrt((r**2).mean()), largest(r)) if r.size else (np.nan,) * 3
         return ChannelResiduals(run, name, r.size, *map(float, numbers))
@@ -223,8 +223,8 @@ GONE = {
 class Estimates(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum is worked out when it is first asked
-    for; each part of it can be asked for here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum is computed when it is first asked
+    for; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
     `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
     """
 
@@ -342,7 +342,8 @@ class Estimates(Printed):
         return tuple(ChannelResiduals.of(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
     def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
-        """A number, or an array of them, that follows from the parameters, with its standard error and 95 % interval.
+        """Return a number, or an array of them, that follows from the parameters, with its standard error and
+        95 % interval.
 
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 

@@ -184,7 +184,8 @@ def _check_times(ts) -> None:
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
-    """The run with its inputs and sensors made ready, after its channels and shapes were compared with the scene.
+    """Return the run with its inputs and sensors made ready, after its channels and shapes were compared with
+    the scene.
 
     `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, for wrong shapes, and for samples that may show
     what was before the start.
@@ -298,7 +299,7 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
 
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
-    """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
+    """Return the shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
     both = scene.coordinate_names, scene.speed_names
     entries = both[0].entries + both[1].entries
     if name in entries:

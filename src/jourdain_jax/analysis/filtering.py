@@ -61,7 +61,7 @@ def filtered_log_likelihood(
     others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
 
     Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion), under
-    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is no number.
+    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is not a number.
 
     **Raises** ValueError for names that are no independent speed, intensities below zero, quaternions, sensors with a delay or lag, accelerometers, noise with
     a correlation time, and numbers that are not known.
@@ -102,7 +102,7 @@ class _Filter:
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
     def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Scalar:
-        """The log-likelihood of all samples; `sigma`: standard deviations of start values."""
+        """Return the log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)
         P = jnp.zeros((x.size, x.size))
@@ -134,7 +134,9 @@ class _Filter:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
 
     def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
-        """The state with these independent coordinates and speeds; the others follow, the coordinates near q."""
+        """Return the state with these independent coordinates and speeds; the others follow, the coordinates
+        near q.
+        """
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
         u = jnp.zeros(len(self.scene.speed_names)).at[self.speeds].set(x[count:])

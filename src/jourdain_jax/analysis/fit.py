@@ -49,7 +49,8 @@ class FitFields(OptionFields, total=False):
 
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
-    """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
+    """Return the minimum from each `theta`; where none is found, or residuals are far beyond their sigmas,
+    the lower one of it and that over growing spans.
 
     Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
     a short span does not tell stays near the first guess. What is far off, and comes no nearer, gives way to growing spans, and goes on only where these do not
@@ -272,7 +273,7 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
-    """Which repeats have as many measured values as unknowns; ValueError where none has."""
+    """Return which repeats have as many measured values as unknowns; ValueError where none has."""
     known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
     each, sigmas = sum(counts) + np.count_nonzero(unknowns.prior_weight), len({name for run in runs for name in run.unknown_sigma})

@@ -111,7 +111,9 @@ Predictions = Sequence[dict[str, Prediction]]  # by run and channel
 def fit_page(
     fit: Estimates, fitted: Predictions, shares: Informed | None, held_out: Predictions, profiles: Mapping[str, Profile], units: Mapping[str, str]
 ) -> str:
-    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions, `units`: of channels."""
+    """Return the page of a `Fit` of one experiment; `fitted` and `held_out`: predictions, `units`: of
+    channels.
+    """
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]
     if profiles:
         about = (

@@ -22,9 +22,9 @@ from jourdain_jax.scene.names import as_names
 
 
 def warnings_of(fit: Estimates) -> tuple[str, ...]:
-    """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
+    """Return warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
-        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is no number any more
+        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is not a number any more
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
         return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.events_met)
     return (*_of_the_minimum(fit), *fit.impossible, *fit.events_met, *fit.oddities, *fit.too_narrow, *_of_the_data(fit), *_of_residuals(fit))
@@ -103,7 +103,7 @@ class _Size(NamedTuple):
     """The mean square of the residuals of some channels, in sigmas."""
 
     channels: list[str]
-    named: str  # as a sentence goes on; empty where these are all channels
+    named: str  # as a sentence continues; empty where these are all channels
     least: float  # where they determined no unknown that others may have determined
     narrow: float  # standard deviation of that, of normal residuals
     most: float  # where they determined all of them
@@ -189,7 +189,7 @@ def _row(name: str, e, remark: str) -> tuple[str, ...]:
 
 
 def batch_text(fit: Estimates) -> str:
-    """The text of many fits: mean and spread of the estimates that converged."""
+    """Return the text of many fits: mean and spread of the estimates that converged."""
     good = np.asarray(fit.converged)
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
     for name, e in fit.estimates.items():

@@ -162,7 +162,8 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
 
 
 def hidden_combinations(directions, least_part, size, values, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Each direction that does not show, in words. `directions`: rows, changes of theta / size, orthonormal; parts below `least_part` are none.
+    """Return each direction that does not show, in words. `directions`: rows, changes of theta / size,
+    orthonormal; parts below `least_part` are none.
 
     A basis is chosen in which each direction has one unknown of its own (row-reduced form), told in relative changes
     `d theta / theta` where the unknown is not zero.
@@ -257,7 +258,7 @@ def standard_errors(
 def weak_combinations(
     covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
+    """Return the directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
 
     They are those of the unknowns that runs share, where there are any.
     """
@@ -273,7 +274,7 @@ def weak_combinations(
         if spread < 0.1:
             break
         change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
-        # of the largest entry of a direction: what is less is left out
+        # of the largest entry of a direction: what is less is omitted
         parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * largest(directions[:, k]))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
         *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]

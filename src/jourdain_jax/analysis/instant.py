@@ -2,7 +2,7 @@
 
     v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: parameters that vary, where some do
 
-The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are asked for; others are zero. It follows from t, q and the
+The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are requested; others are zero. It follows from t, q and the
 independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
 """
 
@@ -58,7 +58,7 @@ class Places(NamedTuple):
 
 
 def places_of(scene: Scene) -> Places:
-    """The places for a scene."""
+    """Return the places for a scene."""
     n, m, geometric = len(scene.coordinate_names.entries), len(scene.speed_names.entries), len(names_of_position_rows(scene))
     of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
     return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
@@ -137,7 +137,7 @@ class ByProgram:
 
 
 def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
-    """All numbers in a row: parameters, t, q, u, inputs."""
+    """Return all numbers in a row: parameters, t, q, u, inputs."""
     xp = array_module((scene, t, q, u, f))
     parts = [*jax.tree.leaves(scene), t, q, u, f]
     return xp.concatenate([xp.ravel(xp.asarray(x, real_type())) for x in parts])
@@ -171,7 +171,9 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
-    """How a scene's instants are computed, where these speeds are to be constant or independent; `masses`: whether their mass matrix is needed."""
+    """Return how a scene's instants are computed, where these speeds are to be constant or independent;
+    `masses`: whether their mass matrix is needed.
+    """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
     try:
@@ -183,7 +185,9 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Names of the coordinates without influence on accelerations; for a quaternion, names of its parts."""
+    """Return names of the coordinates without influence on accelerations; for a quaternion, names of its
+    parts.
+    """
     return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
 
 
@@ -193,11 +197,13 @@ def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
     return {entry for name in names for entry in groups.get(name, (name,))}
 
 
-by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` where there is none
+by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` if there is none
 
 
 def on_rows(scene: Scene) -> np.ndarray:
-    """Which coordinates geometric rows and unit norms depend on, at some probed state: others may stand in their graph, and cancel."""
+    """Return which coordinates geometric rows and unit norms depend on, at some probed state: others may
+    stand in their graph, and cancel.
+    """
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
 
@@ -231,5 +237,5 @@ def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int])
 
 
 def is_made(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Whether machine code of the nodes is made."""
+    """Return whether machine code of the nodes is made."""
     return not ffi.reason_against() and not unsupported(graph, nodes)

@@ -5,7 +5,7 @@ it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanish
 
 Rows together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1, D_k]` grow to
 a last dimension; the motion stays on a manifold of that dimension. Time counts as one more coordinate with the field `(1, X_0)`
-where the rows or rates depend on time or are not homogeneous; its dimension is left out of the growth vector.
+where the rows or rates depend on time or are not homogeneous; its dimension is omitted from the growth vector.
 
 `[X, Y] = DY X - DX Y` along the fields. A bracket of brackets needs the derivative of such a derivative: taken by eighth-order central differences
 (to about 1e-11), because every further derivative doubles what is evaluated.
@@ -50,7 +50,8 @@ class RowsOverStates:
         self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
-        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives as a function of directions.
+        """Return values at the points, taken at the speeds u (which matter where rows are nonlinear in them),
+        and derivatives as a function of directions.
 
         `x`, `u` and what that function takes have a leading axis of points.
         """
@@ -67,7 +68,7 @@ class RowsOverStates:
         return self._arranged(value, u, 1.0), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
-        """The rows and the frame in values with a last axis of points; `time`: its rate."""
+        """Return the rows and the frame in values with a last axis of points; `time`: its rate."""
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
         if self.places:
@@ -83,7 +84,7 @@ STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit direc
 
 
 def integrable_below() -> float:
-    """The violation of Frobenius' criterion below which a row counts as integrable."""
+    """Return the violation of Frobenius' criterion below which a row counts as integrable."""
     return 1e-9 if real_type() == jnp.float64 else 1e-4
 
 
@@ -141,7 +142,7 @@ def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def reachable(scene: Scene) -> int:
-    """The number of coordinates less the unit norms, which hold by themselves."""
+    """Return the number of coordinates less the unit norms, which hold by themselves."""
     return len(scene.coordinate_names) - len(scene.coordinates.quaternions)
 
 
@@ -213,7 +214,7 @@ def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Call
 
 
 def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
+    """Return derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     step = STEP[x.dtype.name]
     steps = step * np.array([1, 2, 3, 4, -1, -2, -3, -4], x.dtype)
@@ -234,7 +235,7 @@ class _Fields:
         self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Values at many points, and derivatives as a function of one direction for each."""
+        """Return values at many points, and derivatives as a function of one direction for each."""
         first = 1 - self.with_time
         padded = lambda a: np.pad(a, ((0, 0), (first, 0)))  # noqa: E731
         (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))

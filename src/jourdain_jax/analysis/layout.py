@@ -104,7 +104,7 @@ class BodyInertia:
         return D[np.array([self.axes.index(k) for k in range(max(self.axes) + 1)])], jnp.stack(l) if l else jnp.zeros(0, D.dtype)
 
     def values(self, D: Float[Array | np.ndarray, "*members moments"], l: Float[Array | np.ndarray, "*members shears"]) -> list[Float[Array, "*members"]]:
-        """The parameter of every entry."""
+        """Return the parameter of every entry."""
 
         def inertia(D, l):
             L = jnp.eye(3, dtype=D.dtype)
@@ -154,7 +154,7 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
 
 
 def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
-    """Entries of the diagonal, and of the products 12, 23, 13."""
+    """Return entries of the diagonal, and of the products 12, 23, 13."""
     known = {of: placed.body for of, placed in pose_at(scene, 0.0, scene.named()[0]).bodies.items()}
     what = f"`free` asks for a possible inertia of `{name}`, which is not a body of `{type(scene).__name__}`"
     check_name(name, known, what)
@@ -209,12 +209,14 @@ class Tie:
     function: Call
 
     def value(self, leaves: list) -> Array:
-        """The parameter of a scene with these leaves."""
+        """Return the parameter of a scene with these leaves."""
         return self.function.results(*leaves)[0]
 
 
 def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
-    """A parameter as a function of the scene, which has the first guesses. ValueError where the function gives no value that the parameter may have."""
+    """Return a parameter as a function of the scene, which has the first guesses. ValueError where the
+    function gives no value that the parameter may have.
+    """
     leaves, treedef = jax.tree.flatten(scene)
     expected = jnp.shape(getattr(scene, name))
 
@@ -287,7 +289,7 @@ class Layout:
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
 
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
-        """The scene with these shared unknowns."""
+        """Return the scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
         found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))  # which leaf each parameter is
         for place in self.shared:
@@ -317,7 +319,7 @@ class Layout:
         return any(place.kind == "sensor" for place in (*self.shared, *self.local))
 
     def known(self, *vectors) -> dict[str, Array | np.ndarray]:
-        """Numbers of sensors and actuators by name, of one run."""
+        """Return numbers of sensors and actuators by name, of one run."""
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:

@@ -100,7 +100,7 @@ class Minimum(ByMember):
         return self if len(self.theta) == 1 else self.of([int(np.argmin(self.at.cost))])
 
     def agreeing(self, apart: float) -> int:
-        """How many members converged to a value at most so far `apart` from the lowest one."""
+        """Return how many members converged to a value at most so far `apart` from the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":
@@ -144,7 +144,7 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         trial, promised = evaluate(x + d, here), slope - 0.5 * change
         gained = fallen(way.at.cost[here], trial, d, slope, promised, control)
         better = np.isfinite(gained) & (gained > 1e-4 * promised)
-        # damping rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
+        # damping rises where steps overshoot: where residuals stay large, undamped ones go back and forth along what shows least
         by = np.where(gained > 0.9 * promised, 1 / fall[here], np.where(gained < 0.6 * promised, 3.0, 1.0))
         damping[here] = np.maximum(damping[here] * np.where(better, by, growth[here]), LEAST)
         # after a step that failed it falls slowly: in a curved valley every other step would fail; it grows twice as much after each further one
@@ -184,7 +184,7 @@ def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
 
 
 def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: float) -> np.ndarray:
-    """The damped step within the bounds."""
+    """Return the damped step within the bounds."""
     # an unknown whose bound is above zero shrinks to a tenth at most in one step: with far smaller masses and lengths, motions take long
     g, low = arrow.gradient, np.where(unknowns.low > 0, np.maximum(unknowns.low, 0.1 * theta), unknowns.low)
     held = unknowns.fixed | ((theta <= unknowns.low) & (g >= 0)) | ((theta >= unknowns.high) & (g <= 0))
@@ -201,6 +201,6 @@ def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: flo
 
 
 def is_small(change, size, d, control: Control) -> Flags:
-    """Which steps end a minimisation."""
+    """Return which steps end a minimisation."""
     small = change <= control.tolerance**2
     return small & (np.abs(d) <= control.tolerance * size).all(axis=1) if small.any() else small

@@ -8,7 +8,7 @@ What a run will tell before it is made: the Fisher information of a planned expe
 
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior,     cov(theta) >= F^-1 (Cramer and Rao)
 
-Unknown start values are among theta; log det F of those unknowns that are asked for is that of their block of F^-1, all others being estimated with them.
+Unknown start values are among theta; log det F of those unknowns that are requested is that of their block of F^-1, all others being estimated with them.
 Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
@@ -45,7 +45,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[str, ...]:
-    """One sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`: values have a leading axis, and the first one counts."""
+    """Return one sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`:
+    values have a leading axis, and the first one counts.
+    """
     found: list[str] = []
     for index, run in enumerate(runs):
         for name, signal in zip(scene.inputs, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
@@ -60,7 +62,8 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[s
 
 
 def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: float) -> Iterator[str]:
-    """Where samples of an input that changes leave a run at an end, and where some are missing from a log in between.
+    """Yield where samples of an input that changes leave a run at an end, and where some are missing from a
+    log in between.
 
     The last interval may be a jump, such as those of commands that are held; then the one before it counts.
     """
@@ -84,7 +87,9 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
 
 
 def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
-    """Where values lie in [-pi, pi] or [0, 2 pi], and neighbours are nearly one turn apart, but near each other without it."""
+    """Yield where values lie in [-pi, pi] or [0, 2 pi], and neighbours are nearly one turn apart, but near
+    each other without it.
+    """
     known, turn = np.isfinite(values), 2 * np.pi
     x, t = values[known], ts[known]
     if x.size < 2 or not any(low <= x.min() and x.max() <= low + turn for low in (-np.pi, 0.0)):
@@ -168,7 +173,7 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
 
 
 def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
-    """The logarithm of the density of the measurements of one run; -inf where its motion fails."""
+    """Return the logarithm of the density of the measurements of one run; -inf where its motion fails."""
     found = jnp.zeros(())
     for name, r in run.residuals(scene, simulate, options).items():
         weight = run.weights[name]
@@ -182,7 +187,9 @@ def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
 
 
 def mapped(f: Callable, runs: Run, *more: Array) -> Array:
-    """`f(run, *more)` of each of the stacked runs; a single one is not put into a batch, whose steps would run in wider registers, each a little later."""
+    """Return `f(run, *more)` for each of the stacked runs; a single one is not batched, since batches use
+    wider and slower registers.
+    """
     if runs.ts.shape[0] > 1:
         return eqx.filter_vmap(f)(runs, *more)
     return f(*jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, (runs, *more)))[None]
@@ -250,7 +257,7 @@ def _inverse(F: Matrix) -> Matrix:
 
 @compiled
 def _log_det(F: Matrix, places: tuple[int, ...]) -> Scalar:
-    """The logarithm of the determinant of this block of the inverse."""
+    """Return the logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 

@@ -116,7 +116,8 @@ class Linearization(Printed, eqx.Module):
         return Modes(values, shapes, left, condition, self.about[0], names)
 
     def sensitivities(self, mode: str, held: str | tuple[str, ...] = (), names: tuple[str, ...] | None = None) -> Sensitivities:
-        """Derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every parameter, as machine code: `small.sensitivities("weave")["c"]`.
+        """Return derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every
+        parameter, as machine code: `small.sensitivities("weave")["c"]`.
 
         The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep their values, as many as steady motions beside
         this one have freedoms; default: speeds in the scene's order, of a bicycle `x_rate`. `names`: as of `modes`. At a double root all is NaN, and `code`
@@ -128,7 +129,7 @@ class Linearization(Printed, eqx.Module):
         return sensitivities(self.about, mode, max(eigenvalues, key=lambda s: s.imag), held)
 
     def state_eigenvalues(self) -> Complex[Array, "states"]:
-        """Eigenvalues of A, 1/s, by ascending real part.
+        """Return eigenvalues of A, 1/s, by ascending real part.
 
         Ignorable coordinates, and speeds that a steady motion may have at will, add zeros, often in Jordan blocks: a root of
         round-off then stands in their place. `eigenvalues` is free of them.
@@ -160,7 +161,7 @@ def linearize(
         small.M, small.C, small.K, small.eigenvalues()
 
     **Arguments**
-    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and `residual` says so. They are
+    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and `residual` reports it. They are
       constant along a steady motion where only ignorable coordinates move: a disc's yaw and spin, but not the attitude of a spinning disc.
     - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A quaternion `attitude` has
       `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
@@ -292,7 +293,7 @@ def _largest_one(shapes: Complex[Array, "parts modes"]) -> Complex[Array, "parts
 
 @_compiled
 def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
-    """Eigenvalues by ascending real part."""
+    """Return eigenvalues by ascending real part."""
     values = jnp.linalg.eigvals(matrix)
     return values[jnp.lexsort((values.imag, values.real))]
 
@@ -306,7 +307,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
 
 
 def _speeds_beside(scene: Scene, y, coordinates: tuple[str, ...]) -> np.ndarray:
-    """Positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
+    """Return positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was
     own = [_own_rate(scene, name) for name in coordinates]

@@ -64,7 +64,7 @@ class LogDensity(eqx.Module):
     ranges: tuple[Range, ...] = eqx.field(static=True)  # of all unknowns
 
     def __call__(self, z: Point) -> Scalar:
-        """The logarithm of the density; -inf where the motion fails."""
+        """Return the logarithm of the density; -inf where the motion fails."""
         return _density(self, self._checked(z), Reference(self.scene, self.layout.parameters))
 
     def _at(self, z: Point, reference: Reference) -> Scalar:
@@ -116,7 +116,7 @@ class LogDensity(eqx.Module):
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
     def scene_at(self, z: Point) -> Scene:
-        """The scene with the parameters at z."""
+        """Return the scene with the parameters at z."""
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
     def whitened(self, fit: Fit) -> "LogDensity":
@@ -189,7 +189,7 @@ def log_density(
       and in arcsin rho, rho = exp(-h / tau), of a correlation time tau that is None, where h is the shortest interval between samples of its channel.
       A flat prior without bounds has no integral: where the data do not tell an unknown, neither has the posterior, and a sampler runs away.
 
-    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead to and fro. The logarithms of the transforms'
+    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead back and forth. The logarithms of the transforms'
     derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad`.
 
     **Raises** ValueError as `fit`.

@@ -200,7 +200,7 @@ class Piecewise(Problem):
             yield here, np.full(len(here), run), rows
 
     def _shape(self, run: int) -> tuple[int, int]:
-        """The shape of [J g r] of a run."""
+        """Return the shape of [J g r] of a run."""
         return max(where.stop for where in self.group_of[run].channels.values()), self.own + self.shared + 2
 
     def change(self, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
@@ -216,7 +216,7 @@ class Piecewise(Problem):
         return np.sqrt(squares)
 
     def _by_piece(self, theta: ByUnknown) -> Float[np.ndarray, "members pieces own_and_shared"]:
-        """The unknowns of the run that each piece belongs to, then the shared ones."""
+        """Return the unknowns of the run that each piece belongs to, then the shared ones."""
         shared, own = self.unknowns.split(theta)
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
@@ -237,7 +237,7 @@ class Piecewise(Problem):
         self.at = kept
 
     def closed(self, members: np.ndarray) -> Flags:
-        """Whether the pieces join, to the tolerance of the simulation."""
+        """Return whether the pieces join, to the tolerance of the simulation."""
         return self.continuity(members) <= 1.0
 
     def continuity(self, members: np.ndarray) -> PerMember:

@@ -45,7 +45,7 @@ class Loss:
     parameter: float
 
     def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
-        """Sum of rho over the last axis."""
+        """Return sum of rho over the last axis."""
         k = self.parameter
         if math.isinf(k):
             return 0.5 * np.einsum("...i,...i->...", r, r)
@@ -60,7 +60,7 @@ class Loss:
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Samples):
-        """Rows times the roots of their weights."""
+        """Return rows times the roots of their weights."""
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:

@@ -53,7 +53,7 @@ class Channel(eqx.Module):
     shape: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, motion: Motion) -> Array:
-        """The value of the channel at one instant."""
+        """Return the value of the channel at one instant."""
         return self.operations.results(*self.held, *jax.tree.leaves(motion))[0]
 
 
@@ -92,7 +92,7 @@ def _traced(function: Callable, scene: Scene) -> Channel:
 
 
 def motion_shape(scene: Scene) -> Motion:
-    """A motion of this scene with shapes in place of numbers."""
+    """Return a motion of this scene with shapes in place of numbers."""
     return _motion_shape(*_kind(scene))
 
 

@@ -42,7 +42,7 @@ class Report(Printed):
     degrees_of_freedom: int
     rows: tuple[str, ...]
     rank: int  # of the rows at generic states
-    redundant_rows: tuple[str, ...]  # may be left out together; the others keep the rank at every probed state
+    redundant_rows: tuple[str, ...]  # may be omitted together; the others keep the rank at every probed state
     integrable_rows: tuple[str, ...]  # holonomic by themselves
     nonholonomic_rows: tuple[str, ...]  # by themselves
     frobenius_violations: dict[str, float]  # relative

@@ -14,7 +14,7 @@ Which samples inform which unknown: of each, the share of what the data tell of 
 It allows for all other unknowns being estimated, too. The shares of all samples add up to one; a prior takes what is missing.
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
 
-How far an unknown may be moved before the data object, all others being fitted anew: profile likelihood.
+How far an unknown may be moved before the data object, all others being fitted again: profile likelihood.
 
     rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, which is held at x; inflation: as of the covariance, for the loss and for sigmas
     interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom              that are estimated

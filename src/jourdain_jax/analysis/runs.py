@@ -43,7 +43,7 @@ class Run(NamedTuple):
 
     t0: Float[Array | np.ndarray, ""]
     ts: Times
-    grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is worked out there
+    grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is computed there
     values: dict[str, Numbers]
     weights: dict[str, Numbers]
     start: dict[str, Numbers]
@@ -53,7 +53,7 @@ class Run(NamedTuple):
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
     def motion(self, scene: Scene, simulate: Callable, ts, options: AllOptions) -> Trajectory:
-        """The motion at these times."""
+        """Return the motion at these times."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = drive.put_into(inputs)
@@ -86,7 +86,7 @@ class Run(NamedTuple):
         return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))
 
     def at(self, layout: Layout, shared, local) -> "Run":
-        """The run with these unknowns."""
+        """Return the run with these unknowns."""
         changed = layout.start(self.start, shared, local)
         if not layout.numbers:
             return self._replace(start=changed)
@@ -95,7 +95,9 @@ class Run(NamedTuple):
 
 
 def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
-    """A run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have a leading axis."""
+    """Return a run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have
+    a leading axis.
+    """
     weights = {}
     for name, values in data.values.items():
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
@@ -106,7 +108,7 @@ def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
 
 
 def on_equal_grids(runs: Sequence[Run]) -> list[Run]:
-    """The runs on grids of as many intervals as the longest needs."""
+    """Return the runs on grids of as many intervals as the longest needs."""
     nodes = [run.start.get(LAST) for run in runs]
     count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
     return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
@@ -128,7 +130,9 @@ def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
 
 
 def grouped(data: Sequence[Experiment]) -> list[list[int]]:
-    """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
+    """Return indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for
+    the number of times.
+    """
     if len(data) == 1:
         return [[0]]
     groups: dict[tuple, list[int]] = {}
@@ -177,7 +181,7 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     return _of_members(run._replace(ts=ts), lambda x: np.pad(x, [(0, 0), (0, more), *[(0, 0)] * (x.ndim - 2)]))
 
 
-Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those asked for), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
+Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those requested), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
 _BY_MEMBER = ("values", "weights")  # of a run, which differ by member
 
 
@@ -238,7 +242,9 @@ class Group:
                 yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
+        """Return how many lanes at a time, with positions of their members and runs; these are filled up with
+        copies of the last.
+        """
         count = members * len(self.runs)
         # of many lanes those that are left last run eight at a time: these cost less than another program for fewer
         width, self._fewest = self._width, max(self._fewest, min(count, 8))
@@ -248,7 +254,8 @@ class Group:
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
     def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: np.ndarray) -> np.ndarray:
-        """Rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s."""
+        """Return rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s.
+        """
         if self._chains is None:
             return rows
         before, rho = self._chains.at(self.places(runs), members % self._count, taus)
@@ -262,7 +269,7 @@ class Group:
         return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
 
     def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> Bool[np.ndarray, "lanes samples"]:
-        """Which samples of these runs lie in the first `share` of the span."""
+        """Return which samples of these runs lie in the first `share` of the span."""
         ts, t0 = self._ts[self.places(runs)], self._t0[self.places(runs)]
         early = np.abs(ts - t0[:, None]) <= (share * np.abs(ts[:, -1] - t0))[:, None]
         counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
@@ -287,7 +294,9 @@ def _of_members(run: Run, of: Callable) -> Run:
 
 
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
-    """All numbers of some trees in the order of `ravel_pytree`, in a row for each member; of a tree that has no axis of members, the same for all."""
+    """Return all numbers of some trees in the order of `ravel_pytree`, in a row for each member; of a tree
+    that has no axis of members, the same for all.
+    """
     parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
     return np.hstack([np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)])
 
@@ -315,6 +324,6 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    # XLA's newer emitters compile it in twice the time, for a program that is no faster; from jaxlib 0.11.1 on there are no others
+    # XLA's newer emitters compile it in twice the time, for a program that is not a faster; from jaxlib 0.11.1 on there are no others
     older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
     return jax.jit(jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)

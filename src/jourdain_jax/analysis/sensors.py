@@ -5,7 +5,7 @@
 
 Each number is known, or a `jj.Estimate`. Source: L. Ljung, System Identification, 2nd ed. (1999), sections 4.2 and 4.4.
 
-Equal intervals of time, where the motion is worked out that late sensors read between.
+Equal intervals of time, where the motion is computed that late sensors read between.
 
 What a sensor shows of a quantity that is known at equal intervals of time: late by a delay, and through a first-order low-pass.
 
@@ -188,7 +188,7 @@ class Sensor(eqx.Module):
 
     Each number may be an `Estimate`. By default an estimated lag is positive, gain and bias may be any number; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, a motion (a piece of one, with `shooting`) is worked out at equal intervals, 64 or more and none longer than the median interval of
+    With a delay or a lag, a motion (a piece of one, with `shooting`) is computed at equal intervals, 64 or more and none longer than the median interval of
     the samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the
     slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to
     0.08 J h^2.
@@ -283,7 +283,7 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
 
 
 def default_range(name: str):
-    """The range of an estimated number that states none."""
+    """Return the range of an estimated number that states none."""
     return positive() if name == "lag" else unbounded()
 
 
@@ -356,7 +356,7 @@ class Drive(Response):
         return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values)))
 
     def put_into(self, inputs) -> Inputs:
-        """The inputs with its signal."""
+        """Return the inputs with its signal."""
         return eqx.tree_at(lambda i: i.channels[self.index], inputs, self.signal())
 
 
@@ -378,5 +378,5 @@ def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Arr
 
 
 def latest(delay: Array | Estimate) -> float:
-    """The largest delay that a sensor may have, s."""
+    """Return the largest delay that a sensor may have, s."""
     return float(delay.range.high if isinstance(delay, Estimate) else delay)

@@ -3,7 +3,7 @@
     piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
     continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
 
-Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it may show, and for it the piece goes on beyond
+Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it may show, and for it the piece continues beyond
 t_i+1. What a sensor's low-pass gives is part of s.
 
 Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
@@ -104,7 +104,7 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
 
 
 def numbers_of_filters(run: Experiment) -> int:
-    """How many numbers the low-passes of the sensors of a run that was `checked` have."""
+    """Return how many numbers the low-passes of the sensors of a run that was `checked` have."""
     return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 

@@ -13,7 +13,7 @@ First guesses of the states between pieces, from what was measured there.
 
 A coordinate or speed that a channel shows is that of a parabola through the samples about the node; so is the rate of a coordinate,
 qdot = N(q) u + nu, met by the smallest change of the speeds. What no channel shows stays as it is at the start; coordinates that no geometric row depends on
-go on from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and the quantity is y + lag y'.
+continue from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and the quantity is y + lag y'.
 """
 
 from dataclasses import replace
@@ -38,7 +38,7 @@ from jourdain_jax.scene.scene import Scene
 def first_nodes(
     scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"]
 ) -> Float[np.ndarray, "pieces states"]:
-    """Nodes at the begin of all pieces of a run, the first one included; q, u: its start."""
+    """Return nodes at the begin of all pieces of a run, the first one included; q, u: its start."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
@@ -70,7 +70,8 @@ def first_nodes(
 
 
 def goes_on(scene: Scene, q: Float[np.ndarray, "coordinates"]) -> np.ndarray:
-    """Which coordinates no geometric row and no unit norm depends on, such as headings and distances."""
+    """Return which coordinates no geometric row and no unit norm depends on, such as headings and distances.
+    """
     beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # where no slope vanishes by symmetry
     return ~np.any(_closures(scene, beside) != 0, axis=0)
 
@@ -103,7 +104,7 @@ def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: 
 
 
 def shot(problem: Piecewise, theta: Places) -> Minimum:
-    """The minimum from each `theta`."""
+    """Return the minimum from each `theta`."""
     check_starts(problem.scene, problem.runs, problem.unknowns)
     begin, control = _begun(problem, theta), problem.asked.control
     roughly, every = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)), np.arange(len(theta))
@@ -151,7 +152,7 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
 
 
 def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates and speeds of the start of a run at the first guess."""
+    """Return coordinates and speeds of the start of a run at the first guess."""
     shared, own = problem.unknowns.split(theta)
     layout = problem.unknowns.layout
     state = consistent_start(layout.scene(problem.scene, shared), t0=data.t0, inputs=data.inputs, **layout.start(data.start, shared, own[run]))
@@ -176,7 +177,8 @@ def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> Non
 
 
 def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
-    """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
+    """Return the minimum with all gaps closed, by sequential quadratic programming from where the pieces are.
+    """
     unknowns, control = problem.unknowns, problem.asked.control
 
     def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
@@ -207,5 +209,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """The fraction of the largest singular value below which one counts as zero: less, where the largest has grown along the motion and the others have not."""
+    """Return the fraction of the largest singular value below which one counts as zero: less, where the
+    largest has grown along the motion and the others have not.
+    """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

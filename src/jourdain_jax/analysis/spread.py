@@ -84,7 +84,7 @@ class Side(NamedTuple):
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
     """Follow the profile of member `b` along one unknown to one side (`way` is 1 or -1) until F has risen by `end`, from a distance `first` on.
 
-    All others go on from where they were at the point before. The end is found by secants of the root of the rise, which is nearly straight.
+    All others continue from where they were at the point before. The end is found by secants of the root of the rise, which is nearly straight.
     """
     close, origin, theta = 0.01, float(found.theta[b, place]), found.theta[b : b + 1]  # close: of the rise at the end
     bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])
@@ -122,7 +122,7 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
-    """Each unknown at a bound is moved away from it, all others following."""
+    """Return each unknown at a bound is moved away from it, all others following."""
     theta, bound = found.theta, problem.unknowns.reached(found.theta)
     told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free(problem, found, bound))
     for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
@@ -163,8 +163,8 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
 
 
 def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
-    """Name the intervals of the first member that are too narrow, since the squares rise less than `errors`
-    predict (errors of all free unknowns).
+    """Return name the intervals of the first member that are too narrow, since the squares rise less than
+    `errors` predict (errors of all free unknowns).
 
     Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """

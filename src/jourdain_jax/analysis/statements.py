@@ -68,13 +68,15 @@ class Check(eqx.Module):
         return bool(self.value <= self.threshold)
 
     def as_dict(self) -> dict:
-        """The check for machines; a value that is not finite is None."""
+        """Return the check for machines; a value that is not finite is None."""
         value = float(self.value) if np.isfinite(self.value) else None
         return vars(self) | {"value": value, "passed": self.passed}
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """The check called `name` (a key of `THRESHOLDS`) from a number for every suspect; NaN counts as larger than any number."""
+    """Return the check called `name` (a key of `THRESHOLDS`) from a number for every suspect; NaN counts as
+    larger than any number.
+    """
     threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
     if not values:
         return Check(name, 0.0, threshold, "nothing", note)
@@ -84,7 +86,9 @@ def check(name: str, values: dict, dtype, note: str = "") -> Check:
 
 
 def along(f: Callable, arguments, point, direction, u) -> tuple:
-    """Value and slope of `f(arguments, point)` along a direction, its values at -2h, -h, h and 2h, and h, which goes with the speeds `u`."""
+    """Return value and slope of `f(arguments, point)` along a direction, its values at -2h, -h, h and 2h, and
+    h, which goes with the speeds `u`.
+    """
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
     ends = [_value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
     return *_pushed(f, arguments, point, direction), ends, h
@@ -222,7 +226,7 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
 
 
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
-    """A random combination of accelerations and constraint forces, by every reduction."""
+    """Return a random combination of accelerations and constraint forces, by every reduction."""
     names, weights, t, inputs, fixed, usual = arguments
     parameters, q, u = point
     scene = eqx.combine(parameters, fixed)
@@ -233,7 +237,7 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
 
 
 def by_reduction(way, scene, t, q, u, equations, rows):
-    """One reduction of equations and rows that all share."""
+    """Return one reduction of equations and rows that all share."""
     return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
 
 
@@ -248,7 +252,7 @@ def _dot(a, b):
 
 
 def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
-    """The three checks above; `Z` spans the admissible speeds."""
+    """Return the three checks above; `Z` spans the admissible speeds."""
     inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
         check("inertia", inertia, q.dtype),

@@ -41,7 +41,7 @@ class SteadyMotion(Printed, eqx.Module):
     converged: Flag  # whether `residual` is below the root of round-off
 
     def __getitem__(self, name: str):
-        """A coordinate, speed, quaternion or angular velocity by name."""
+        """Return a coordinate, speed, quaternion or angular velocity by name."""
         return self.state[name]
 
     def _text(self) -> str:
@@ -77,7 +77,7 @@ def steady(
     - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
       own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
     - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60); `by_name`: `max_steps` alone.
-      The search goes on to round-off and integrates nothing: no other field means anything here.
+      The search continues to round-off and integrates nothing: no other field means anything here.
 
     **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
     scene's parameters and in the held values, where the steady motion is a smooth function of them.

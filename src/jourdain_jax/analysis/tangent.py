@@ -62,12 +62,12 @@ def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]
 
 
 def others(some, count: int) -> Int[np.ndarray, "rest"]:
-    """The indices below `count` that are not among `some`."""
+    """Return the indices below `count` that are not among `some`."""
     return np.setdiff1d(np.arange(count), np.asarray(some, int))
 
 
 def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]) -> Float[Entries, "all independent"]:
-    """All perturbations from the independent ones so that `rows @ perturbation = 0`."""
+    """Return all perturbations from the independent ones so that `rows @ perturbation = 0`."""
     dependent = others(independent, rows.shape[1])
     rows = _of_unit_length(rows, dependent)
     followed = -inverse(rows[:, dependent]) @ rows[:, independent]
@@ -75,7 +75,8 @@ def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "i
 
 
 def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
-    """The smallest singular value of the dependent part of rows, each of unit length; no derivative."""
+    """Return the smallest singular value of the dependent part of rows, each of unit length; no derivative.
+    """
     xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
     if xp is np and not np.all(np.isfinite(block)):
         return np.asarray(np.nan)
@@ -84,7 +85,7 @@ def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, 
 
 
 def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, "rows all"]:
-    """Rows over the lengths of their dependent parts."""
+    """Return rows over the lengths of their dependent parts."""
     xp, block = array_module(rows), rows[:, dependent]
     length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
     return rows / xp.where(length > 0, length, 1.0)
@@ -99,7 +100,9 @@ def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) 
 
 
 def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tuple[int, ...]:
-    """Indices of independent speeds at a known state: the `usual` ones, or others where these do not determine the rest well."""
+    """Return indices of independent speeds at a known state: the `usual` ones, or others where these do not
+    determine the rest well.
+    """
     A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
     rank = count - len(usual)
     pivot = pivots_at(A, others(usual, count).tolist(), rank)[0]

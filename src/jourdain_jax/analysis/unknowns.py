@@ -61,15 +61,16 @@ class Unknowns:
         return rows
 
     def reached(self, theta: Places) -> Bool[np.ndarray, "members places"]:
-        """Which unknowns lie at a bound."""
+        """Return which unknowns lie at a bound."""
         return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
     def sizes(self, theta: Places) -> Places:
-        """The magnitude against which changes of each are measured: its own; near zero a typical one."""
+        """Return the magnitude against which changes of each are measured: its own; near zero a typical one.
+        """
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
-        """The first guess, and others on a Latin hypercube over the ranges; always the same ones."""
+        """Return the first guess, and others on a Latin hypercube over the ranges; always the same ones."""
         theta = np.tile(self.guess, (count, 1))
         if count == 1:
             return theta
@@ -105,7 +106,7 @@ class _Entry:
 def unknowns_of(
     scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]", apart: bool = False
 ) -> Unknowns:
-    """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
+    """Return the unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
     A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`). Those of a single run count as shared,
     unless they are to be `apart`.
@@ -169,7 +170,9 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """The range cut at zero, below which the scene has no motion; a little above it where it has none at zero either. ValueError for a guess below zero."""
+    """Return the range cut at zero, below which the scene has no motion; a little above it where it has none
+    at zero either. ValueError for a guess below zero.
+    """
     if np.any(entry.guess < 0):
         raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared non-negative; give a guess of zero or more")
     # of the first guess: the bound of a parameter that is to be above zero

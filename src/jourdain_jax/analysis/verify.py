@@ -11,7 +11,7 @@ Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1)
 energy             d(T + V)/dt along the motion, less the power of what has no potential
 gradients          of udot and A' lambda: forward against reverse mode, and against central differences
 
-Everything is worked out once, uncompiled: compiling it would take several times as long as running it.
+Everything is computed once, uncompiled: compiling it would take several times as long as running it.
 """
 
 from collections.abc import Mapping
@@ -64,8 +64,8 @@ def verify(
       domain, where it has none); generic, for a symmetric one hides errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
     - `seed`: of that state, and of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the
-      speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
-      derivative there and are left out, with a note (`derivative_exists`).
+      speeds, relative in the parameters; the Gibbs-Appell reduction is omitted from them. Parameters that split rows which are dependent have no
+      derivative there and are omitted, with a note (`derivative_exists`).
 
     **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a
     DifferentiationModeError where numbers are traced.
@@ -177,7 +177,9 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
 
 
 def _acts_on_speeds(scene: Scene) -> bool:
-    """Whether loads act directly on speeds, or a potential is given as a function of coordinates: then bodies do not show all forces."""
+    """Return whether loads act directly on speeds, or a potential is given as a function of coordinates: then
+    bodies do not show all forces.
+    """
     flags: list[bool] = []
 
     def look(scene, motion):

@@ -95,13 +95,17 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tup
 
 @partial(compiled, options=RUN_SELDOM)
 def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
-    """Parameters and distances of upright lines, and their derivatives with respect to each reading, in the order of its means."""
+    """Return parameters and distances of upright lines, and their derivatives with respect to each reading,
+    in the order of its means.
+    """
     found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 
 def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:
-    """All parameters of the benchmark, and by how much upright lines miss the mass centres ("miss B1")."""
+    """Return all parameters of the benchmark, and by how much upright lines miss the mass centres ("miss
+    B1").
+    """
     found = {"g": y["g"]} | {f"r{wheel}": y[f"d{wheel}"] / (2 * jnp.pi * y[f"n{wheel}"]) for wheel in "RF"}
     found |= {f"m{part}": y[f"m{part}"] for part in ("R", "F", *hangings)}
     found |= _geometry(y, found, by_table)
@@ -143,7 +147,9 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
 
 
 def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
-    """The vector from where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
+    """Return the vector from where the handlebar hung to the front axle, (x, z), m; both lay on a table, with
+    the steer axis level.
+    """
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
     return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])

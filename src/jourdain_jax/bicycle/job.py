@@ -105,7 +105,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     drawn = sample_parameters(bicycle, jax.random.key(seed), samples)
     nominal = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     physical = np.asarray(drawn.physical)
-    # a sample that is no bicycle is computed as the measured one, and not counted
+    # a sample that is not a bicycle is computed as the measured one, and not counted
     values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])

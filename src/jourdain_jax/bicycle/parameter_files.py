@@ -144,7 +144,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
 
 def read_lines(path: Path) -> str:
-    """The text of a file of parameters or readings, which is not empty."""
+    """Return the text of a file of parameters or readings, which is not empty."""
     text = read_text(path, 1_000_000, f"a bicycle parameter file with lines {_FORMAT}")
     if not text.strip():
         raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
@@ -152,7 +152,7 @@ def read_lines(path: Path) -> str:
 
 
 def text_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Number and content of the lines that hold a parameter, without comments."""
+    """Yield number and content of the lines that hold a parameter, without comments."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()
         if content:
@@ -217,7 +217,7 @@ def _check_known(name: str, where: str) -> None:
 
 
 def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:
-    """Warnings where an ignored value contradicts the symmetry that the model assumes."""
+    """Return warnings where an ignored value contradicts the symmetry that the model assumes."""
     found = [
         f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0
     ]

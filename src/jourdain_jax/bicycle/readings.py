@@ -50,7 +50,7 @@ class Readings:
 
 
 def holds_readings(path: Path) -> bool:
-    """Whether a file is one of raw measurements, by its name."""
+    """Return whether a file is one of raw measurements, by its name."""
     return path.name.endswith("Measured.txt")
 
 

@@ -140,7 +140,7 @@ _speeds = compiled(_stability_speeds, options=RUN_SELDOM)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
-    """The order castering, capsize, weave, weave that `eigenvalues` describes."""
+    """Return the order castering, capsize, weave, weave that `eigenvalues` describes."""
     values = values[jnp.lexsort((values.imag, values.real))]
     is_pair = values.imag != 0
     pair_between = is_pair[1] & is_pair[2] & ~is_pair[0] & ~is_pair[3]
@@ -148,7 +148,7 @@ def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
 
 
 def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
-    """The matrices as arrays."""
+    """Return the matrices as arrays."""
     return BicycleMatrices(*(jnp.asarray(value, real_type()) for value in (M, C1, K0, K2, g)))
 
 
@@ -179,12 +179,14 @@ def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
 
 
 def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Polynomials in x of the module's head: zero where two eigenvalues sum to zero, and where two coincide."""
+    """Return polynomials in x of the module's head: zero where two eigenvalues sum to zero, and where two
+    coincide.
+    """
     b4, b3, b2, b1, b0 = _coefficients(matrices)
     x = jnp.array([1.0, 0.0], b0.dtype)
 
     def combined(*terms):
-        """The sum of products, each a factor and polynomials."""
+        """Return the sum of products, each a factor and polynomials."""
         return reduce(jnp.polyadd, (factor * reduce(jnp.polymul, parts) for factor, *parts in terms))
 
     opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
@@ -198,7 +200,8 @@ def _slope(polynomial: Polynomial, x: Array) -> Array:
 
 
 def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:
-    """The positive real roots up to `top`, with derivatives of two orders, and which they are: others are 1.
+    """Return the positive real roots up to `top`, with derivatives of two orders, and which they are: others
+    are 1.
 
     Found as their inverses: coefficients of the highest powers may vanish.
     """
@@ -212,12 +215,12 @@ def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"]
 
 
 def _root_where(there, x: Scalar) -> Scalar:
-    """The square root of x, or NaN without derivative."""
+    """Return the square root of x, or NaN without derivative."""
     return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
 
 
 def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
-    """Whether two positive real eigenvalues become a pair at a root x, as the speed grows."""
+    """Return whether two positive real eigenvalues become a pair at a root x, as the speed grows."""
     v = jnp.sqrt(x)
     fixed = jax.lax.stop_gradient(matrices)
     coefficients, slopes = jax.jvp(lambda v: _characteristic(fixed, v), (v,), (jnp.ones_like(v),))
@@ -228,7 +231,9 @@ def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
 
 
 def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
-    """The widest interval of speeds between neighbouring crossings where all eigenvalues decay, without derivative; NaN if there is none."""
+    """Return the widest interval of speeds between neighbouring crossings where all eigenvalues decay,
+    without derivative; NaN if there is none.
+    """
     matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
     ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))
     middles = (0.5 * (ends[:-1] + ends[1:])) ** 2

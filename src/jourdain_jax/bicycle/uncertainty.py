@@ -35,14 +35,14 @@ class ParameterSamples(eqx.Module):
 class Interval(eqx.Module):
     """A quantity with limits that contain 95 % of the samples that have it."""
 
-    value: Scalar  # NaN where there is none
+    value: Scalar  # NaN if there is none
     low: Scalar  # 2.5 % quantile, NaN if no sample has the quantity
     high: Scalar  # 97.5 % quantile
     fraction: Scalar  # of the samples counted, those that have the quantity
 
 
 def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
-    """Draw `count` bicycles from normal distributions with the measured values and their covariance, or independent with their sigmas where there is none.
+    """Draw `count` bicycles from normal distributions with the measured values and their covariance, or independent with their sigmas if there is none.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())

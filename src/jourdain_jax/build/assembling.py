@@ -5,7 +5,7 @@ on NumPy, all at once.
 
 Those that do not arrive, or not inside, take short steps within the domain instead, from where they are and then from elsewhere.
 Where rows are dependent on each other at all assembled configurations (overconstrained linkages), only a configuration on the rows to round-off shows their
-rank: directions whose singular value is small are left out of the last steps.
+rank: directions whose singular value is small are omitted from the last steps.
 """
 
 from dataclasses import dataclass, fields
@@ -24,7 +24,7 @@ class Assembled:
     """Configurations, and how good they are."""
 
     q: np.ndarray  # (states, coordinates)
-    position_error: np.ndarray  # largest residual of the rows, (states,); infinite where it is no number
+    position_error: np.ndarray  # largest residual of the rows, (states,); infinite where it is not a number
     error: np.ndarray  # of the coordinates: the last correction, relative to their size; infinite for one that is not on the rows, (states,)
     outside: np.ndarray  # how far outside the domain, in widths of it; zero inside, (states,)
 
@@ -35,9 +35,10 @@ class Assembled:
 
 
 def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, tries: int = 4) -> Assembled:
-    """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k, these by the entries of a pattern.
+    """Return configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the
+    states numbered k, these by the entries of a pattern.
 
-    Of the `generic` ones those that find no place inside the domain begin anew elsewhere, so that there are `tries` after the first one.
+    Of the `generic` ones those that find no place inside the domain begin again elsewhere, so that there are `tries` after the first one.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
     # where configurations lie anywhere in the domain: on the rows a row may be of no length at all
@@ -49,7 +50,7 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
         return q, last
 
     def judged(q: np.ndarray, shift: np.ndarray) -> Assembled:
-        """Configurations with their last corrections, judged."""
+        """Return configurations with their last corrections, judged."""
         residual, G = look(q, every)
         with np.errstate(invalid="ignore"):
             position_error = largest(residual, 1)
@@ -90,7 +91,8 @@ def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarr
 
 
 def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
-    """The length of each row at most states: the median, or the largest for a row that vanishes at half of them.
+    """Return the length of each row at most states: the median, or the largest for a row that vanishes at
+    half of them.
 
     A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
     """
@@ -99,7 +101,9 @@ def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: F
 
 
 def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
-    """The median over the states at which all are numbers, or the largest for a row that vanishes at half of them; 0 for one that always does."""
+    """Return the median over the states at which all are numbers, or the largest for a row that vanishes at
+    half of them; 0 for one that always does.
+    """
     length = length[np.all(np.isfinite(length), axis=1)]
     if not len(length):
         return np.zeros(length.shape[1], length.dtype)
@@ -126,7 +130,7 @@ def speed_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States from the domain, not yet on the rows."""
+    """Return states from the domain, not yet on the rows."""
     q_low, q_high = coordinate_bounds(scene)
     u_low, u_high = speed_bounds(scene)
     q = generator.uniform(q_low, q_high, (count, len(q_low)))

@@ -46,7 +46,7 @@ class Probed(eqx.Module):
     G: Float[Entries, "*states closures coordinates"]
     A: Float[Entries, "*states rows speeds"]
     A_other: Float[Entries, "*states rows speeds"]  # at other speeds
-    A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were put on the geometric rows
+    A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were projected onto the geometric constraints
     M: Float[Entries, "*states speeds speeds"]
     vanishing: dict[str, Float[Entries, "*states entries"]]  # as in `LookedAt`
     numbers: Numbers
@@ -55,7 +55,7 @@ class Probed(eqx.Module):
 
 
 def generic_inputs(scene: Scene) -> np.ndarray:
-    """Values of inputs at which no term passes for absent."""
+    """Return values of inputs at which no term passes for absent."""
     return np.linspace(0.5, 1.0, len(scene.inputs))
 
 
@@ -113,7 +113,7 @@ def looked_at(scene: Scene) -> LookedAt:
 
 @once_per_class
 def coordinates_on_rows(scene: Scene) -> np.ndarray:
-    """Which coordinates geometric rows or unit norms depend on, (coordinates,)."""
+    """Return which coordinates geometric rows or unit norms depend on, (coordinates,)."""
     nodes = looked_at(scene)
     return np.isin(nodes.traced.q, [n for row in nodes.of_closures for n in row])
 
@@ -147,7 +147,8 @@ def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Ass
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
-    """Whether these velocity rows are combinations of the others wherever positions meet the geometric rows, at generic parameters; states as above.
+    """Return whether these velocity rows are combinations of the others wherever positions meet the geometric
+    rows, at generic parameters; states as above.
 
     `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side.
     """
@@ -181,11 +182,11 @@ class _AtStates:
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
-        """The graph at coordinates and speeds of the states numbered `which`."""
+        """Return the graph at coordinates and speeds of the states numbered `which`."""
         return Probes(self.graph, named_values(self.scene, self.t[which], q, u, self.inputs[which]))
 
     def probed(self, u_other) -> Probed:
-        """All that is looked at."""
+        """Return all that is looked at."""
         nodes = self.nodes
         return Probed(
             q=self.real(self.q),
@@ -204,7 +205,7 @@ class _AtStates:
         )
 
     def _at(self, nodes) -> np.ndarray:
-        """Values of nodes, with a leading axis of states."""
+        """Return values of nodes, with a leading axis of states."""
         return _values(self.values, nodes)
 
     def real(self, x: np.ndarray) -> np.ndarray:
@@ -212,7 +213,7 @@ class _AtStates:
         return np.asarray(x, real_type())
 
     def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:
-        """Matrices with these entries by row, with a leading axis of states."""
+        """Return matrices with these entries by row, with a leading axis of states."""
         place = {n: k for k, n in enumerate(columns)}
         found = np.zeros((probes.count, len(entries), len(columns)))
         places = [(i, place[n], node) for i, row in enumerate(entries) for n, node in row.items()]
@@ -222,7 +223,7 @@ class _AtStates:
         return found
 
     def _row_matrices(self, probes: Probes) -> np.ndarray:
-        """A at these probes."""
+        """Return a at these probes."""
         return self._matrices(probes, self.nodes.rows, self.traced.u.tolist())
 
     def _mass_matrix(self) -> np.ndarray:
@@ -232,7 +233,7 @@ class _AtStates:
         return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
-        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are no numbers."""
+        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are not numbers."""
         at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
             return u
@@ -253,7 +254,7 @@ class _AtStates:
         return moved(np.where(np.isfinite(last)[:, None], x, np.nan), every)
 
     def _assembled(self, q) -> Assembled:
-        """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
+        """Return coordinates on geometric rows and unit norms, inside the domain where that can be."""
         q = np.array(q, float)
         for first, _ in self.scene.coordinates.quaternions:
             length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)

@@ -47,7 +47,7 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
 def contradictions(
     who: str, names: tuple[str, ...], A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
 ) -> tuple[str, ...]:
-    """Which rows no speeds meet together at any of some random states, as a sentence.
+    """Return which rows no speeds meet together at any of some random states, as a sentence.
 
     A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
 
@@ -71,9 +71,10 @@ def contradictions(
 def redundant_rows(
     found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], Scaled]
 ) -> tuple[str, ...]:
-    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
+    """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
+    state, and does not come near to losing it.
 
-    A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
+    A row that is omitted is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
     along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
     `far`: rows at full turns of all angles.
     """
@@ -109,14 +110,18 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
 
 
 def _are_bounded(c: np.ndarray) -> bool:
-    """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
+    """Return whether coefficients at many states are: none is large, nor far beyond its usual size with both
+    signs, as tangents are.
+    """
     usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
     return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (largest(c, 0) > 2)))
 
 
 def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tuple[int, ...]:
-    """Numbers of the privileged speeds with these names. ValueError for unknown names, and for others than `freedoms` speeds."""
+    """Return numbers of the privileged speeds with these names. ValueError for unknown names, and for others
+    than `freedoms` speeds.
+    """
     if not isinstance(names, str | Iterable):
         raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(names)}, expected names of speeds")
     chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
@@ -138,7 +143,9 @@ def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray
 
 
 def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
-    """The smallest of the pivots over the domain: zero where the determinant of A_z changes sign between probes, for it vanishes in between."""
+    """Return the smallest of the pivots over the domain: zero if the determinant of A_z changes sign between
+    probes, since it then vanishes between them.
+    """
     if rank and scaled.shape[1] == rank:
         signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
         if signs.min(initial=0.0) < 0 < signs.max(initial=0.0):
@@ -147,7 +154,9 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
 
 
 def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
-    """The independent speeds whose complement has the largest worst pivot over all probes (the largest typical one among equals)."""
+    """Return the independent speeds whose complement has the largest worst pivot over all probes (the largest
+    typical one among equals).
+    """
     if rank == 0:
         return tuple(range(count))
     subsets = list(itertools.islice(itertools.combinations(range(count), rank), 3001))
@@ -165,7 +174,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...
 
 
 def _greedy(A: np.ndarray, rank: int) -> tuple[int, ...]:
-    """Columns chosen one after another by largest remaining length (pivoted QR)."""
+    """Return columns chosen one after another by largest remaining length (pivoted QR)."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):
         lengths = np.linalg.norm(remaining, axis=0)

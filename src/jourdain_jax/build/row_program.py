@@ -46,7 +46,7 @@ class RowProgram:
 
 @once_per_class
 def row_program(scene: Scene) -> RowProgram | None:
-    """The program of a class of scenes; None where a part of it is no scalar program."""
+    """Return the program of a class of scenes; None where a part of it is no scalar program."""
     scene = with_reference_parameters(scene)
     try:
         nodes = looked_at(scene)

@@ -34,12 +34,12 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
     nodes = looked_at(scene)
     at, geometric = nodes.traced.at, len(nodes.traced.at.closure)
     smooth = owned(scene, **{name: getattr(at, name) for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")})
-    rows = dict(zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True))  # they must not jump as time goes on
+    rows = dict(zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True))  # they must not jump as time continues
     if not any(passes(nodes.graph, smooth | rows, NONANALYTIC | CALLS)):
         return ()
 
     def values(wanted: list[int], points: np.ndarray) -> np.ndarray:
-        """Values at points (t, q)."""
+        """Return values at points (t, q)."""
         others = np.tile(u[0], (len(points), 1)), np.zeros((len(points), len(scene.inputs)))
         return Probes(nodes.graph, named_values(scene, points[:, 0], points[:, 1:], *others))(wanted).T
 

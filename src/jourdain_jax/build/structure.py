@@ -39,7 +39,7 @@ class Structure:
     row_names: tuple[str, ...]
     rank: int  # of the rows at generic states
     ranks: tuple[int, ...]  # at all probed states
-    redundant_rows: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    redundant_rows: tuple[str, ...]  # may be omitted together: the others keep the rank at every probed state
     may_set_in: tuple[str, ...]  # those of them that no identity makes follow from the others: they may not, where no probe lies
     rank_losses: tuple[str, ...]  # configurations among the probed ones with fewer independent rows, as text
     independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
@@ -95,7 +95,7 @@ class Structure:
 
     @property
     def dependent_rows(self) -> bool:
-        """Whether rows depend on each other although none may be left out: each is needed somewhere."""
+        """Whether rows depend on each other although none may be omitted: each is needed somewhere."""
         return len(self.kept_rows) > self.rank
 
     @property
@@ -118,18 +118,20 @@ class Structure:
 
 
 def _moves(rates: np.ndarray) -> bool:
-    """Whether any rate is a number other than zero."""
+    """Return whether any rate is a number other than zero."""
     return bool(np.any(np.isfinite(rates) & (rates != 0)))
 
 
 def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
-    """Whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows may be stated in any unit."""
+    """Return whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows
+    may be stated in any unit.
+    """
     size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
     return bool(np.any(np.abs(difference) > tolerance * size))
 
 
 def _sizes(found: Probed) -> np.ndarray:
-    """The largest entry of every row, at every state."""
+    """Return the largest entry of every row, at every state."""
     return largest(found.A, 2)
 
 
@@ -170,12 +172,12 @@ def structure_of(scene: Scene) -> Structure:
     """Return static facts about a scene: rank of its constraints, privileged velocities and their
     conditioning, kinds of constraints; eqs. (25)-(31).
 
-    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers replace traced parameters.
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
     """
     structure = structure_whatever_its_faults(scene)
-    # numbers that stand in for traced parameters prove nothing of bodies and grounds
+    # numbers that replace traced parameters prove nothing of bodies and grounds
     if wrong := structure.kinks or (not is_traced(scene) and (structure.odd_grounds or structure.faults)):
         raise ValueError(wrong[0])
     return structure
@@ -187,7 +189,9 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def trust(scene: Scene) -> float:
-    """How far typical lengths count: a thousandth where parameters are traced, for the numbers that stand in may be of another order."""
+    """Return how far typical lengths count: a thousandth where parameters are traced, for the numbers that
+    stand in may be of another order.
+    """
     return 1e-3 if is_traced(scene) else 1.0
 
 
@@ -210,7 +214,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 
 @once_per_values
 def _structure(scene: Scene) -> Structure:
-    with np.errstate(all="ignore"):  # what is no number at a probe does not count there
+    with np.errstate(all="ignore"):  # what is not a number at a probe does not count there
         return _probed_structure(scene)
 
 
@@ -255,7 +259,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
         faults = contradictions(type(scene).__name__, names, scaled.A[generic], asked, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
-    faults = faults or sentences(scene, found.numbers, "gravity")  # last: what stands in for a traced direction must hide nothing else
+    faults = faults or sentences(scene, found.numbers, "gravity")  # last: what replaces a traced direction must hide nothing else
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
@@ -303,7 +307,7 @@ def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _is_singular(M: np.ndarray) -> bool:
-    """Whether scaled inertias are singular at all of some states."""
+    """Return whether scaled inertias are singular at all of some states."""
     return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
 
 
@@ -353,7 +357,7 @@ class Reference:
     Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
     arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
 
-    `varied`: names of parameters that differ between lanes; other numbers near by stand in for these, so
+    `varied`: names of parameters that differ between lanes; other numbers near by replace these, so
     that what holds by chance does not count; None: all.
     """
 

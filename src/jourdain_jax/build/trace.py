@@ -65,7 +65,7 @@ class VelocityQuantities(eqx.Module):
     resets: Num[Entries, "events rows"]  # as `event_resets` has them
     energies: Num[Entries, "2"]  # kinetic and potential
     slip_turns: Num[Entries, "directions"]  # rates of directions of slip, the last coordinates
-    held: Num[Entries, "coordinates_and_speeds"]  # put back onto the rows of contacts that are closed; none where no contact switches
+    held: Num[Entries, "coordinates_and_speeds"]  # projected onto the constraints of contacts that are closed; none where no contact switches
     start: Num[Entries, "numbers"]  # `switching.Begun`
     responses: Num[Entries, "states numbers"]  # of contacts that switch, of which the others are made: at coordinates, speeds and inputs, which come first
 
@@ -79,13 +79,13 @@ class Particulars(eqx.Module):
 
 
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
-    """The potential of each load, zero where it has none."""
+    """Return the potential of each load, zero where it has none."""
     stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
     return jnp.stack(stored) if stored else jnp.zeros(0, motion.q.array.dtype)
 
 
 def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
-    """Rates in time of loads and potentials while the motion, poses included, is held."""
+    """Return rates in time of loads and potentials while the motion, poses included, is held."""
 
     def pieces(t):
         held = eqx.tree_at(lambda m: m.t, motion, t)
@@ -214,7 +214,8 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
 
 @once_per_class
 def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
-    """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes.
+    """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
+    and inputs, and their shapes.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs. ValueError where a method reads what JAX is tracing elsewhere.
     """
@@ -255,7 +256,7 @@ def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:
 
 
 def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
-    """Values of the inputs of the scene's graph by name; states may have a leading axis."""
+    """Return values of the inputs of the scene's graph by name; states may have a leading axis."""
     named = {f"p{k}_{i}": value for k, leaf in enumerate(jax.tree.leaves(scene)) for i, value in enumerate(np.ravel(leaf))}
     named["t_0"] = t
     for prefix, values in zip("qui", (q, u, inputs), strict=True):
@@ -284,7 +285,8 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -
 
 
 def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Scalar:
-    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W.
+    """Return the part of `rate_of_work` that needs no accelerations: of loads without a potential, of
+    potentials that depend on time or on inputs; W.
 
     sum F.v + L.omega + Q_k u_k           loads without a potential
     dV/dt at fixed poses                  potentials that depend on time

@@ -9,7 +9,7 @@ Derivatives of f(x) in both modes, to the second order, come from two functions 
 Pulls transpose pushes. As f'' is symmetric, bends along v transpose bends, and turns, whose w is that v. What f(x) is counts as a number at which these
 are taken, beside x: a derivative along x is the whole one.
 
-Each is a linear map: one function works out its values, another one those of its transpose. JAX meets such a map where a derivative was taken. Forward mode
+Each is a linear map: one function computes its values, another one those of its transpose. JAX meets such a map where a derivative was taken. Forward mode
 evaluates it, reverse mode transposes it, and neither traces what only the other one needs.
 
 A function and its rule of differentiation must agree on which results have lanes and where: JAX takes that from the one that it batches first.
@@ -71,7 +71,7 @@ class LinearMap:
 
 
 def shapes(arrays: Sequence) -> list[jax.ShapeDtypeStruct]:
-    """Shapes of arrays, with their types."""
+    """Return shapes of arrays, with their types."""
     return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
 
 
@@ -81,7 +81,7 @@ def no_further(*_):
 
 
 def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
-    """The values, with new ones at some places."""
+    """Return the values, with new ones at some places."""
     found = list(values)
     for i, x in zip(which, new, strict=True):
         found[i] = x
@@ -116,7 +116,9 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
 
 
 def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
-    """A second derivative, of arrays with their lanes along these axes, or the same in all lanes, in place of arrays with their lanes first."""
+    """Return a second derivative, of arrays with their lanes along these axes, or the same in all lanes, in
+    place of arrays with their lanes first.
+    """
     transposed = own.transposed
 
     def gathered(arrays: Sequence) -> list:
@@ -196,7 +198,7 @@ class BothWays(NamedTuple):
         return LinearMap(pulled, [self.leaves[i] for i in moving], lambda: self.pushes(moving), lambda others: self._bends(moving, others))
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
-        """The derivative of pushes along others of the leaves; it is taken at the tangents too."""
+        """Return the derivative of pushes along others of the leaves; it is taken at the tangents too."""
         count = len(self.leaves) + len(self.found)
 
         def pulled(at, g):
@@ -206,7 +208,7 @@ class BothWays(NamedTuple):
         return replace(own, transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further))
 
     def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
-        """The derivative of pulls along others of the leaves; it is taken at the cotangents too."""
+        """Return the derivative of pulls along others of the leaves; it is taken at the cotangents too."""
         count, end = len(self.leaves), len(self.leaves) + len(self.found)
         if reason := self.reason_against_second([*moving, *others]):
             raise DifferentiationModeError(reason)

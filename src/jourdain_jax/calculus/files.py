@@ -103,7 +103,7 @@ def _too_deep(source: str) -> ValueError:
 
 
 def _near(path: Path, error: Exception) -> str:
-    """The nearest name in the folder, where the file is missing."""
+    """Return the nearest name in the folder, where the file is missing."""
     found: list[str] = []
     with contextlib.suppress(OSError):
         if isinstance(error, FileNotFoundError):

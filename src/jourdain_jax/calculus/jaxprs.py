@@ -48,9 +48,10 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 
 
 def parts_of_scan(equation) -> tuple[int, int]:
-    """How many inputs of a scan are constants, and how many it carries: these have the same axes in its body as outside, all others one less.
+    """Return how many inputs of a scan are constants, and how many it carries: these have the same axes in
+    its body as outside, all others one less.
 
-    The parameters that say so are not the same in all versions of JAX.
+    The parameters that report it are not the same in all versions of JAX.
     """
     body = equation.params["jaxpr"].jaxpr
     whole, carried = (
@@ -60,12 +61,12 @@ def parts_of_scan(equation) -> tuple[int, int]:
 
 
 def is_jaxpr(x) -> bool:
-    """Whether this is a traced function, closed or not."""
+    """Return whether this is a traced function, closed or not."""
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
 def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
-    """The traced functions among the parameters of an operation."""
+    """Return the traced functions among the parameters of an operation."""
     return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(params.values()), is_leaf=is_jaxpr) if is_jaxpr(x)]
 
 

@@ -3,11 +3,11 @@
 `lanes_first` puts the lanes of `vmap` first, and `entries_of` last. Taps, which act outside of `jit` only, call a Python function with the derivatives that
 pass through them: no compiled program calls back to Python. Between `entered` and `left`, derivatives are NaN where a computation failed, and zero where
 nobody asks for what it found: `jnp.where(failed, nan, x)` has derivatives of zero where it is NaN, which pass for those of a minimum; and
-what was computed from numbers that are lost has derivatives such as 0 NaN, also where it is left out.
+what was computed from numbers that are lost has derivatives such as 0 NaN, also where it is omitted.
 A computation y(x) in between has, with a zero that counts the derivatives that enter,
 
     forward     dy = NaN where y failed and any dx is not zero
-    reverse     dx = 0 where no dy is asked for, NaN where one that failed is
+    reverse     dx = 0 where no dy is requested, NaN where one that failed is
 
 Both count as linear maps, whose own derivatives are such maps. In reverse mode of these, cotangents come to x
 past `left`, by what the first derivative was taken at: therefore that zero counts as such, too.
@@ -41,7 +41,9 @@ def identity(name: str) -> Primitive:
 
 
 def lanes_first(tree):
-    """The tree, unchanged; under `vmap` all its arrays get their axis of lanes first. Values without a tangent space pass."""
+    """Return the tree, unchanged; under `vmap` all its arrays get their axis of lanes first. Values without a
+    tangent space pass.
+    """
     leaves, treedef = jax.tree.flatten(tree)
     moved = [i for i, x in enumerate(leaves) if x.dtype != jax.dtypes.float0]
     for i, x in zip(moved, lanes_first_p.bind(*(leaves[i] for i in moved)) if moved else (), strict=True):
@@ -245,7 +247,7 @@ def _lost_and_counted_back(cotangents, failed, asked, x, *, lanes):
 
 
 def _map(function: Callable, back: Callable, at: int) -> Primitive:
-    """A map as a primitive, linear in all but the first `at` of its arrays; `back`: its transpose."""
+    """Return a map as a primitive, linear in all but the first `at` of its arrays; `back`: its transpose."""
     p = Primitive(f"jourdain_nan{function.__name__}")
 
     def shapes(*avals, lanes):

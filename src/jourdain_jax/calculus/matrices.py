@@ -55,7 +55,9 @@ def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
 
 
 def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Count:
-    """How many singular values exceed `cutoff` times the largest (default: the cut-off of their dtype)."""
+    """Return how many singular values exceed `cutoff` times the largest (default: the cut-off of their
+    dtype).
+    """
     if sigma.shape[0] == 0:
         return jnp.zeros((), jnp.int32)
     cutoff = rank_cutoff(sigma.dtype) if cutoff is None else cutoff
@@ -84,7 +86,7 @@ def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
 
 
 def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
-    """Which columns of a basis belong to the null space."""
+    """Return which columns of a basis belong to the null space."""
     return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)
 
 

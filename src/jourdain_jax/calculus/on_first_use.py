@@ -67,7 +67,7 @@ def names_on_first_use(package: dict[str, Any], where: Mapping[str, str], gone: 
 
 
 def version_of(package: str) -> str:
-    """The installed version of a package; "unknown" where it runs without being installed."""
+    """Return the installed version of a package; "unknown" where it runs without being installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -47,7 +47,8 @@ def rank_cutoff(dtype: jnp.dtype) -> float:
 
 
 def passing_cutoff(dtype: jnp.dtype) -> float:
-    """The cut-off for motions *through* a loss of rank of rows that are well conditioned elsewhere: the root of the round-off of `dtype`.
+    """Return the cut-off for motions *through* a loss of rank of rows that are well conditioned elsewhere:
+    the root of the round-off of `dtype`.
 
     Round-off e of a row of size sigma is a velocity e/sigma and an acceleration e/sigma^2; the step size resolves them down to about sqrt(e).
     """
@@ -162,7 +163,9 @@ def holds(condition: Callable, *numbers) -> bool:
 
 
 def has_unit(x) -> bool:
-    """Whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a number: 1,300 g would be 1,300 kg."""
+    """Return whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a
+    number: 1,300 g would be 1,300 kg.
+    """
     if isinstance(x, list | tuple):
         return any(has_unit(part) for part in x if type(part) is not float)
     return _may_have_unit(type(x)) and any(hasattr(type(x), name) or name in getattr(x, "__dict__", ()) for name in _UNITS)
@@ -174,7 +177,7 @@ def as_array(x, dtype):
 
 
 def in_default_precision(tree):
-    """The tree with its floating-point arrays in the default type."""
+    """Return the tree with its floating-point arrays in the default type."""
     return jax.tree.map(lambda x: x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
@@ -187,7 +190,7 @@ def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None
 
 
 def described(value) -> str:
-    """A value in an error message: `None`, the text 'abc', the class `Skate`, a list."""
+    """Return a value in an error message: `None`, the text 'abc', the class `Skate`, a list."""
     if value is None:
         return "`None`"
     if has_unit(value):
@@ -207,7 +210,7 @@ def described(value) -> str:
 
 
 def is_traced(*trees) -> bool:
-    """Whether any leaf is being traced, so that its number is not known."""
+    """Return whether any leaf is being traced, so that its number is not known."""
     unknown = [tree for tree in trees if not isinstance(tree, float | int | np.ndarray)]  # no trees, and this takes a tenth of the time
     return bool(unknown) and any(map(is_traced_type, map(type, jax.tree.leaves(unknown))))
 
@@ -229,7 +232,9 @@ def array_module(x) -> ModuleType:
 
 
 def nothing_is_traced() -> bool:
-    """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
+    """Return whether this call stands outside of every transformation: no function around it is being traced,
+    and so no argument.
+    """
     return jax.extend.core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
 
 
@@ -267,7 +272,7 @@ def with_usual_promotion(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be left out: a first motion of a disc
+# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be omitted: a first motion of a disc
 # from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
 _EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS

@@ -14,7 +14,7 @@ on until the last has ended (J. Nocedal and S. Wright, Numerical Optimization (2
 iteration converges quadratically, each further step doubles the order of derivatives that are right: two steps that change nothing give those up to the
 third. Steps left out cost nothing, under `vmap` neither once all lanes have settled.
 
-In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows says so; then small singular values are left out.
+In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows reports it; then small singular values are omitted.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
 
 
 def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
-    """The matrix of a linear function, column by column."""
+    """Return the matrix of a linear function, column by column."""
     return jax.vmap(linear, in_axes=1, out_axes=1)(jnp.eye(like.shape[0], dtype=like.dtype))
 
 
@@ -135,7 +135,8 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
 
 
 def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80) -> Unknowns:
-    """The root near a guess, differentiable: a search without derivative, then steps `x <- x - J+ R(x)` with the J found, which carry one order each.
+    """Return the root near a guess, differentiable: a search without derivative, then steps `x <- x - J+
+    R(x)` with the J found, which carry one order each.
 
     `look`: x -> R and J, of numbers without derivatives; `rows`: x -> R; `x`: values of what is held (of size zero), with their derivatives; `cutoff`: of J+.
     All else is as for `damped_search`.

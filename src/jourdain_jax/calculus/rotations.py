@@ -19,7 +19,9 @@ Attitude = Float[Array, "4"]
 
 
 def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x k, s = |v|, c = z.k; half a turn about x to -z."""
+    """Return the shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v =
+    z x k, s = |v|, c = z.k; half a turn about x to -z.
+    """
     k = direction / np.linalg.norm(direction)
     v = np.cross([0.0, 0.0, 1.0], k)
     if k[2] < 0 and np.linalg.norm(v) < 1e-10:
@@ -66,14 +68,14 @@ def rot_z(angle: Number) -> Matrix3:
 
 
 def skew(v: Vector3) -> Matrix3:
-    """The matrix of the cross product, `skew(v) w = v x w`."""
+    """Return the matrix of the cross product, `skew(v) w = v x w`."""
     x, y, z = v[0], v[1], v[2]
     o = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
 def vee(S: Matrix3) -> Vector3:
-    """The vector of the antisymmetric part of `S`, the inverse of `skew`."""
+    """Return the vector of the antisymmetric part of `S`, the inverse of `skew`."""
     return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
 
 

@@ -21,7 +21,7 @@ def with_bound(value: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values and bounds."""
+    """Return values and bounds."""
     half = len(x) // 2
     return x[:half], x[half:]
 
@@ -59,14 +59,16 @@ def quotient(x, y):
 
 
 def root(x):
-    """The square root of a; its derivative is 1/(2 sqrt(a)), and a bound of twice that also holds where a is no larger than its own."""
+    """Return the square root of a; its derivative is 1/(2 sqrt(a)), and a bound of twice that also holds
+    where a is no larger than its own.
+    """
     a, ea = halves(x)
     value = np.sqrt(a)
     return with_bound(value, np.where((ea > 0) & (np.abs(a) <= LOST * ea), np.inf, np.where(ea > 0, ea / value, 0.0)))
 
 
 def wave(function: Callable) -> Callable:
-    """A sine or cosine, which changes no faster than its argument and lies between -1 and 1."""
+    """Return a sine or cosine, which changes no faster than its argument and lies between -1 and 1."""
 
     def bounded(x):
         a, ea = halves(x)

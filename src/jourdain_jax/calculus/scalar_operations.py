@@ -76,7 +76,7 @@ def _real_power(g, n, a, b, da, db):
 
 
 def _unless_zero(g, nodes: tuple[int, ...], value):
-    """The value, and 1 where all of the nodes are zero."""
+    """Return the value, and 1 where all of the nodes are zero."""
     if any(g.is_const(n) and g.value[n] for n in nodes):
         return value
     vanish = [g.call("eq", n, g.zero) for n in nodes]

@@ -27,7 +27,7 @@ class Pattern:
 
     @classmethod
     def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int]) -> "Pattern":
-        """The pattern with entries at these places."""
+        """Return the pattern with entries at these places."""
         rows, columns = np.array(list(entries), int).reshape(-1, 2).T
         return cls(rows, columns, shape)
 
@@ -37,13 +37,13 @@ class Pattern:
         return self.shape[0] >= self.fewest and 16 * len(self.rows) <= self.shape[0] * self.shape[1]
 
     def dense(self, values: np.ndarray) -> np.ndarray:
-        """The matrices."""
+        """Return the matrices."""
         found = np.zeros((len(values), *self.shape))
         found[:, self.rows, self.columns] = values
         return found
 
     def lengths(self, values: np.ndarray) -> np.ndarray:
-        """The lengths of all rows, (states, rows)."""
+        """Return the lengths of all rows, (states, rows)."""
         return np.sqrt(_summed(self.rows, self.shape[0], values**2))
 
     def shortest(self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:

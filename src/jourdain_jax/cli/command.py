@@ -24,7 +24,7 @@ VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of all verbs."""
+    """Return the parser of all verbs."""
     top = argparse.ArgumentParser(
         prog="jourdain-jax",
         description="Dynamics of holonomic and nonholonomic mechanical systems.",

@@ -106,7 +106,9 @@ def _run(text: str, source: str, out: str, options) -> bool:
 
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
-    """The study that a file describes, whose processes may hold so much memory, and how it is to be run."""
+    """Return the study that a file describes, whose processes may hold so much memory, and how it is to be
+    run.
+    """
     check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):

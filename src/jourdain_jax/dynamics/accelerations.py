@@ -76,7 +76,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
 
 
 def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
-    """A reduction from a short name, or the object itself; the null space by QR for None."""
+    """Return a reduction from a short name, or the object itself; the null space by QR for None."""
     if reduction is None:
         return NullSpaceQR()
     if isinstance(reduction, str):
@@ -93,7 +93,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
 
 
 def as_stabilisation(stabilisation) -> Baumgarte | None:
-    """The Baumgarte terms, or None; a ValueError for anything else."""
+    """Return the Baumgarte terms, or None; a ValueError for anything else."""
     if stabilisation is not None and not isinstance(stabilisation, Baumgarte):
         raise ValueError(f"`stabilisation` is {described(stabilisation)}, expected `jj.Baumgarte(alpha, beta)` or None")
     return stabilisation
@@ -129,7 +129,7 @@ def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usua
 
 
 def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: ConstraintRows) -> Accelerations:
-    """Accelerations with multipliers of minimum norm, rank, conditioning and residual."""
+    """Return accelerations with multipliers of minimum norm, rank, conditioning and residual."""
     problem = scaled(equations, rows)
     sigma = singular_values(problem.A)
     return Accelerations(
@@ -144,7 +144,9 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
 
 
 def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced:
-    """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
+    """Return accelerations and constraint force alone, as `accelerations` but without multipliers and
+    diagnostics: for use inside integration.
+    """
     return reduced_at(scene, t, q, u, inputs, reduction, None, usual_rows(scene))[0]
 
 

@@ -41,7 +41,9 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
 
 def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
-    """The scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N' dV/dq` at fixed poses on the speeds."""
+    """Return the scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N'
+    dV/dq` at fixed poses on the speeds.
+    """
     t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
     zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
     if potential_of(scene, pose) is None:
@@ -57,7 +59,9 @@ def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
 
 
 def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
-    """A pose moved by `shift` and turned by the small rotation vector `turn` (inertial frame), to first order."""
+    """Return a pose moved by `shift` and turned by the small rotation vector `turn` (inertial frame), to
+    first order.
+    """
     moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)
     if isinstance(pose.body, RigidBody):
         moved = eqx.tree_at(lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation)

@@ -26,7 +26,8 @@ class Wrenches(eqx.Module):
 
 
 def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
-    """The normal force (N) of every contact of `height="coordinates"`, by name, and whether it is determined.
+    """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
+    determined.
 
     - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: what no load and no row exerts on them.
     - `spare`: what the rows exert for multipliers that change no motion, with a leading axis; zero where the rows are independent.
@@ -94,12 +95,12 @@ def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], h
 
 
 def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> Bool[Array, "contacts"]:
-    """Which normal forces do not depend on multipliers that the motion leaves open."""
+    """Return which normal forces do not depend on multipliers that the motion leaves open."""
     size = jnp.maximum(largest(spare.force), largest(spare.torque))
     return largest(changes, 0) <= tolerance * size
 
 
 def _carried(contact: Contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
-    """Numbers of the bodies that a contact holds up."""
+    """Return numbers of the bodies that a contact holds up."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
     return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

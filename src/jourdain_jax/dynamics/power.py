@@ -6,7 +6,7 @@
                 + dV/dt at fixed poses          potentials that depend on time
                 + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
 
-A term that is zero at every state by the scene's structure is left out, not computed. Inputs count as constant here (their rates reach rows
+A term that is zero at every state by the scene's structure is omitted, not computed. Inputs count as constant here (their rates reach rows
 through the accelerations). Where the potential V_i of a load depends on inputs, these do the work dV_i/df . df/dt besides. It is found without a
 derivative of the inputs, which may jump:
 
@@ -48,7 +48,9 @@ class Power(eqx.Module):
 
 
 def needs_work(scene: Scene, structure: Structure) -> bool:
-    """Whether anything changes T + V, so that the work done must be integrated beside the motion: any term above that is not zero by structure."""
+    """Return whether anything changes T + V, so that the work done must be integrated beside the motion: any
+    term above that is not zero by structure.
+    """
     by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
     return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
 
@@ -58,7 +60,7 @@ def _rows_work(structure: Structure) -> bool:
 
 
 def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
-    """The power that changes T + V, in W, split by where it comes from."""
+    """Return the power that changes T + V, in W, split by where it comes from."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
     return Power(

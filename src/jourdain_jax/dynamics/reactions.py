@@ -108,7 +108,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Arr
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
-    """The motion with other velocities of the bodies, and other speeds, each on its own."""
+    """Return the motion with other velocities of the bodies, and other speeds, each on its own."""
     bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
     qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)

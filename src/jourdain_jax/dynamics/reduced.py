@@ -68,7 +68,7 @@ def cyclic_coordinates(scene: Scene) -> tuple[str, ...]:
 
 
 def ignorable_coordinates(scene: Scene) -> tuple[str, ...]:
-    """Coordinates that the privileged accelerations do not depend on; a quaternion is named whole.
+    """Return coordinates that the privileged accelerations do not depend on; a quaternion is named whole.
 
     None where rows are nonlinear in the speeds.
     """
@@ -78,7 +78,9 @@ def ignorable_coordinates(scene: Scene) -> tuple[str, ...]:
 
 
 def _named(scene: Scene, chosen) -> tuple[str, ...]:
-    """Names of the chosen coordinates; of a quaternion its own name where all four are chosen, none otherwise."""
+    """Return names of the chosen coordinates; of a quaternion its own name where all four are chosen, none
+    otherwise.
+    """
     names: list[str] = []
     groups = {first: group for group, first, _ in scene.coordinate_names.groups}
     skipped: set[int] = set()
@@ -109,7 +111,9 @@ def dependence(scene: Scene) -> Dependence:
 
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
-    """Which entries change with which coordinate at any state; values (states, 1 + coordinates, entries), undisplaced ones first."""
+    """Return which entries change with which coordinate at any state; values (states, 1 + coordinates,
+    entries), undisplaced ones first.
+    """
     size = np.max(np.abs(values), initial=np.finfo(values.dtype).tiny)
     limit = DEPENDS if values.dtype == np.float64 else 1e-4
     return ~np.all(np.abs(values[:, 1:] - values[:, :1]) <= limit * size, axis=0).T  # NaN counts as a change

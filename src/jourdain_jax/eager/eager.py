@@ -25,7 +25,7 @@ def eval_numpy(f: Callable) -> Callable:
 
     @wraps(f)
     def run(*arguments, lanes=()):
-        # a truth value is no number here: it decides what is traced
+        # a truth value is not a number here: it decides what is traced
         arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=lambda x: x is None)
@@ -36,7 +36,7 @@ def eval_numpy(f: Callable) -> Callable:
 
 
 def eager_if_concrete(f: Callable) -> Callable:
-    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced values, as it stands.
+    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced values, unchanged.
 
     What `f` finds out by the scene's own numbers (rank, privileged speeds) must be among its arguments: inside, the numbers are traced.
     """

@@ -53,7 +53,7 @@ def _scan(equation, inputs) -> list[np.ndarray]:
         result = evaluated(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)], applied)
         before_last, before, carry = before, carry, result[:carried]
         if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
-            return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
+            return carry  # an iteration that has converged, or goes back and forth: the rest changes nothing
         for out, y in zip(outs, result[carried:], strict=True):
             out.append(y)
     avals = [v.aval for v in params["jaxpr"].jaxpr.outvars[carried:]]
@@ -85,7 +85,7 @@ def _while(equation, inputs) -> list[np.ndarray]:
 
 
 def _where(equation) -> str:
-    """The function of the user's that an equation comes from."""
+    """Return the function of the user's that an equation comes from."""
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         if not any(part in frame.file_name for part in _NOT_THE_USERS):
@@ -145,7 +145,9 @@ def _round(equation, x):
 
 
 def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
-    """The operands of `dot_general` as matrices whose product is its result, but for the shape; axes of a batch first."""
+    """Return the operands of `dot_general` as matrices whose product is its result, but for the shape; axes
+    of a batch first.
+    """
     (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
@@ -174,7 +176,7 @@ def _select(equation, which, *cases):
 
 
 def _window(x, starts, sizes) -> tuple[slice, ...]:
-    """The part of an array of these sizes that begins at `starts`, or as near to them as it fits."""
+    """Return the part of an array of these sizes that begins at `starts`, or as near to them as it fits."""
     begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
     return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 
@@ -241,7 +243,7 @@ def _lu(equation, A):
 
 
 def _platform(equation):
-    """Which of several implementations: the one for CPUs, or the one for all platforms."""
+    """Return which of several implementations: the one for CPUs, or the one for all platforms."""
     return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
 
 

@@ -63,7 +63,7 @@ class GibbsAppell(eqx.Module):
     name = "Gibbs-Appell"
 
     def accelerations(self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
-        """Accelerations on the `rows`; of `equations`, only Q is used for them."""
+        """Return accelerations on the `rows`; of `equations`, only Q is used for them."""
         problem = scaled(equations, rows)
         split = Partition(problem.A, self.independent)
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()

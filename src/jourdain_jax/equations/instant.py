@@ -49,7 +49,7 @@ def instant_at(scene: Scene, t, q, u, inputs=None) -> Instant:
 
 
 def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
-    """The rows of an instant."""
+    """Return the rows of an instant."""
     return ConstraintRows(instant.value.rows, instant.by_speeds.rows, instant.rate.rows, names_of_rows(scene))
 
 

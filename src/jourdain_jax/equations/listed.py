@@ -20,32 +20,32 @@ class _Listed(NamedTuple):
 
 
 def names_of_bodies(scene: Scene) -> tuple[str, ...]:
-    """Names of the bodies, sorted."""
+    """Return names of the bodies, sorted."""
     return _listed(scene).bodies
 
 
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
-    """Names of all rows, in order."""
+    """Return names of all rows, in order."""
     return _listed(scene).rows
 
 
 def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
-    """Names of the geometric rows, in order; they come first among all rows."""
+    """Return names of the geometric rows, in order; they come first among all rows."""
     return _listed(scene).position_rows
 
 
 def names_of_events(scene: Scene) -> tuple[str, ...]:
-    """Names of the events, sorted."""
+    """Return names of the events, sorted."""
     return _listed(scene).events
 
 
 def stops(scene: Scene) -> tuple[bool, ...]:
-    """Whether each event stops the motion, in the order of their names."""
+    """Return whether each event stops the motion, in the order of their names."""
     return _listed(scene).stops
 
 
 def has_load_without_potential(scene: Scene) -> bool:
-    """Whether some load is given by forces alone."""
+    """Return whether some load is given by forces alone."""
     return _listed(scene).has_load_without_potential
 
 

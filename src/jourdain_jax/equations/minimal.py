@@ -5,7 +5,7 @@ in the speeds.
     udot = C ydot + c'                 from their rates
     C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
 
-A, C and the partial velocities do not depend on u: they are worked out once, at `u = (y, 0)`, and serve both levels. A holds the rows that are asked for:
+A, C and the partial velocities do not depend on u: they are computed once, at `u = (y, 0)`, and serve both levels. A holds the rows that are requested:
 without those that follow from the others A_z is square, and its determinant changes its sign where it is singular.
 Source: Wang and Pao (2003), sections III and IV.
 """
@@ -51,7 +51,7 @@ def minimal_kinematics(scene: Scene, independent: tuple[int, ...], rows: tuple[i
 
 
 def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) -> tuple[Motion, Reduced]:
-    """The motion and the accelerations that go with known speeds."""
+    """Return the motion and the accelerations that go with known speeds."""
     value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)
     equations = equations_of(scene, Instant(motion, known.weights, value, known.partial, rate))
     c = known.c

@@ -111,7 +111,8 @@ def project_speeds(
     determined: bool = False,
     by: RowFunctions = BY_AUTODIFF,
 ) -> Speeds:
-    """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
+    """Return speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are
+    `free` move.
 
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
     from `usual_rows` (default: none does, unless it is zero). `affine`: rows are, in the speeds, so that one step is exact; `iterations` do not count then.

@@ -52,7 +52,7 @@ class Reduced(eqx.Module):
 
 
 def reduce(reduction: Reduction, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
-    """Accelerations by the given reduction."""
+    """Return accelerations by the given reduction."""
     problem = scaled(equations, rows)
     w, pivot, applicable = reduction.solve(problem)
     return reduced(problem.c * w, pivot, applicable, equations)
@@ -68,7 +68,7 @@ def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None 
     """Return the last singular value of the usual rank, which vanishes at a loss of rank; if that rank is
     unknown, the smallest above the cut-off.
 
-    1 where there is none.
+    1 if there is none.
     """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
@@ -135,7 +135,7 @@ class Partition(eqx.Module):
         return tuple(i for i in range(self.A.shape[1]) if i not in self.independent)
 
     def all_from(self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]) -> Float[Array, "speeds *k"]:
-        """All speeds, in order, from the independent and the dependent ones."""
+        """Return all speeds, in order, from the independent and the dependent ones."""
         order = np.argsort([*self.independent, *self.dependent])
         return jnp.concatenate([y, z])[order]
 
@@ -157,11 +157,13 @@ class Partition(eqx.Module):
         return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
 
     def signed_pivot(self) -> Scalar:
-        """The pivot with the sign of det A_z where A_z is square: a change of sign along a motion means that A_z was singular in between."""
+        """Return the pivot with the sign of det A_z where A_z is square: a change of sign along a motion
+        means that A_z was singular in between.
+        """
         return self.pivot() * self.orientation()
 
     def orientation(self) -> Scalar:
-        """The sign of det A_z, 1 where A_z is not square; a number to differentiation."""
+        """Return the sign of det A_z, 1 where A_z is not square; a number to differentiation."""
         square = self.A.shape[0] == len(self.dependent) > 0
         return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
 

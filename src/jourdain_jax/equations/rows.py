@@ -46,7 +46,9 @@ class ConstraintRows(eqx.Module):
 
 
 def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
-    """Values of all geometric rows by name: prescribed coordinates, geometric constraints, contact heights."""
+    """Return values of all geometric rows by name: prescribed coordinates, geometric constraints, contact
+    heights.
+    """
     rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in prescribed_of(scene, pose.t).items()}
     rows |= geometric_constraints_of(scene, pose)
     kept = {name: contact for name, contact in contacts_of(scene, pose).items() if contact.height == "row" and contact.friction is None}
@@ -54,7 +56,7 @@ def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Values of all rows at the level of velocities, by name."""
+    """Return values of all rows at the level of velocities, by name."""
     rows = rates_along(scene, motion, lambda pose: position_rows(scene, pose))
     for name, contact in contacts_of(scene, motion.pose()).items():
         if contact.friction is not None:  # it may slip (`equations/switching.py`)
@@ -73,7 +75,9 @@ def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
-    """Rates of named `values` of a pose along the velocities that the motion carries: they can be differentiated by a body's velocity alone."""
+    """Return rates of named `values` of a pose along the velocities that the motion carries: they can be
+    differentiated by a body's velocity alone.
+    """
 
     names: list[str] = []
 
@@ -94,7 +98,7 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """One name per scalar row: the given one, with an index where a constraint has several rows."""
+    """Return one name per scalar row: the given one, with an index where a constraint has several rows."""
     names: list[str] = []
     for name, value in rows.items():
         names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]
@@ -102,7 +106,7 @@ def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
 
 
 def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
-    """All rows in one vector."""
+    """Return all rows in one vector."""
     return jnp.concatenate([value.reshape(-1) for value in rows.values()]) if rows else jnp.zeros(0, dtype)
 
 

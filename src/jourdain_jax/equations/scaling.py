@@ -49,7 +49,7 @@ def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray,
 
 
 def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledProblem:
-    """The scaled problem of one state."""
+    """Return the scaled problem of one state."""
     c = speed_scale(equations.M)
     d = row_scale(rows.A * c, None if rows.usual is None else rows.usual.lengths)
     return ScaledProblem(c[:, None] * equations.M * c, c * (equations.Q - equations.h), d[:, None] * rows.A * c, -d * rows.drift, c, d, rows.usual)

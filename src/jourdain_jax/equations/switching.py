@@ -40,7 +40,7 @@ TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
 
 def contact_events(at: At) -> dict[str, Scalar]:
-    """Values of the events of all contacts that switch."""
+    """Return values of the events of all contacts that switch."""
     events, forces, one = {}, at.forces, jnp.ones_like(at.motion.t)
     for i, name in enumerate(at.scene.switching.contacts):
         number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]

@@ -221,7 +221,7 @@ def contact_modes(scene: Scene, motion: Motion) -> Modes:
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
-    """Rates of the directions of slip, 1/s; none where a contact does not slip.
+    """Return rates of the directions of slip, 1/s; none where a contact does not slip.
 
     de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, and `SLOW` where it creeps
     """
@@ -263,7 +263,9 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
-    """All impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the scene's own potential; `loads`: as in `resultants`."""
+    """Return all impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the
+    scene's own potential; `loads`: as in `resultants`.
+    """
     total = resultants(scene, motion, loads=loads)
     orientation = of_bodies(motion, "orientation")
     torque = jnp.einsum("bji,bj->bi", orientation, total.torque)

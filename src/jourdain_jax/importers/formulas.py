@@ -52,7 +52,7 @@ class Formulas:
         return {name: [next(flat) for _ in range(length)] for name, length in self._lengths.items()}
 
     def numbers(self, leaves: Mapping[Any, float]) -> dict[Any, np.ndarray]:
-        """The values of all lists as known numbers, in double precision."""
+        """Return the values of all lists as known numbers, in double precision."""
         with np.errstate(all="ignore"):
             found = self.values({symbol: np.float64(x) for symbol, x in leaves.items()}, np)
         return {name: np.array(values, np.float64) for name, values in found.items()}
@@ -76,7 +76,7 @@ def check_functions(expression, leaves) -> None:
 
 
 def _value(expression, known: dict, on: ModuleType):
-    """The value of one expression."""
+    """Return the value of one expression."""
     if expression in known:
         return known[expression]
     name = type(expression).__name__

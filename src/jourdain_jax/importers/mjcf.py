@@ -39,7 +39,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
     - `path`: of the file, or its text.
     - `free`: names of bodies whose place in the frame of their parent is a parameter.
-    - `ignore`: names of elements and attributes that may be left out although they change the motion, such as "armature" or "equality". With
+    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such as "armature" or "equality". With
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
@@ -55,7 +55,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
     **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, moments of inertia that no body has, what is said twice, and
     whatever changes the motion, or is no part of the format, and is not read, such as `tendon`, `armature`, `frictionloss` or a misspelt attribute,
-    unless `ignore` names it. A warning lists what else is left out.
+    unless `ignore` names it. A warning lists what else is omitted.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_labels(free))
@@ -79,7 +79,7 @@ class _Reader:
         self.start: dict[str, float] = {}
 
     def tree(self, free: tuple[str, ...]) -> Tree:
-        """The whole mechanism."""
+        """Return the whole mechanism."""
         for section in self.file.root.findall("worldbody"):
             name = "world" if not self.links else f"world {len(self.links) + 1}"
             looks = self._looks(self._geoms(section, None, "the world"))
@@ -117,7 +117,9 @@ class _Reader:
             self._body(element, parent, given, frame)
 
     def _held(self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE) -> Iterable[tuple[Element, str | None, Place]]:
-        """The elements of a kind in a body, and in frames in it: each with the class around it, and its frame in that of the body."""
+        """Yield the elements of a kind in a body, and in frames in it: each with the class around it, and its
+        frame in that of the body.
+        """
         for child in holder:
             if child.tag == kind:
                 yield child, childclass, frame
@@ -253,7 +255,7 @@ class _Reader:
         return position, turn
 
     def _turn(self, word: str, x: np.ndarray) -> Matrix:
-        """The rotation that an attribute states by these numbers; NaN where they state none."""
+        """Return the rotation that an attribute states by these numbers; NaN where they state none."""
         if word == "quat":
             return by_quaternion(x)
         if word == "axisangle":
@@ -288,7 +290,7 @@ class _Reader:
             yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
-        """The range of a motor's control or force, where it has one: stated, and not switched off."""
+        """Return the range of a motor's control or force, where it has one: stated, and not switched off."""
         low, high = motor.numbers(f"{what}range", 2, [0.0, 0.0])
         limited, inferred = motor.given.get(f"{what}limited", "auto"), self.settings["autolimits"] == "true"
         if (limited == "true" and low >= high) or (limited == "auto" and not inferred and (low, high) != (0.0, 0.0)):
@@ -297,5 +299,5 @@ class _Reader:
 
 
 def _within(frame: Place, inner: Place) -> Place:
-    """A place in a frame, in that which the frame is in."""
+    """Return a place in a frame, in that which the frame is in."""
     return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]

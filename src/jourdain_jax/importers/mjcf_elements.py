@@ -122,7 +122,9 @@ class Defaults:
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> Part:
-        """The element with its attributes completed by its class, or else by that of the bodies around it; checked."""
+        """Return the element with its attributes completed by its class, or else by that of the bodies around
+        it; checked.
+        """
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
             raise self._file.fault(f"{what} is of the class `{name}`, which no `default` states")
@@ -132,5 +134,5 @@ class Defaults:
 
 
 def all_of(file: XmlFile, path: str) -> Part:
-    """All sections at a path as one: of an attribute that several state the last counts."""
+    """Return all sections at a path as one: of an attribute that several state the last counts."""
     return Part(file, f"`{path.rpartition('/')[2]}`", None, {name: value for section in file.root.findall(path) for name, value in section.attrib.items()})

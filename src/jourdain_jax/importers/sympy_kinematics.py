@@ -36,7 +36,7 @@ class Pose:
 
 
 def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
-    """The bodies, and the system with the coordinates that were added."""
+    """Return the bodies, and the system with the coordinates that were added."""
     poses: list[Pose] = []
     angles: dict[Any, tuple] = {}  # frame -> its orientation, the frame that it turns in, its turn there
     for body in system.bodies:
@@ -86,7 +86,7 @@ def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[Mec
 
 
 def _in_own_frame(body, name: str, angle: tuple | None):
-    """The central inertia along the axes of the body."""
+    """Return the central inertia along the axes of the body."""
     ways = [(body.frame, None)] if angle is None else [(body.frame, None), angle[1:]]
     for frame, turn in ways:
         try:
@@ -99,7 +99,9 @@ def _in_own_frame(body, name: str, angle: tuple | None):
 
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
-    """An angle for a frame without orientation: its orientation, the frame that it turns in, and its turn there."""
+    """Return an angle for a frame without orientation: its orientation, the frame that it turns in, and its
+    turn there.
+    """
     sympy = sympy_package()
     for parent, velocity in frame._ang_vel_dict.items():
         try:
@@ -133,7 +135,7 @@ def _constant(system: MechanicalSystem, matrix, what: str):
 
 
 def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
-    """A ValueError where the stated angular velocity is not the rate of the orientation."""
+    """Raise a ValueError where the stated angular velocity is not the rate of the orientation."""
     if pose.frame is None:
         return
     name, stated = f"orientation of body `{pose.name}`", f"angular velocity of body `{pose.name}`"

@@ -26,7 +26,7 @@ class Sample:
 
 
 def symbols_in(expressions: Iterable[Any]) -> set[Any]:
-    """Functions of time, rates of these, and symbols in some expressions."""
+    """Return functions of time, rates of these, and symbols in some expressions."""
     sympy = sympy_package()
     time = sympy.physics.mechanics.dynamicsymbols._t
     found: set[Any] = set()
@@ -36,7 +36,8 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
 
 
 def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()) -> list[Sample]:
-    """The first random states at which all expressions are finite, with the nearest speeds at which the `rows` vanish, which are affine in them.
+    """Return the first random states at which all expressions are finite, with the nearest speeds at which
+    the `rows` vanish, which are affine in them.
 
     Constants have their numbers where these are given. ValueError, which names a list, where there are too few such states.
     """
@@ -86,7 +87,7 @@ def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speed
 
 
 def _meeting(both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]) -> dict[Any, float]:
-    """The nearest speeds at which the rows vanish; NaN where these have no numbers."""
+    """Return the nearest speeds at which the rows vanish; NaN where these have no numbers."""
     u = np.array([leaves[speed] for speed in speeds])
     u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if np.isfinite(both).all() else u * np.nan
     return dict(zip(speeds, map(float, u), strict=True))

@@ -36,7 +36,7 @@ class _Expressions:
     formulas: dict[str, Formulas]  # bodies, rates, loads, and geometric and velocity rows
 
     def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Scalar]]:
-        """The values of a part; `others`: speeds and inputs, where it depends on these."""
+        """Return the values of a part; `others`: speeds and inputs, where it depends on these."""
         leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
             leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
@@ -129,7 +129,7 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
 
 
 def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type[Scene]:
-    """The class, when all poses are known."""
+    """Return the class, when all poses are known."""
     bodies: dict[Any, Any] = {}
     for pose in poses:
         bodies |= {("mass", pose.name): [pose.mass], ("position", pose.name): pose.position}
@@ -174,9 +174,10 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
 
 
 def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str, Any], Any]:
-    """The loads by kind and place, inertial frame: "weight" (constant, so that it has a potential), "force" and "torque" of a body, "generalized" of a speed.
+    """Return the loads by kind and place, inertial frame: "weight" (constant, so that it has a potential),
+    "force" and "torque" of a body, "generalized" of a speed.
 
-    A force on a point that is no mass centre, and a torque on a frame that is no body's, count by the power that they have by SymPy's velocity of that
+    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by the power that they have by SymPy's velocity of that
     point or frame: Q_k = F . dv/du_k.
     """
     sympy = sympy_package()
@@ -215,7 +216,9 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
 
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
-    """A ValueError for a function of time that no kinematic equation gives, where it can be no input: a rate, or one that poses depend on."""
+    """Raise a ValueError for a function of time that no kinematic equation gives, where it can be no input: a
+    rate, or one that poses depend on.
+    """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds
         advice = "loads and rows may depend on speeds, not on their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
@@ -226,7 +229,7 @@ def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
 
 
 def _check_values(given: Mapping[str, float], names: set[str]) -> None:
-    """A ValueError for constants without a value, and values of nothing."""
+    """Raise a ValueError for constants without a value, and values of nothing."""
     if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
         raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each constant, by symbol or name")

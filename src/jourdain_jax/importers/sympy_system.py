@@ -27,7 +27,7 @@ class MechanicalSystem:
     auxiliary: tuple[Any, ...]  # speeds that are zero
 
     def resolved(self, expression):
-        """The expression (or matrix) without rates of coordinates and auxiliary speeds."""
+        """Return the expression (or matrix) without rates of coordinates and auxiliary speeds."""
         zero = dict.fromkeys((*self.auxiliary, *(speed.diff(self.time) for speed in self.auxiliary)), 0)
         return sympy_package().sympify(expression).xreplace(self.rates).xreplace(zero)
 
@@ -36,7 +36,7 @@ class MechanicalSystem:
         return tuple(sympy_package().sympify(row).diff(self.time) for row in self.configuration)
 
     def with_coordinates(self, rates: dict[Any, Any]) -> "MechanicalSystem":
-        """The system with further coordinates, whose rates are given."""
+        """Return the system with further coordinates, whose rates are given."""
         new = {coordinate.diff(self.time): self.resolved(rate) for coordinate, rate in rates.items()}
         return replace(self, coordinates=(*self.coordinates, *rates), rates=self.rates | new)
 
@@ -46,7 +46,7 @@ class MechanicalSystem:
         return sympy_package().physics.mechanics.dynamicsymbols._t
 
     def is_constant(self, expression) -> bool:
-        """Whether it depends on constants only."""
+        """Return whether it depends on constants only."""
         return not expression.has(self.time) and not expression.atoms(sympy_package().core.function.AppliedUndef)
 
 

@@ -121,7 +121,7 @@ class Tree:
     start: dict[str, float] = field(default_factory=dict)  # coordinate -> value that the file states
 
     def moving(self) -> set[str]:
-        """Names of the links that any joint moves."""
+        """Return names of the links that any joint moves."""
         found: set[str] = set()
         for link in self.links:
             if link.joints or link.parent in found:

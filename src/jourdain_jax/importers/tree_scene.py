@@ -112,7 +112,7 @@ class TreeScene(Scene):
         return getattr(self, f"{self._names[link.name]}_mass_centre", np.zeros(3))
 
     def _of_push(self, motion, push: Push, size):
-        """The force and the torque of a motor."""
+        """Yield the force and the torque of a motor."""
         body, link = motion[push.link], next(link for link in self._tree.links if link.name == push.link)
         yield point_force(body.point(push.point - self._centre(link)), size * (body.orientation @ push.force))
         if np.any(push.torque):
@@ -133,7 +133,7 @@ def _array(x) -> Float[Array, "*shape"]:
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
-    """The coordinates of a joint, as `coordinates` takes them; without a prefix for the base."""
+    """Return the coordinates of a joint, as `coordinates` takes them; without a prefix for the base."""
     label = f"{name}_" if joint.name else ""
     if joint.kind == "ball":
         return (quaternion(name),)
@@ -145,7 +145,7 @@ def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
 
 
 def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
-    """The frame after a joint has moved it."""
+    """Return the frame after a joint has moved it."""
     label = f"{name}_" if joint.name else ""
     if joint.kind == "slide":
         return R, origin + R @ joint.axis * (q[name] - joint.reference)

@@ -76,7 +76,7 @@ def from_urdf(
     - `free`: names of links whose place in the frame of their parent is a parameter.
     - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held: `locked={"thumb": 0.0}`.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
-    - `ignore`: what may be left out without a word: names of elements and attributes, "friction", or "text" between elements. With
+    - `ignore`: what may be omitted without a word: names of elements and attributes, "friction", or "text" between elements. With
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
@@ -88,7 +88,7 @@ def from_urdf(
     **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
     loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a
     joint with friction, what is said twice; and by its name all that an element of a URDF does not hold: a misspelt attribute, `spring` of `dynamics`,
-    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are left out, such as `gazebo` and `transmission`.
+    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are omitted, such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
@@ -113,7 +113,7 @@ class _Reader:
                 raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; {nearest(name, self.joints)}")
 
     def tree(self, base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
-        """The whole mechanism."""
+        """Return the whole mechanism."""
         above: dict[str, tuple[str, str]] = {}  # link -> its joint and its parent
         for name, joint in self.joints.items():
             child, parent = (self._end(joint, which) for which in ("child", "parent"))
@@ -216,7 +216,7 @@ class _Reader:
         return Look(look, size, *_origin(visual), colour, opacity, path)
 
     def _mesh_path(self, name: str | None) -> str | None:
-        """The file of a mesh, if it is there."""
+        """Return the file of a mesh, if it is there."""
         if not name:
             return None
         here = self.file.folder

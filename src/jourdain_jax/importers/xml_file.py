@@ -104,7 +104,9 @@ class XmlFile:
             self.refuse("text", f"the text `{shortened(text)}` in {what}", "state numbers in attributes")
 
     def check_attributes(self, kind: str, attributes: Mapping[str, str], what: str) -> None:
-        """A ValueError for an attribute that elements of a kind do not have here, unless it is to be ignored, or one with an unknown value."""
+        """Raise a ValueError for an attribute that elements of a kind do not have here, unless it is to be
+        ignored, or one with an unknown value.
+        """
         holds = self.table[kind]
         for name, value in attributes.items():
             if value not in holds.words.get(name, (value,)):
@@ -113,7 +115,7 @@ class XmlFile:
                 self.refuse(name.rpartition("}")[2], f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}', valid=holds.read)
 
     def leave_out(self, what: str) -> None:
-        """Note that something is left out that moves nothing, or that the user wants to be left out."""
+        """Record an omitted element that moves nothing, or that the user ignores."""
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
@@ -130,7 +132,7 @@ class XmlFile:
             warnings.warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
 
     def fault(self, what: str) -> ValueError:
-        """The error of this file."""
+        """Return the error of this file."""
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
@@ -140,7 +142,9 @@ class XmlFile:
         check_name(name, valid, f"{self.source}: {what}")
 
     def named(self, kind: str) -> "dict[str, Part]":
-        """The elements of a kind in the root, by their names; ValueError where one has none, or two have the same."""
+        """Return the elements of a kind in the root, by their names; ValueError where one has none, or two
+        have the same.
+        """
         found: dict[str, Part] = {}
         for element in self.root.findall(kind):
             name = element.get("name")
@@ -172,11 +176,11 @@ class Part:
         return word in self.given
 
     def children(self, *kinds: str) -> list[Element]:
-        """The elements of some kinds in it."""
+        """Return the elements of some kinds in it."""
         return [] if self.element is None else [child for child in self.element if child.tag in kinds]
 
     def child(self, kind: str) -> "Part":
-        """The element of a kind in it."""
+        """Return the element of a kind in it."""
         return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
 
     def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
@@ -194,11 +198,11 @@ class Part:
         return found
 
     def number(self, word: str, default: float | None = None) -> float:
-        """The one number in an attribute."""
+        """Return the one number in an attribute."""
         return float(self.numbers(word, 1, None if default is None else [default])[0])
 
     def direction(self, word: str, default) -> Float[np.ndarray, "3"]:
-        """The unit vector along three numbers. ValueError where these are zero."""
+        """Return the unit vector along three numbers. ValueError where these are zero."""
         along = self.numbers(word, 3, default)
         if not np.any(along):
             raise self.fault(word, "zero, expected a direction")

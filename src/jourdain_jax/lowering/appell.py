@@ -79,7 +79,7 @@ class AppellOnGraph:
             simplify_contacts(traced, self._forms)
 
     def build(self, strategy: Strategy) -> Equations:
-        """The equations by one strategy."""
+        """Return the equations by one strategy."""
         forms = self._forms(strategy.most_terms)
         held = self._at_reference(strategy.held)
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.by_determinants)
@@ -332,13 +332,13 @@ class _Kinematics:
         return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
     def rates_along_motion(self, raw: list[int]) -> list[int]:
-        """Rates of traced nodes along the motion, at the held coordinates."""
+        """Return rates of traced nodes along the motion, at the held coordinates."""
         return self._along(self._at(raw), raw, self.qdot)
 
     # helpers
 
     def _at(self, nodes) -> list[int]:
-        """Nodes at the held coordinates, simplified."""
+        """Return nodes at the held coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
 
     def _turned(self, R, w) -> list[int]:

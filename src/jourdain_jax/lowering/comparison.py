@@ -20,7 +20,7 @@ LIKELY = "a body, load or row has more than one derivative there, as at a kink, 
 
 
 def rates_of(found: Equations) -> list[int]:
-    """The nodes of qdot and ydot."""
+    """Return the nodes of qdot and ydot."""
     return [*found.qdot, *found.ydot]
 
 

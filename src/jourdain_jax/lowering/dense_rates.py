@@ -27,7 +27,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
-    """Rates of coordinates and of the independent speeds, and values of the stop events, at many states; NaN where accelerations are not determined.
+    """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
+    states; NaN where accelerations are not determined.
 
     All arrays have an axis of states first, parameters too. `independent`: speeds in the state; where these are not all, the others follow from the rows.
     """
@@ -44,7 +45,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
 
     functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
-    # 4096 states times directions are worked out at once
+    # 4096 states times directions are computed at once
     size = -(-len(t) // (1 + u.size // 4096))
     found = [_rates(functions, structure, independent, *jax.tree.map(lambda x, i=i: x[i : i + size], states)) for i in range(0, len(t), size)]
     return tuple(map(np.concatenate, zip(*found, strict=True)))

@@ -39,7 +39,9 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """The nodes as expressions where these are short (60 characters, of 8 nodes at most), otherwise how many there are."""
+    """Return the nodes as expressions where these are short (60 characters, of 8 nodes at most), otherwise
+    how many there are.
+    """
     names = identifiers(lowered)
     written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
     short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= 60]
@@ -63,7 +65,7 @@ def _speeds(lowered) -> list[str]:
 
 
 def identifiers(lowered) -> dict[int, str]:
-    """A readable name for every input of the program, each its own."""
+    """Return a readable name for every input of the program, each its own."""
     traced = lowered.traced
     named = [(traced.t, "t")]
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
@@ -87,13 +89,13 @@ def _identifier(name: str) -> str:
 
 
 def results(lowered) -> dict[str, int]:
-    """Name -> node of every rate."""
+    """Return name -> node of every rate."""
     rates = {f"d_{_identifier(name)}": n for name, n in zip(lowered.coordinates, lowered.qdot, strict=True)}
     return rates | {f"d_{_identifier(lowered.speeds[i])}": n for i, n in zip(lowered.independent, lowered.ydot, strict=True)}
 
 
 def _prefix(letter: str, names) -> str:
-    """A prefix for numbered names of our own that no name of the scene has."""
+    """Return a prefix for numbered names of our own that no name of the scene has."""
     return _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
 
 
@@ -142,7 +144,9 @@ def _conventions(lowered) -> str:
 
 
 def c_source(lowered, name: str = "rates") -> str:
-    """One C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; needs the mathematical library."""
+    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; needs
+    the mathematical library.
+    """
     traced, rates = lowered.traced, results(lowered)
     names = {n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given for n, given in identifiers(lowered).items()}
     flat = [int(n) for nodes in traced.parameters for n in np.ravel(nodes)]
@@ -174,13 +178,13 @@ def c_source(lowered, name: str = "rates") -> str:
 
 
 def expressions(lowered) -> dict:
-    """Name -> SymPy expression of every rate, in the parameters and the state; needs SymPy."""
+    """Return name -> SymPy expression of every rate, in the parameters and the state; needs SymPy."""
     rates = results(lowered)
     return dict(zip(rates, sympy_expressions(lowered.graph, list(rates.values()), identifiers(lowered)), strict=True))
 
 
 def latex(lowered) -> str:
-    """The equations for an `align` environment, long numbers with six digits; needs SymPy.
+    """Return the equations for an `align` environment, long numbers with six digits; needs SymPy.
 
     Speeds that are the rate of a coordinate stand as its derivative, which needs no equation.
     """
@@ -201,7 +205,7 @@ def latex(lowered) -> str:
 
 
 def _symbol(name: str) -> str:
-    """A letter, Latin or Greek, with its number as index, in italics; words upright."""
+    """Return a letter, Latin or Greek, with its number as index, in italics; words upright."""
     import sympy
 
     letter = name.rstrip("0123456789").rstrip("_")

@@ -19,7 +19,7 @@ def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
     """Return probes with coordinates up to half a turn away from the given ones, projected onto the geometric
     constraints where Newton's method converges; made on first use.
 
-    Quaternions are drawn anew.
+    Quaternions are drawn again.
     """
     return cache(lambda: _at_full_turns(probes, traced))
 

@@ -36,7 +36,9 @@ def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int]
 
 
 def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
-    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on anywhere."""
+    """Return coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on
+    anywhere.
+    """
     probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
     attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]

@@ -3,7 +3,7 @@ multipliers are not determined.
 
 A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds, with as many rows as there are
 C' M C ydot = C' (f - M c)                                                                             (41)
-z <- z + dz,   A_z dz = -phi(t, q, u)         speeds put back onto the rows
+z <- z + dz,   A_z dz = -phi(t, q, u)         speeds projected onto the constraints
 """
 
 from jourdain_jax.build.structure import Structure

@@ -42,7 +42,8 @@ MOST_TERMS = 200  # of one normal form
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
-    """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds.
+    """Return the lowered equations of the scene's class, or the reason why there are none. Built once per
+    class, shapes and privileged speeds.
 
     `every_speed`: all speeds stay in the state, rows are kept by multipliers; default: where no privileged speeds serve everywhere.
     """
@@ -78,7 +79,7 @@ def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lo
     """Return the program, which depends on the structure's `kept` part, not on the values of parameters."""
     begin = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):  # what is no number at a probe does not count there
+        with np.errstate(all="ignore"):  # what is not a number at a probe does not count there
             found = _built(scene, structure_whatever_its_faults(scene), every_speed, massless)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback

@@ -66,7 +66,7 @@ class Lowered:
     event_relations: tuple[int, ...]  # and those that do so in stop events besides
     jumps: tuple[int, ...]  # of the relations, those at whose zeros rates may jump
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
-    projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
+    projected_u: tuple[int, ...]  # all speeds projected onto the constraints; none where dependent speeds are eliminated
     at_start: tuple[int, ...]  # contacts that switch at the start of a motion: `switching.Begun`
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
     left_out: tuple[str, ...]  # rows that follow from the others
@@ -87,30 +87,39 @@ class Lowered:
         return self.graph.operations([*self.qdot, *self.ydot])
 
     def summary(self) -> str:
-        """Operations after each step, omitted parts with reasons, the chosen privileged speeds."""
+        """Return operations after each step, omitted parts with reasons, the chosen privileged speeds."""
         return export.summary(self)
 
     def __str__(self) -> str:
         return self.summary()
 
     def python_source(self) -> str:
-        """The program as readable Python, in SI units and radians: `fixed(parameters)` and `rates(fixed, t, state)`."""
+        """Return the program as readable Python, in SI units and radians: `fixed(parameters)` and
+        `rates(fixed, t, state)`.
+        """
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """The program as one C function `name`, in SI units and radians; its comment says which number is which."""
+        """Return the program as one C function `name`, in SI units and radians; its comment says which number
+        is which.
+        """
         return export.c_source(self, name)
 
     def expressions(self) -> dict:
-        """Name -> SymPy expression of every rate; needs SymPy. For small scenes: large ones give pages."""
+        """Return name -> SymPy expression of every rate; needs SymPy. For small scenes: large ones give
+        pages.
+        """
         return export.expressions(self)
 
     def latex(self) -> str:
-        """One equation per rate, for an `align` environment, long numbers with six digits; needs SymPy."""
+        """Return one equation per rate, for an `align` environment, long numbers with six digits; needs
+        SymPy.
+        """
         return export.latex(self)
 
     def _repr_latex_(self) -> str | None:
-        """The equations in a notebook, if they are short; otherwise, and without SymPy, the summary."""
+        """Return the equations in a notebook, if they are short; otherwise, and without SymPy, the summary.
+        """
         # 100 operations of a program whose equations a notebook shows
         if self.operations > 100 or importlib.util.find_spec("sympy") is None:
             return None
@@ -144,7 +153,7 @@ class Lowered:
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
         """Return `rates`; the pivots, which must keep their signs; directions; and the smallest sine between a row that is
-        kept by multipliers and those before it, None where there are none. The last three are numbers to differentiation.
+        kept by multipliers and those before it, None if there are none. The last three are numbers to differentiation.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
@@ -205,7 +214,7 @@ class Lowered:
         return (*self.relations, *(self.event_relations if has_events else ()))
 
     def values(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
-        """Values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
+        """Return values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
 

@@ -56,7 +56,7 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion goes on, and the program does not serve
+    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion continues, and the program does not serve
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
@@ -81,14 +81,14 @@ def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -
 
 
 def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:
-    """One step of Gauss-Newton towards `closure = 0`."""
+    """Return one step of Gauss-Newton towards `closure = 0`."""
     G = matrix(graph, closure, q)
     correction = solve_symmetric(graph, _products(graph, G, G, NormalForms(graph, 0)), [closure]).solution[0]
     return _less(graph, q, G, correction)
 
 
 def projected_speeds(graph: Graph, M: Columns, A: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
-    """The speeds on `phi = 0`, nearest in the metric of M."""
+    """Return the speeds on `phi = 0`, nearest in the metric of M."""
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
     return _less(graph, u, impulses, multipliers)

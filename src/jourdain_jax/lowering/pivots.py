@@ -87,13 +87,13 @@ class Pivots:
             self._judged.pop(row, None)
 
     def _in_row(self, row: int) -> list[int]:
-        """The columns left in which a row holds something, in order."""
+        """Return the columns left in which a row holds something, in order."""
         if row not in self._entries:
             self._entries[row] = [k for k, n in enumerate(self.A[row]) if n != self.graph.zero]
         return [k for k in self._entries[row] if k in self.columns]
 
     def best(self) -> Pivot:
-        """The next pivot. Rows may be combined for it."""
+        """Return the next pivot. Rows may be combined for it."""
         graph, A, rows = self.graph, self.A, self.rows
         judged = [(r, c, entry) for r in sorted(rows) for c, entry in self._judged_row(r).items()]
         if not judged:
@@ -121,7 +121,7 @@ class Pivots:
         return self._by_column((r, c))
 
     def _judged_row(self, row: int) -> dict[int, "_Entry"]:
-        """The entries of a row by column, judged; kept until the row changes."""
+        """Return the entries of a row by column, judged; kept until the row changes."""
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
@@ -142,7 +142,9 @@ class Pivots:
     # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Whether an entry stays away from zero also outside of the domain, wherever the system is regular."""
+        """Return whether an entry stays away from zero also outside of the domain, wherever the system is
+        regular.
+        """
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
         size = np.min(np.abs(ratio), initial=np.inf)
@@ -150,7 +152,7 @@ class Pivots:
         return bool(size > 0.25 or (size > GOOD and not ratio.min() < 0 < ratio.max()))
 
     def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
-        """An entry beside the largest of its row, with its sign."""
+        """Return an entry beside the largest of its row, with its sign."""
         r, c = place
         columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
         places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
@@ -175,7 +177,7 @@ class Pivots:
         return self._kept_regular
 
     def _at(self, nodes) -> np.ndarray:
-        """Values at the probes of the domain and the far ones."""
+        """Return values at the probes of the domain and the far ones."""
         near = self.probes(nodes)
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
@@ -256,7 +258,7 @@ class Pivots:
         return combined(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
-        """The weights of rows in a combination: one where their sizes are alike."""
+        """Return the weights of rows in a combination: one where their sizes are alike."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
         # rows whose sizes differ by more are combined with weights
@@ -265,7 +267,9 @@ class Pivots:
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 
     def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Two rows turned into one with the pivot and one without: `a r + w b s` and `b r - a s`; the determinant keeps its sign."""
+        """Return two rows turned into one with the pivot and one without: `a r + w b s` and `b r - a s`; the
+        determinant keeps its sign.
+        """
         graph, A, (r, s) = self.graph, self.A, users
         a, b = A[r][c], A[s][c]
         first, second = (graph.mul(graph.const(w), n) for w, n in zip(weights, (a, b), strict=True))
@@ -283,7 +287,9 @@ class Pivots:
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """All rows of a column combined into a new one, and made orthogonal to the column (Gram and Schmidt)."""
+        """Return all rows of a column combined into a new one, and made orthogonal to the column (Gram and
+        Schmidt).
+        """
         graph, A = self.graph, self.A
         new = len(A)
         over = graph.div(graph.one, squares)
@@ -306,7 +312,7 @@ class Pivots:
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
-    """Entries beside the largest of their row, which come one after another, and beside `sizes`."""
+    """Return entries beside the largest of their row, which come one after another, and beside `sizes`."""
     values = np.abs(values)
     starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
     largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)
@@ -316,15 +322,15 @@ def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.nda
 
 
 def turns(graph: Graph, node: int) -> bool:
-    """Whether a node is the sine or cosine of a parameter, which may be any angle."""
+    """Return whether a node is the sine or cosine of a parameter, which may be any angle."""
     return graph.op[node] in ("sin", "cos") and graph.op[graph.args[node][0]] == "input" and not graph.varies[node]
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:
-    """The smallest; zero where none is a number."""
+    """Return the smallest; zero where none is a number."""
     return float(np.min(ratio[np.isfinite(ratio)], initial=np.inf)) if np.isfinite(ratio).any() else 0.0
 
 
 def products(graph: Graph, a: Sequence[int], rows) -> list[int]:
-    """The products of a vector with some rows."""
+    """Return the products of a vector with some rows."""
     return [graph.dot(row, a) for row in rows]

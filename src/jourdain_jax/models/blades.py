@@ -101,12 +101,12 @@ class ChaplyginSleigh(Scene):
 
 
 def _level(mass, inertia, x, y, orientation) -> RigidBody:
-    """A body that stays level, of whose moments of inertia only the one about z matters."""
+    """Return a body that stays level, of whose moments of inertia only the one about z matters."""
     return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
 
 
 def _edge(body, point=None) -> Scalar:
-    """The row of a blade along body x, at a point of the body (default: its mass centre)."""
+    """Return the row of a blade along body x, at a point of the body (default: its mass centre)."""
     return knife_edge(body, body.position if point is None else body.place(point), body.orientation[:, 1])
 
 
@@ -220,7 +220,9 @@ class TrailerChain(Scene):
         return self.towing([0.0] * (self.trailers + 1), forward=1.2, turn=0.4)
 
     def towing(self, headings, *, forward=0.0, turn=0.0) -> dict[str, Scalar]:
-        """A start: headings (rad) of the car at the origin and of all trailers, speed (m/s) and turn rate (rad/s) of the car."""
+        """Return a start: headings (rad) of the car at the origin and of all trailers, speed (m/s) and turn
+        rate (rad/s) of the car.
+        """
         headings, lengths = jnp.asarray(headings), self._per_trailer(self.length)
         x = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.cos(headings[1:]))])
         y = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.sin(headings[1:]))])
@@ -262,7 +264,7 @@ class TrailerChain(Scene):
         return {f"axle {i}": _edge(motion[_name(i)]) for i in range(self.trailers + 1)}
 
     def invariants(self, motion):
-        """The car's turn rate, where no torque drives it."""
+        """Return the car's turn rate, where no torque drives it."""
         return {"turn rate of the car": motion.u.turn0}
 
     def _per_trailer(self, value) -> Float[Array, "trailers"]:

@@ -82,7 +82,7 @@ class DoublePendulumRods(_DoublePendulum):
 
 
 def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Particle]:
-    """Two particles at Cartesian coordinates in the x-z plane."""
+    """Return two particles at Cartesian coordinates in the x-z plane."""
     level = jnp.zeros_like(q.x1)
     first, second = jnp.stack([q.x1, level, q.z1]), jnp.stack([q.x2, level, q.z2])
     return {"first": Particle(scene.mass1, first), "second": Particle(scene.mass2, second)}
@@ -173,7 +173,9 @@ class PendulumChain(Heavy):
         return self.hanging([jnp.pi / 3] * self.links)
 
     def hanging(self, angles) -> dict[str, Scalar]:
-        """Coordinates of the chain whose rods hang at these angles (rad) from straight down, positive towards +x."""
+        """Return coordinates of the chain whose rods hang at these angles (rad) from straight down, positive
+        towards +x.
+        """
         angles, lengths = jnp.asarray(angles), self._per_link(self.length)
         x, z = jnp.cumsum(lengths * jnp.sin(angles)), -jnp.cumsum(lengths * jnp.cos(angles))
         return {f"x{i + 1}": x[i] for i in range(self.links)} | {f"z{i + 1}": z[i] for i in range(self.links)}

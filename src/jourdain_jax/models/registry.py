@@ -39,7 +39,9 @@ MODELS = _Models()
 
 
 def model(name: str, **parameters) -> Scene:
-    """A model by name, with parameters changed by name; a ValueError that lists the valid names otherwise."""
+    """Return a model by name, with parameters changed by name; a ValueError that lists the valid names
+    otherwise.
+    """
     kind = known_model(name)
     valid = [field.name for field in fields(kind) if field.init]
     for given in parameters:

@@ -61,7 +61,7 @@ class _TwoWheelAxle(Scene):
         )
 
     def _rolling(self, pose, height: str):
-        """Both wheels roll; each carries itself, the axle bends no load from one to the other."""
+        """Return both wheels roll; each carries itself, the axle bends no load from one to the other."""
         return {wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,)) for wheel in ("wheel1", "wheel2")}
 
     def _axle_row(self, psi1_rate, psi2_rate, phi_rate):

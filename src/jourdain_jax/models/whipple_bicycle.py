@@ -77,7 +77,7 @@ class WhippleBicycle(Scene):
 
     @classmethod
     def from_values(cls, values: Mapping[str, float | Array]) -> "WhippleBicycle":
-        """The bicycle with these 26 parameters by name, as read from a parameter file.
+        """Return the bicycle with these 26 parameters by name, as read from a parameter file.
 
         Raises a ValueError that names parameters which are missing or unknown.
         """
@@ -90,7 +90,9 @@ class WhippleBicycle(Scene):
         return cls(**values)
 
     def upright(self, speed) -> dict[str, Scalar]:
-        """Speeds of running straight and upright at `speed` (m/s), the steady motion of the linear model; all else is zero."""
+        """Return speeds of running straight and upright at `speed` (m/s), the steady motion of the linear
+        model; all else is zero.
+        """
         speed = jnp.asarray(speed, real_type())
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
 
@@ -136,8 +138,9 @@ class WhippleBicycle(Scene):
         }
 
     def mode_names(self, eigenvalues: np.ndarray) -> tuple[str, ...]:
-        """Names of the four modes: weave is the complex pair, or where all are real the two of one sign that meet at a higher speed, which grow when
-        riding forward; of the others castering is the faster one, capsize the slower. None of another number of modes.
+        """Return names of the four modes: weave is the complex pair, or where all are real the two of one
+        sign that meet at a higher speed, which grow when riding forward; of the others castering is the
+        faster one, capsize the slower. None of another number of modes.
         """
         if len(eigenvalues) != 4:
             return ()

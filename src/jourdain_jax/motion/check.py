@@ -55,7 +55,7 @@ def check(scene: Scene | BuiltFor) -> Checked:
 
 
 def _checked(scene: Scene, every_speed: bool | None) -> Checked:
-    """The table, with the program of one state (`lowered`)."""
+    """Return the table, with the program of one state (`lowered`)."""
     known = structure_whatever_its_faults(scene)
     program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene, every_speed)
     found = {

@@ -9,7 +9,7 @@ class Rows:
 
     names: tuple[str, ...]
     rank: int  # at generic states
-    redundant: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    redundant: tuple[str, ...]  # may be omitted together: the others keep the rank at every probed state
     may_set_in: tuple[str, ...]  # redundant at every probed state, but by no identity
     rank_losses: tuple[str, ...]  # probed configurations with fewer independent rows
     affine: bool  # linear or affine in the speeds

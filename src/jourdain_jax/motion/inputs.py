@@ -1,6 +1,6 @@
 """Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
 
-Functions of time are looked at anew in every call, their numbers kept apart from what is done with them.
+Functions of time are looked at again in every call, their numbers kept apart from what is done with them.
 A function is traced where it is handed over. What it closes over (arrays, traced numbers) and the plain numbers in its sums, products, quotients and
 comparisons become arguments of a program, so that they have derivatives; what is left, the operations, is compared by value. So a new function that does
 the same with other numbers compiles nothing, and a function whose globals have changed is another program.
@@ -72,7 +72,7 @@ class TimeProgram:
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
-        """The value at time t; `numbers`: the plain ones; `held`: what the function closes over."""
+        """Return the value at time t; `numbers`: the plain ones; `held`: what the function closes over."""
         given = zip((*numbers, *held, t), self.closed.in_avals, strict=True)
         return jaxpr_as_fun(self.closed)(*(jnp.asarray(x, like.dtype) for x, like in given))[0]
 
@@ -88,7 +88,7 @@ class TimeProgram:
 
 
 def _without_rules(described):
-    """A description without the functions that are somebody's rules of differentiation."""
+    """Return a description without the functions that are somebody's rules of differentiation."""
     if not isinstance(described, tuple):
         return described
     if len(described) == 4 and isinstance(described[0], Primitive) and described[0].name.startswith("custom_"):
@@ -170,7 +170,7 @@ class Sampled(eqx.Module):
         self.ts, self.values = in_default_precision(checked_samples("Sampled", ts, values, 1, "input"))
 
     def __call__(self, t):
-        """Value at time t."""
+        """Return value at time t."""
         return jnp.interp(t, self.ts, self.values)
 
 
@@ -180,7 +180,7 @@ class Constant(eqx.Module):
     value: Float[Array | np.ndarray, "*lanes"]
 
     def __call__(self, t):
-        """The value."""
+        """Return the value."""
         return self.value
 
 
@@ -193,7 +193,7 @@ class Mode(eqx.Module):
     direction: Float[Array, ""] | None = None  # 1, or -1 where time runs back
 
     def __call__(self, t):
-        """The number at time t; at a transition the one after it."""
+        """Return the number at time t; at a transition the one after it."""
         if self.ts is None or self.values is None:
             return self.value
         passed = jnp.searchsorted(*jax.lax.stop_gradient((self.ts, t * self.direction)), side="right")
@@ -206,7 +206,7 @@ class Inputs(eqx.Module):
     channels: tuple[Callable, ...]
 
     def __call__(self, t) -> Float[Array, "inputs"]:
-        """The vector of inputs at time t."""
+        """Return the vector of inputs at time t."""
         return jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
     @property
@@ -220,7 +220,7 @@ class Inputs(eqx.Module):
         return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
-        """Values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
+        """Return values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
         t = jnp.asarray(t, real_type())
         try:
             values, rates = jax.jvp(self, (t,), (jnp.ones_like(t),))
@@ -376,10 +376,10 @@ class SeenFromWithin(eqx.Module):
     """An input by samples, at times of a step: at a knot it is on the line that belongs to the step."""
 
     sampled: Sampled
-    middle: PerLane  # s, of the step; infinite where there is none
+    middle: PerLane  # s, of the step; infinite if there is none
 
     def __call__(self, t):
-        """The value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
+        """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
         ts, values = self.sampled.ts, self.sampled.values
         at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
         # 2.0**-10 of the way to the middle of a step: so far inside a time at its end lies to see on which side of a knot it is

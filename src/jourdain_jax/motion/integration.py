@@ -1,6 +1,6 @@
 """One motion from start to end as one compiled program, by one of two integrators: our own loop over steps, or diffrax.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
+Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are computed, and all is put into a
 `Trajectory`.
 
 Two more checks are result codes, inside `jit` and in every lane. Where nothing does work that no potential accounts for, T + V is constant for a right motion.
@@ -9,7 +9,7 @@ all numbers together, N steps change the energy by some N dE, and round-off by s
 larger than half of N dE; ten times as much, and at least 1 % of the energy that moves, means that the motion is not that of the
 scene: it went through a singular position, or over a feature, without notice. And rows that depend on each other may contradict each other on the way,
 
-    A u + phi_0 = 0,   rank A < number of rows:   a row that is left out holds by itself only where phi_0 is in the range of A
+    A u + phi_0 = 0,   rank A < number of rows:   a row that is omitted holds by itself only where phi_0 is in the range of A
 
 although the start meets all of them; where phi_0 = 0 they never do.
 """
@@ -81,7 +81,9 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(setups: Setup) -> Trajectory:
-    """The motions of all lanes: `own_steps.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
+    """Return the motions of all lanes: `own_steps.width` lanes at a time where the rates are a scalar
+    program, otherwise under `vmap`.
+    """
     given = eqx.filter_vmap(_in_contact)(_with_machine_code(_prepared(setups)))
     setups, asked = eqx.filter_vmap(_entered)(given)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
@@ -100,7 +102,9 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
 
 
 def _in_contact(setup: Setup) -> Setup:
-    """The setup with contacts that switch in the modes of the start, which is on the ground where they touch it."""
+    """Return the setup with contacts that switch in the modes of the start, which is on the ground where they
+    touch it.
+    """
     scene, t0, start = setup.scene, setup.t0, setup.start
     if not scene.switching.contacts:
         return setup
@@ -263,7 +267,7 @@ DRIFTED = 1e-2  # of the energy that moves
 
 
 def conserves(setup: Setup) -> bool:
-    """Whether T + V is constant along a motion whose steps are taken by tolerances.
+    """Return whether T + V is constant along a motion whose steps are taken by tolerances.
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
@@ -283,7 +287,7 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
 
 
 def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
-    """Whether T + V changed by more than N `steps` explain."""
+    """Return whether T + V changed by more than N `steps` explain."""
     at, off = energies
     T, V = at.T
     E, error = T + V, jnp.sum(jnp.abs(off - at) + jnp.finfo(at.dtype).eps * jnp.abs(at), axis=1)

@@ -8,7 +8,7 @@ from jourdain_jax.calculus.reals import F
 
 
 def nan_is_a_mark():
-    """A context in which JAX does not look for NaN."""
+    """Return a context in which JAX does not look for NaN."""
     return jax.debug_nans(False)
 
 

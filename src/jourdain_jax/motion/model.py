@@ -137,7 +137,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def program(self) -> Lowered | None:
-        """The scalar program; None where there is none."""
+        """The scalar program; None if there is none."""
         found = self._lowered
         return found if isinstance(found, Lowered) else None
 
@@ -242,7 +242,7 @@ def _flattened(model: Model) -> tuple[tuple, tuple]:
 
 
 def _unflattened(static: tuple, children: tuple) -> Model:
-    model = object.__new__(Model)  # anything may stand in the place of numbers
+    model = object.__new__(Model)  # anything may stand in place of numbers
     (scene, arrays), (formulation, backend, decided, memory) = children, static
     vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, memory=memory, made=None)
     return model

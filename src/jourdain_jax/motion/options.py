@@ -105,7 +105,7 @@ OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
 def _register(kind: type[Options]) -> None:
-    """Register a kind of options as a pytree whose leaves may be anything."""
+    """Register a kind of options as a pytree whose leaves is arbitrary."""
     names = [field.name for field in fields(kind)]
     leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
 

@@ -50,7 +50,7 @@ class OwnSteps(Integrator):
     native: bool  # whether machine code may integrate
     order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
     memory: int  # bytes that the record of reverse mode may take
-    most: int  # events after which a motion goes on
+    most: int  # events after which a motion continues
     stopping: bool  # whether other events end it
     own: ClassVar[bool] = True
 
@@ -140,7 +140,8 @@ def own_steps(solver, **static) -> OwnSteps | None:
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
-    """The motion that `run` finds from a number to others, its start and states moved to the times of the setup.
+    """Return the motion that `run` finds from a number to others, its start and states moved to the times of
+    the setup.
 
     A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
     otherwise.
@@ -181,7 +182,9 @@ def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Calla
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Why no step watches the relations that the loads of a scene, or its stop events, have; empty where one does, or they have none."""
+    """Return why no step watches the relations that the loads of a scene, or its stop events, have; empty
+    where one does, or they have none.
+    """
     if setup.field.lowered is None:
         return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
     count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
@@ -207,7 +210,9 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
-    """The program with the functions of time among the inputs, where it takes these, and the relations in it."""
+    """Return the program with the functions of time among the inputs, where it takes these, and the relations
+    in it.
+    """
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
@@ -224,7 +229,8 @@ def _values(program: Lowered, nodes: tuple[int, ...], args, tau, y) -> Float[Arr
 
 
 def _given(count: int, inputs: Inputs, t) -> Float[Array, "given"]:
-    """Numbers of the functions of time, and values of the `count` inputs that are left to the program."""
+    """Return numbers of the functions of time, and values of the `count` inputs that are left to the program.
+    """
     functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)] if count < len(inputs.channels) else []
     numbers = [x for channel in functions for x in numbers_of(channel)]
     values = [channel(t) for channel in inputs.channels if not (functions and isinstance(channel, FunctionOfTime))]

@@ -60,7 +60,7 @@ class State(Printed, eqx.Module):
     guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
     def __getitem__(self, name: str):
-        """A coordinate, speed, quaternion or angular velocity by name."""
+        """Return a coordinate, speed, quaternion or angular velocity by name."""
         coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
         return coordinates[name] if name in coordinates else speeds[name]
 
@@ -109,7 +109,7 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
         low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
         affine = structure_whatever_its_faults(scene).affine
         return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), affine, determined, program)
-    except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
+    except ValueError:  # of a scene that is wrong in itself; said where its structure is requested
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
 
@@ -150,7 +150,9 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
-    """How rows are evaluated where XLA puts something onto them, or a derivative or a search needs them."""
+    """Return how rows are evaluated where XLA puts something onto them, or a derivative or a search needs
+    them.
+    """
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
@@ -185,13 +187,13 @@ class Guess(NamedTuple):
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
-        """Which coordinates are where they may be found."""
+        """Return which coordinates are where they may be found."""
         q = jax.lax.stop_gradient(q)
         return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
 
 def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
-    """Which of these entries are not held."""
+    """Return which of these entries are not held."""
     return np.array([name not in held for name in names], bool)
 
 
@@ -202,7 +204,8 @@ def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
 
 
 def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
-    """The start on the constraints, and whether its coordinates arrived, where they may be found; no search where `guesses` is None.
+    """Return the start on the constraints, and whether its coordinates arrived, where they may be found; no
+    search where `guesses` is None.
 
     The residual is infinite where a number is not finite, or a coordinate was found where it may not be.
     """
@@ -237,7 +240,7 @@ def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:
 
 
 def _arrived(q, near_q, g, start: Guess) -> Bool[Array, ""]:
-    """Whether the rows are met, where coordinates may be found and without running far away."""
+    """Return whether the rows are met, where coordinates may be found and without running far away."""
     # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
     close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
     return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
@@ -254,7 +257,7 @@ class _Put(NamedTuple):
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
-    """Coordinates from the first guess that leads to the rows, q itself counting as the first."""
+    """Return coordinates from the first guess that leads to the rows, q itself counting as the first."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
@@ -274,12 +277,15 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
 
 
 def contradiction(dtype) -> float:
-    """The residual (m, rad) from which on given values contradict each other: that of numbers typed with a few digits, or of round-off."""
+    """Return the residual (m, rad) from which on given values contradict each other: that of numbers typed
+    with a few digits, or of round-off.
+    """
     return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: of numbers typed with a few digits
 
 
 def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
-    """Whether values that are held, where entries are not free, may contradict each other; `known`: of the scene.
+    """Return whether values that are held, where entries are not free, may contradict each other; `known`: of
+    the scene.
 
     rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: their columns of what is free
 

@@ -133,7 +133,9 @@ def lost_codes(field: VectorField) -> tuple[int, ...]:
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
-    """Whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where its numbers are not known."""
+    """Return whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where
+    its numbers are not known.
+    """
     known = numbers_where_known((field, motion, t0))
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or known is None:
         return False
@@ -146,7 +148,7 @@ def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
 
 @eqx.filter_jit
 def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state state"]:
-    """Derivative of the rates at the end state, with respect to the state without the work."""
+    """Return derivative of the rates at the end state, with respect to the state without the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
     y = field.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))

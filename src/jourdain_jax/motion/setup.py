@@ -25,11 +25,11 @@ from jourdain_jax.scene.scene import Scene
 
 MEMORY = 2**32  # bytes, where no model states others
 LONGEST = 1 / 16  # of the span: the longest step, by default
-_SHORT = 1e-9  # s, a span for motions that are not asked for
+_SHORT = 1e-9  # s, a span for motions that are not requested
 
 
 class Passed(eqx.Module):
-    """The events after which a motion went on."""
+    """The events after which a motion continued."""
 
     ts: Float[Array | np.ndarray, "transitions *lanes"]  # since the start; infinite beyond the last one
     events: Int[Array | np.ndarray, "transitions *lanes"]
@@ -85,12 +85,12 @@ class Integrator(abc.ABC):
     max_steps: int
     event_names: tuple[str, ...]
     solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
-    own: ClassVar[bool]  # whether steps watch relations (`crossings.py`), and states are put onto the rows
+    own: ClassVar[bool]  # whether steps watch relations (`crossings.py`), and states are projected onto the constraints
 
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """The solver, as it stands in a trajectory."""
+        """The solver, as shown in a trajectory."""
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
@@ -145,7 +145,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         return self.integrator.max_steps + (0 if knots is None else len(knots))
 
     def goals(self, ts) -> Float[Array, "times *lanes"]:
-        """Times since the start to reach: the saved times, and the end."""
+        """Return times since the start to reach: the saved times, and the end."""
         return jnp.concatenate([ts, self.t1[None]]) - self.t0
 
     @property
@@ -170,7 +170,9 @@ class Begun(eqx.Module):
 
 
 def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
-    """Whether the span is finite and not empty, and the times to save at lie in it, one after another; also of traced times."""
+    """Return whether the span is finite and not empty, and the times to save at lie in it, one after another;
+    also of traced times.
+    """
     xp = array_module((ts, t0, t1))
     direction = xp.sign(t1 - t0)
     # times at an end of the span may lie beyond it by four units in the last place

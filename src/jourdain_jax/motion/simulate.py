@@ -104,7 +104,9 @@ def simulate(
 
 
 def _integrated(setup: Setup) -> Trajectory:
-    """The motion; under `jax_debug_nans`, NaN after an event is a mark, and a motion that failed is integrated again for JAX to find the NaN."""
+    """Return the motion; under `jax_debug_nans`, NaN after an event is a mark, and a motion that failed is
+    integrated again for JAX to find the NaN.
+    """
     if not jax.config.jax_debug_nans:
         return integrate(setup)
     with nan_is_a_mark():
@@ -188,7 +190,8 @@ _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 
 
 def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, inputs=None) -> State:
-    """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
+    """Return a state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`),
+    or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
     """

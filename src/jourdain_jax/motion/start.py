@@ -90,7 +90,7 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
-    In a program that is exported, pass `jj.build(scene, backend="xla")` in the place of the scene.
+    In a program that is exported, pass `jj.build(scene, backend="xla")` in place of the scene.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
     domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
     """

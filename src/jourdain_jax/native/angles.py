@@ -21,7 +21,9 @@ from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """A polynomial by Horner's rule, highest power first; of a long one, even and odd powers side by side."""
+    """Return a polynomial by Horner's rule, highest power first; of a long one, even and odd powers side by
+    side.
+    """
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
         return w.fma(polynomial(w, coefficients[1 - odd :: 2], square), x, polynomial(w, coefficients[odd::2], square))
@@ -52,7 +54,7 @@ def product_less(w: Writer, a: Value, b: Value, c: Value) -> Value:
 
 
 def _halves(w: Writer, a: Value) -> tuple[Value, Value]:
-    """Two numbers of 26 and 27 bits, whose sum is a."""
+    """Return two numbers of 26 and 27 bits, whose sum is a."""
     high = w.converted("bitcast", w.converted("bitcast", a, w.whole) & -(2**27), w.real)
     return high, a - high
 
@@ -112,7 +114,9 @@ def tangent(w: Writer, x: Value) -> Value:
 
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
-    """The quick values, but others in the lanes whose angle is large; these are functions of their own, so that what is usual runs past them."""
+    """Return the quick values, with others in lanes with large angles; these are separate functions, so that
+    the usual path skips them.
+    """
     far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
         w.store(value, place)
@@ -143,7 +147,7 @@ _FAR_TANGENT = {"far_tangent": _tangent}
 
 
 def _reduced(w: Writer, x: Value) -> tuple[Value, Value, Value]:
-    """What whole quarter turns leave of an angle that is not large, by how much that is over, and how many turns they are."""
+    """Return the remainder of an angle after whole quarter turns, its low part, and the number of turns."""
     shifted = w.fma(x, 2 / math.pi, WHOLE)
     turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
     near = w.fma(-turns, HALF_PI[0], x)  # exact
@@ -271,7 +275,8 @@ def _tiny(a: Value) -> Value:
 
 
 def _direction(w: Writer, across: Value, x: Value) -> Value:
-    """The angle from 0 to pi of a point with the coordinates x, `across`; the second is not negative."""
+    """Return the angle from 0 to pi of a point with the coordinates x, `across`; the second is not negative.
+    """
     along = w.magnitude(x)
     steep = across > along
     a, b = w.where(steep, along, across), w.where(steep, across, along)
@@ -315,7 +320,9 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> tuple[Value, Value, Value]:
-    """Whether |x| is above 1/2, and the arc whose sine is |x|, or there sqrt((1 - |x|)/2), in two parts."""
+    """Return whether |x| is above 1/2, and the arc whose sine is |x|, or there sqrt((1 - |x|)/2), in two
+    parts.
+    """
     a = w.magnitude(x)
     large = a > 0.5
     square = w.where(large, 0.5 - 0.5 * a, a * a)

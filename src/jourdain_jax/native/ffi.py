@@ -46,7 +46,7 @@ _REGISTERING = threading.Lock()
 
 @functools.cache
 def version() -> tuple[int, int] | None:
-    """Major and minor version of the interface; None, with a warning, where it is not known."""
+    """Return major and minor version of the interface; None, with a warning, if it is unknown."""
     found = _stated_version()
     if found is None:
         warnings.warn("this jaxlib has an unknown foreign function interface: motions are integrated by XLA, "
@@ -55,7 +55,7 @@ def version() -> tuple[int, int] | None:
 
 
 def reason_against() -> str:
-    """Why no machine code of our own can be called here; empty where it can."""
+    """Return why no machine code of our own can be called here; empty where it can."""
     if (backend := jax.default_backend()) not in ("cpu", "gpu"):
         return f"it is made for CPUs and NVIDIA GPUs, not for JAX's backend {backend}"
     if reason := host.reason_against() if backend == "cpu" else nvidia.reason_against():
@@ -66,7 +66,7 @@ def reason_against() -> str:
 
 
 def devices() -> str:
-    """What is said of the devices of machine code, where there are others than the CPU."""
+    """Return the note on devices of machine code, if there are others than the CPU."""
     return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
 
 
@@ -99,12 +99,14 @@ class Given(NamedTuple):
 
 
 def last_size(w: Writer, x: Given) -> Value:
-    """The size of the last axis."""
+    """Return the size of the last axis."""
     return w.load(x.sizes, 0 if w.device else x.rank - 1, "i64")
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """The product of the sizes of all axes but the last ones, 1 or 3 of them on a GPU, where the host has found it."""
+    """Return the product of the sizes of all axes but the last ones, 1 or 3 of them on a GPU, where the host
+    has found it.
+    """
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
     total = w.room(type="i64")
@@ -115,7 +117,9 @@ def product(w: Writer, x: Given, but: int) -> Value:
 
 
 def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
-    """A handler that calls `body` with all arguments, and pointers to the data of all results; on a GPU the kernel that does so."""
+    """Return a handler that calls `body` with all arguments, and pointers to the data of all results; on a
+    GPU the kernel that does so.
+    """
     if w.device:
         return _write_kernel(w, arguments, results, body)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
@@ -126,7 +130,7 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
 
 
 def answer_metadata(w: Writer, frame: Value) -> None:
-    """Where the frame asks for the version of the interface, says it and returns."""
+    """Answer a call that asks for the version of the interface, and return."""
     known = version()
     assert known is not None
     extension = w.load(frame, 1, "ptr")
@@ -150,13 +154,15 @@ def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[
 
 
 def given(w: Writer, buffer: Value) -> Given:
-    """What a handler is given of an array."""
+    """Return the array that a handler receives."""
     # words of a buffer: 2 the type, 3 the data, 4 the rank, 5 the sizes
     return Given(w.load(buffer, 3, "ptr"), w.load(buffer, 5, "ptr"), w.load(buffer, 4, "i64"))
 
 
 def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:
-    """The results of a `call` of machine code in a program of JAX, arrays in single precision converted; `more`: avals of results besides, which go."""
+    """Return the results of a `call` of machine code in a program of JAX, arrays in single precision
+    converted; `more`: avals of results besides, which go.
+    """
 
     def converted(x, old, new):
         if old.dtype == new.dtype:
@@ -170,7 +176,9 @@ def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callabl
 
 
 def registered(text: str, effort: int = 2) -> str:
-    """The name under which JAX calls the handler of a module of LLVM IR; `effort`: as of `host.object_code`."""
+    """Return the name under which JAX calls the handler of a module of LLVM IR; `effort`: as of
+    `host.object_code`.
+    """
     name = _name(text, effort)
     register(name, text, "cpu", effort)
     return name
@@ -197,22 +205,22 @@ NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the nex
 
 
 def start_counting(w: Writer, job: Value, word: int) -> None:
-    """No lane is taken: a word of a job counts them, or on a GPU points to what does."""
+    """Reset the count of samples taken: a word of a job, or on a GPU its target."""
     w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
 
 
 def next_lane(w: Writer, job: Value, word: int) -> Value:
-    """The number of the next lane, which is taken."""
+    """Return the number of the next lane, which is taken."""
     return w.counted_up(w.load(job, word, "ptr"), 0) if w.device else w.counted_up(job, word)
 
 
 def lanes_taken(w: Writer, job: Value, word: int) -> Value:
-    """How many lanes are taken; there may be fewer."""
+    """Return how many lanes are taken; there may be fewer."""
     return w.load(w.load(job, word, "ptr"), type="i64") if w.device else w.load(job, word, "i64")
 
 
 def share(w: Writer, job: Value, count: Value) -> None:
-    """Calls the module's `loop(job)` in as many threads as the writer says, in fewer where lanes are few."""
+    """Call the module's `loop(job)` in as many threads as the writer allows, in fewer for small batches."""
     threads = w.threads
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room(threads, "i64"), w.room(type="i64")
     w.store(w.literal(0, "i64"), started)
@@ -234,13 +242,13 @@ def share(w: Writer, job: Value, count: Value) -> None:
 
 
 def taken_in(w: Writer, count: int, numbers: Value, rows: Value, lane: Value) -> None:
-    """A lane takes so many numbers, one after the other in memory, as its rows."""
+    """Copy so many contiguous numbers of a sample into its rows."""
     with w.counted(0, count) as row:
         w.store(w.load(numbers, row, "double"), rows, row * w.lanes + lane)
 
 
 def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: Value) -> None:
-    """So many rows of a lane, put one after the other into memory."""
+    """Copy so many rows of a sample into contiguous memory."""
     with w.counted(0, count) as row:
         w.store(w.load(rows, row * w.lanes + lane, "double"), numbers, row)
 
@@ -248,7 +256,7 @@ def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: Value) 
 def write_rows(w: Writer, given: int, returned: int) -> None:
     """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
 
-    Places for which no row is left work out the last one once more.
+    Places for which no row is left compute the last one once more.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")

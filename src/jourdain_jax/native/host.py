@@ -52,7 +52,7 @@ _TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %
 
 @functools.cache
 def reason_against() -> str:
-    """Why no machine code is made here; empty where it is."""
+    """Return the reason why no machine code is made here; empty if it is."""
     if os.name != "posix":
         return "it is made under Linux and macOS alone"
     if llvm is None:
@@ -72,30 +72,35 @@ def reason_against() -> str:
 
 @functools.cache
 def features() -> dict[str, bool]:
-    """What the processor can do. Of Apple's, LLVM says nothing; every 64-bit one of ARM has vector registers, and rounds products and sums once."""
+    """Return the features of the processor. LLVM reports none for Apple's; every 64-bit ARM processor has
+    vector registers, and fuses products and sums.
+    """
     found = dict(llvm.get_host_cpu_features())
     return found | {"neon": True} if llvm.get_process_triple().startswith(("aarch64", "arm64")) else found
 
 
 def lanes() -> int:
-    """How many doubles a vector register holds."""
+    """Return how many doubles a vector register holds."""
     return next((count for name, count in _LANES if features().get(name)), 2)
 
 
 def registers() -> int:
-    """How many values may be kept in vector registers; four of these are left to the working of instructions."""
+    """Return how many values may be kept in vector registers; four of these are left to the working of
+    instructions.
+    """
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
 
 def threads() -> int:
-    """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
+    """Return the number of threads that share a batch: one for every usable core, or `JOURDAIN_JAX_THREADS`.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     stated = os.environ.get("JOURDAIN_JAX_THREADS", str(min(cores, MOST_THREADS)))
     return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", 1, MOST_THREADS)
 
 
 def fuses() -> bool:
-    """Whether products and sums are rounded once, in one instruction."""
+    """Return whether products and sums are rounded once, in one instruction."""
     return bool(features().get("fma") or features().get("neon"))
 
 
@@ -106,7 +111,7 @@ def _machine(effort: int):
 
 
 def description() -> str:
-    """What machine code depends on besides the program."""
+    """Return the facts on which machine code depends besides the program."""
     machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
     return f"{EFFORT} {llvm.llvm_version_info} {machine}"
 
@@ -129,7 +134,7 @@ def object_code(text: str, effort: int) -> bytes:
 
 
 def address(code: bytes, name: str) -> int:
-    """Where a function of some machine code is, once it is in memory."""
+    """Return where a function of some machine code is, once it is in memory."""
     with _lock:
         # an engine takes its target machine with it
         machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
@@ -145,7 +150,7 @@ _DIGEST = 32  # bytes
 
 
 def folder() -> Path | None:
-    """Where code is kept; None where `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
+    """Return where code is kept; None where `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
     stated = os.environ.get("JOURDAIN_JAX_CACHE", "")
     if stated == "0":
         return None
@@ -160,7 +165,8 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """What `make` returns, from the file of this name where it is whole, otherwise made and kept there; a disk that refuses is no error.
+    """Return the result of `make`, from the file of this name if it is whole, otherwise made and stored; a
+    failing disk is no error.
 
     `made_by`: what else must be the same, versions of what makes it, as text.
     """
@@ -183,7 +189,7 @@ def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
 
 
 def _is_ours(place: Path) -> bool:
-    """Whether the folder, made where there is none, can be used; a warning that says why it cannot."""
+    """Return whether the folder, made if missing, can be used; otherwise warn with the reason."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         against = _against(os.stat(place))
@@ -197,7 +203,7 @@ def _is_ours(place: Path) -> bool:
 
 
 def _against(found: os.stat_result) -> str:
-    """Why a folder or a file is not believed; empty where it is."""
+    """Return the reason not to trust a folder or a file; empty if there is none."""
     if found.st_uid != os.geteuid():
         return f"it belongs to user {found.st_uid}, and what lies there would run as {os.geteuid()}"
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -215,7 +221,7 @@ def _warn(place: Path, against: str) -> None:
 
 
 def _read(file: Path) -> bytes:
-    """The content; nothing where there is none of our own."""
+    """Return the content of our own file; nothing if there is none."""
     try:
         with open(os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as opened:
             return b"" if _against(os.fstat(opened.fileno())) else opened.read()

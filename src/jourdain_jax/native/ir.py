@@ -3,7 +3,7 @@
 `a + b`, `a < b`, `where(c, a, b)` each append an instruction to the function that is being written. Numbers of Python become literals. There are no
 flags that let LLVM change results: every lane is rounded as it is written here, whatever the width.
 
-On a GPU (`device`) every thread runs the same with a lane of its own; the threads of a warp come `together` where the loop over steps goes on. What is local
+On a GPU (`device`) every thread runs the same with a lane of its own; the threads of a warp come `together` where the loop over steps continues. What is local
 to a thread is in registers only where functions are written out at their calls: those that are called once, and small ones.
 """
 
@@ -64,11 +64,11 @@ class Value:
         return self.writer.compared("ge", self, other)
 
     def equals(self, other) -> "Value":
-        """Whether two values are equal; NaN is equal to nothing."""
+        """Return whether two values are equal; NaN is equal to nothing."""
         return self.writer.compared("eq", self, other)
 
     def differs(self, other) -> "Value":
-        """Whether two values are not equal."""
+        """Return whether two values are not equal."""
         return self.writer.compared("ne", self, other)
 
     def __and__(self, other) -> "Value":
@@ -138,7 +138,7 @@ class Writer:
             self.place(self.label())
 
     def label(self) -> str:
-        """A new name of a place."""
+        """Return a new name of a place."""
         self._count += 1
         return f"at{self._count}"
 
@@ -152,7 +152,7 @@ class Writer:
 
     @contextmanager
     def when(self, condition: Value) -> Iterator[None]:
-        """What is written inside runs where the condition holds."""
+        """Run the code inside if the condition holds."""
         inside, after = self.label(), self.label()
         self.go(inside, condition, after)
         self.place(inside)
@@ -190,13 +190,13 @@ class Writer:
     # instructions
 
     def instruction(self, type: str, text: str) -> Value:
-        """The result of an instruction."""
+        """Return the result of an instruction."""
         self._count += 1
         self._lines.append(f"  %v{self._count} = {text}")
         return Value(self, type, f"%v{self._count}")
 
     def literal(self, number, type: str) -> Value:
-        """A number of Python in this type; values pass."""
+        """Return a number of Python in this type; values pass."""
         if isinstance(number, Value):
             return number
         scalar = type.split(" x ")[-1].rstrip(">")
@@ -204,7 +204,7 @@ class Writer:
         return Value(self, type, text if scalar == type else f"splat ({scalar} {text})")
 
     def number(self, value: float) -> Value:
-        """A number in all lanes."""
+        """Return a number in all lanes."""
         return self.literal(value, self.real)
 
     def binary(self, op: str, a: Value, b) -> Value:
@@ -213,13 +213,13 @@ class Writer:
         return self.instruction(a.type, f"{prefix}{op} {a.type} {a.name}, {b.name}")
 
     def compared(self, op: str, a: Value, b) -> Value:
-        """A comparison; with NaN only `ne` holds."""
+        """Return a comparison; with NaN only `ne` holds."""
         b, real = self.literal(b, a.type), "double" in a.type
         found = self.truth if a.type.startswith("<") else "i1"
         return self.instruction(found, f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}")
 
     def is_nan(self, a: Value) -> Value:
-        """Whether a number is none."""
+        """Return whether a number is none."""
         return self.instruction(self.truth, f"fcmp uno {a.type} {a.name}, {a.name}")
 
     def where(self, condition: Value, a, b) -> Value:
@@ -229,7 +229,7 @@ class Writer:
         return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
 
     def call(self, function: str | Value, result: str, *arguments: Value) -> Value:
-        """The result of a function, of this name, or to which this points."""
+        """Return the result of a function, of this name, or to which this points."""
         name = function.name if isinstance(function, Value) else f"@{function}"
         return self.instruction(result, f"call {result} {name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
@@ -256,7 +256,7 @@ class Writer:
         return self.call(function, self.real, *arguments)
 
     def once(self, function: str, result: str, arguments: dict[str, str], body: Callable) -> None:
-        """A function that stands in the module once, however often it is asked for; `body(w, *arguments)` writes it."""
+        """Return a function that is written once per module; `body(w, *arguments)` writes it."""
         if function not in self._declared:
             around, self._lines = (self._lines, self._entry), []
             with self.function(function, result, arguments, attributes="noinline") as given:
@@ -265,7 +265,7 @@ class Writer:
             self._lines, self._entry = around
 
     def intrinsic(self, name: str, a: Value, *more) -> Value:
-        """A function of LLVM of one or more numbers of a type."""
+        """Return a function of LLVM of one or more numbers of a type."""
         kind = f"v{self.lanes}f64" if a.type == self.real else "f64"
         return self.external(f"llvm.{name}.{kind}", a.type, a, *(self.literal(b, a.type) for b in more))
 
@@ -278,31 +278,31 @@ class Writer:
         return self.intrinsic("fabs", a)
 
     def root(self, a: Value) -> Value:
-        """The square root of a number."""
+        """Return the square root of a number."""
         return self.intrinsic("sqrt", a)
 
     def equal(self, a, b) -> Value:
-        """Whether two values are equal."""
+        """Return whether two values are equal."""
         return a.equals(b)
 
     def differs(self, a, b) -> Value:
-        """Whether two values are not equal."""
+        """Return whether two values are not equal."""
         return a.differs(b)
 
     def smaller(self, a: Value, b) -> Value:
-        """The smaller of two numbers, NaN if either is."""
+        """Return the smaller of two numbers, NaN if either is."""
         return self.intrinsic("minimum", a, b)
 
     def larger(self, a: Value, b) -> Value:
-        """The larger of two numbers, NaN if either is."""
+        """Return the larger of two numbers, NaN if either is."""
         return self.intrinsic("maximum", a, b)
 
     def converted(self, how: str, a: Value, to: str) -> Value:
-        """A conversion of LLVM, such as `sitofp`."""
+        """Return a conversion of LLVM, such as `sitofp`."""
         return self.instruction(to, f"{how} {a.type} {a.name} to {to}")
 
     def spread(self, a: Value) -> Value:
-        """A number in all lanes, given one that is no vector."""
+        """Return a number in all lanes, given one that is not a vector."""
         first = self.instruction(self.real, f"insertelement {self.real} poison, double {a.name}, i64 0")
         return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
 
@@ -311,20 +311,20 @@ class Writer:
         return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
 
     def thread(self) -> tuple[Value, Value]:
-        """The number of a thread of a GPU, and how many there are."""
+        """Return the number of a thread of a GPU, and how many there are."""
         block, size, own, blocks = (
             self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64") for name in ("ctaid", "ntid", "tid", "nctaid")
         )
         return block * size + own, blocks * size
 
     def any(self, a: Value) -> Value:
-        """Whether a truth value holds in any lane."""
+        """Return whether a truth value holds in any lane."""
         return self.external(f"llvm.vector.reduce.or.v{self.lanes}i1", "i1", a)
 
     # memory
 
     def constants(self, name: str, numbers: Iterable, type: str = "double") -> Value:
-        """Numbers that stand in the module."""
+        """Return numbers that stand in the module."""
         texts = [f"{type} {self.literal(x, type).name}" for x in numbers]
         self._declared[name] = f"@{name} = internal constant [{len(texts)} x {type}] [{', '.join(texts)}]"
         return Value(self, "ptr", f"@{name}")
@@ -337,18 +337,18 @@ class Writer:
         return Value(self, "ptr", f"%v{self._count}")
 
     def at(self, pointer: Value, index, type: str = "") -> Value:
-        """The place of the value with this index."""
+        """Return the place of the value with this index."""
         type = type or self.real
         return self.instruction("ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}")
 
     def load(self, pointer: Value, index=0, type: str = "") -> Value:
-        """What is in memory."""
+        """Return the value in memory."""
         type = type or self.real
         place = self.at(pointer, index, type).name
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """A value that was put into memory, read from there, even where LLVM would rather keep it in a register; others, and on a GPU all, as they are."""
+        """Return a value reloaded from memory, even where LLVM would keep it in a register; others, and on a GPU all, unchanged."""
         if self.device:
             return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
@@ -363,7 +363,7 @@ class Writer:
         return found
 
     def counted_up(self, pointer: Value, index) -> Value:
-        """A whole number in memory, which becomes one more, also where several threads ask."""
+        """Return a whole number in memory, which becomes one more, also where several threads ask."""
         return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
 
     def store(self, value, pointer: Value, index=0) -> Value:
@@ -375,7 +375,7 @@ class Writer:
 
 
 def _inlined(text: str) -> str:
-    """A module in which functions are written out where they are called once, or small; `noinline` is said of the others alone."""
+    """Return a module with functions inlined that are called once, or small; the others are marked `noinline`."""
     parts = {found[1]: found[0] for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)}
     calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
     sizes: dict[str, int] = {}

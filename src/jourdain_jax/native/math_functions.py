@@ -56,7 +56,7 @@ def _power_of_two(w: Writer, k: Value) -> Value:
 
 
 def _scaled(w: Writer, x: Value, k: Value) -> Value:
-    """2^k x, in two factors, neither of which overflows."""
+    """Return 2^k x, by two factors, neither of which overflows."""
     half = w.binary("ashr", k, 1)
     return x * _power_of_two(w, half) * _power_of_two(w, k - half)
 
@@ -152,7 +152,7 @@ def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
 
 
 def _sum(w: Writer, a: Value, b: Value | float) -> tuple[Value, Value]:
-    """a + b, of which either may be the larger one; none is negative."""
+    """Return a + b, both non-negative, in either order of size."""
     return two_sum(w.larger(a, w.literal(b, a.type)), w.smaller(a, w.literal(b, a.type)))
 
 

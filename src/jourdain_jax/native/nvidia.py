@@ -32,7 +32,7 @@ _CALLED = (
 
 
 class Loaded(NamedTuple):
-    """A kernel, and what each of its threads takes."""
+    """A kernel, and the resources of its threads."""
 
     function: int
     local: int  # bytes of memory
@@ -40,13 +40,13 @@ class Loaded(NamedTuple):
 
 
 def driver() -> ctypes.CDLL:
-    """The library of the driver."""
+    """Return the library of the driver."""
     return ctypes.CDLL("libcuda.so.1")
 
 
 @functools.cache
 def reason_against() -> str:
-    """Why no machine code is made here for GPUs; empty where it is."""
+    """Return the reason why no machine code is made here for GPUs; empty if it is."""
     if reason := host.reason_against() or reason_against_text():
         return reason
     try:
@@ -65,7 +65,7 @@ def reason_against() -> str:
 
 
 def reason_against_text() -> str:
-    """Why LLVM writes no text for NVIDIA's driver; empty where it does."""
+    """Return the reason why LLVM writes no PTX; empty if it does."""
     try:
         host.llvm.initialize_all_targets()
         host.llvm.initialize_all_asmprinters()
@@ -76,7 +76,7 @@ def reason_against_text() -> str:
 
 
 def _checked(code: int) -> None:
-    """Raises what the driver says, unless all is well."""
+    """Raise the driver's error, if there is one."""
     if code:
         text = ctypes.c_char_p()
         driver().cuGetErrorString(code, ctypes.byref(text))
@@ -84,7 +84,7 @@ def _checked(code: int) -> None:
 
 
 def _said(function: str, *what, found=ctypes.c_int) -> int:
-    """The number that the driver puts where the first argument of a function points."""
+    """Return the number that the driver puts where the first argument of a function points."""
     number = found()
     _checked(getattr(driver(), function)(ctypes.byref(number), *what))
     return number.value
@@ -95,7 +95,7 @@ def _devices() -> range:
 
 
 def _of_device(attribute: int) -> int:
-    """The least of all devices."""
+    """Return the least of all devices."""
     return min(_said("cuDeviceGetAttribute", attribute, device) for device in _devices())
 
 
@@ -112,7 +112,7 @@ def memory() -> int:
 
 
 def architecture() -> str:
-    """What text is made for, such as `sm_90`."""
+    """Return the target architecture, such as `sm_90`."""
     return f"sm_{max(_capabilities())}"
 
 
@@ -132,7 +132,7 @@ def text_for(module: str, architecture: str) -> str:
 
 @contextmanager
 def _in_context() -> Iterator[None]:
-    """What is done inside is done for the first device, in the context that it has in this process; it stays for JAX."""
+    """Run the code inside in the first device's context of this process, which JAX shares."""
     context = ctypes.c_void_p()
     _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
     _checked(driver().cuCtxPushCurrent_v2(context))
@@ -143,7 +143,7 @@ def _in_context() -> Iterator[None]:
 
 
 def loaded(text: bytes, name: str) -> Loaded:
-    """The kernel of this name in PTX."""
+    """Return the kernel of this name in PTX."""
     with _in_context():
         library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
         _checked(driver().cuLibraryLoadData(ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0))
@@ -153,7 +153,9 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """How many warps serve so many lanes: as many as registers allow, and whose local memory stays in the first cache, where that is not too few."""
+    """Return the number of warps for so many samples: as many as registers allow, with local memory in the
+    first cache, unless these are too few.
+    """
     # attributes of a device: 82 its registers, 81 what of its cache can be shared memory, 16 its multiprocessors
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(81) // max(1, WARP * kernel.local)

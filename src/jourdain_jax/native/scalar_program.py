@@ -22,16 +22,16 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 @dataclass
 class Turn:
-    """Values that come from memory before a value is worked out, and those that go there after it, each with its place."""
+    """Values loaded before a value is computed, and stored after it, each with its place."""
 
     loaded: list[int]
     stored: list[tuple[int, int]] = field(default_factory=list)
 
 
 def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int) -> tuple[list[Turn], int]:
-    """A turn for each value that is worked out, and how many places in memory they take.
+    """Return a turn for each computed value, and the number of places in memory.
 
-    `uses`: the values in order, each with those that it is made of; `there`: those that are in memory already. A place is taken anew once nothing is made of
+    `uses`: the values in order, each with those that it is made of; `there`: those that are in memory already. A place is taken again once nothing is made of
     what is there any more.
     """
     made_of = [tuple(dict.fromkeys(values)) for _, values in uses]
@@ -77,7 +77,7 @@ _TRUTHS = {"and": "and", "or": "or"}
 
 
 def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
-    """Why the nodes cannot be written as machine code; empty where they can."""
+    """Return why the nodes cannot be written as machine code; empty where they can."""
     known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "sin", "cos", "not", "select", "const", "input"}
     for node in graph.reachable(nodes):
         if graph.op[node] in ARRAYS or graph.op[node] == "entry":
@@ -88,14 +88,18 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
 
 
 def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
-    """Values of the outputs, given those of inputs and of nodes computed before; `by_llvm`: it decides which values are in registers."""
+    """Return values of the outputs, given inputs and nodes computed before; `by_llvm`: LLVM allocates the
+    registers.
+    """
     return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]
 
 
 def written_in_turn(
     w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
 ) -> Iterator[tuple[int, Value]]:
-    """The number and the value of each output, as soon as that is worked out: what is done with it is written next. What is known stays in memory."""
+    """Yield the number and the value of each output as soon as it is computed, so that its use is written
+    next. Known values stay in memory.
+    """
     numbers: dict[int, list[int]] = {}
     for number, node in enumerate(outputs):
         numbers.setdefault(node, []).append(number)
@@ -132,12 +136,12 @@ class _AtHand:
             self.rooms = w.opaque(w.room(max(rows, 1)), range(REACH, rows + REACH, 2 * REACH))
 
     def before(self, i: int) -> None:
-        """Takes what the value with this number is made of."""
+        """Load the operands of the value with this number."""
         for node in self.turns[i].loaded if self.turns else ():
             self.values[node] = self.w.again(self.places[node])
 
     def after(self, i: int) -> None:
-        """Puts away what its register is taken from."""
+        """Store values whose registers are reused."""
         for node, row in self.turns[i].stored if self.turns else ():
             if self.values[node].type == self.w.real:
                 which = row // (2 * REACH)
@@ -147,12 +151,12 @@ class _AtHand:
 
 
 def as_real(w: Writer, a: Value) -> Value:
-    """A truth value as 0 or 1."""
+    """Return a truth value as 0 or 1."""
     return w.converted("uitofp", a, w.real) if a.type == w.truth else a
 
 
 def as_truth(w: Writer, a: Value) -> Value:
-    """Whether a number is not zero."""
+    """Return whether a number is not zero."""
     return a if a.type == w.truth else a.differs(0.0)
 
 
@@ -170,7 +174,7 @@ def _operation(w: Writer, op: str, args: list[Value]) -> Value:
 
 
 def _made_of(graph: Graph, node: int, fusible: set[int]) -> list[int]:
-    """What is at hand where a node is worked out: its arguments, in place of fusible ones theirs, but no constants."""
+    """Return operands of a node after fusing multiply-adds, without constants."""
     return [b for a in graph.args[node] for b in (graph.args[a] if a in fusible else (a,)) if graph.op[b] != "const"]
 
 

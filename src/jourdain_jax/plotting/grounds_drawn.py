@@ -17,7 +17,9 @@ _CELLS = 48  # of a mesh, along each of its two parameters
 
 
 def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.ndarray) -> list[dict]:
-    """Planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from `low` to `high`, m, as they are at the first time."""
+    """Return planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from
+    `low` to `high`, m, at the first time.
+    """
     found: dict[bytes, dict] = {}
     for name, contact in drawn.contacts.items():
         if _moves(contact):  # the body that carries it shows it, or the tangent planes of a ground that was not given
@@ -45,13 +47,13 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
 
 
 def _moves(contact: Contact) -> bool:
-    """Whether the contact is with a plane that changes its place."""
+    """Return whether the contact is with a plane that changes its place."""
     normals, offsets = np.asarray(contact.plane.normal), np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1)
     return isinstance(contact.ground, Plane | None) and bool(np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max()))
 
 
 def _plane(origin, axes, low, high) -> dict:
-    """The plane, its middle below the middle of the box."""
+    """Return the plane, its middle below the middle of the box."""
     normal, middle = axes[:, 2], (low + high) / 2
     return {"kind": "plane", "origin": middle - ((middle - origin) @ normal) * normal, "axes": axes}
 
@@ -63,13 +65,13 @@ def floor_under(low, high) -> float:
 
 
 def _mesh(grid: np.ndarray) -> dict:
-    """Triangles between the neighbours in a grid of points; those with a corner that is NaN are left out."""
+    """Return triangles between neighbours in a grid of points, without those that have a NaN corner."""
     triangles = quads(grid)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
     return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))]}
 
 
 def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
-    """A surface or height map over the box, and a margin around it, at the first time."""
+    """Return a surface or height map over the box, and a margin around it, at the first time."""
     margin = 0.15 * max(high - low)
     x, y = np.meshgrid(*(np.linspace(low[k] - margin, high[k] + margin, _CELLS + 1) for k in range(2)), indexing="ij")
     k, from_height = drawn.reached[0], float(np.asarray(contact.point)[0, 2])

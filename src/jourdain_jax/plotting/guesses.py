@@ -9,7 +9,9 @@ from jourdain_jax.scene.visuals import Visual
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
-    """Looks of a `body` at one time, which rolls by `shapes`; `dot` (m): radius of what has no size."""
+    """Return looks of a `body` at one time, which rolls by `shapes`; `dot` (m): radius of a body without
+    size.
+    """
     if isinstance(body, Particle):
         return [Visual.ball(dot)]
     outline = np.asarray(body.outline)
@@ -22,14 +24,15 @@ def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list
 
 
 def _solid(kind: str, corner: np.ndarray) -> Visual:
-    """The solid within a box, from its corner."""
+    """Return the solid within a box, from its corner."""
     if kind == "wheel":
         return Visual.wheel(corner.max(), 2 * corner.min(), axis="xyz"[int(np.argmin(corner))])
     return Visual.box(2 * corner) if kind == "box" else Visual.ellipsoid(corner)
 
 
 def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
-    """What rolls, in the frame of the body; a shape knows its own place in the inertial frame."""
+    """Return the rolling shape, in the frame of the body; a shape knows its own place in the inertial frame.
+    """
     to_body = np.asarray(body.orientation).T
     at = to_body @ (np.asarray(shape.centre) - np.asarray(body.position))
     if isinstance(shape, Ball):
@@ -42,7 +45,9 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
-    """The uniform box of this mass and inertia: `a^2 = 6 (B + C - A)/m` from its principal moments A, B, C; none where one of its sides is not positive."""
+    """Return the uniform box of this mass and inertia: `a^2 = 6 (B + C - A)/m` from its principal moments A,
+    B, C; none where one of its sides is not positive.
+    """
     moments, axes = np.linalg.eigh(np.asarray(body.inertia))
     mass = float(body.mass)
     squares = 6 * (moments.sum() - 2 * moments) / mass if mass > 0 else np.zeros(3)

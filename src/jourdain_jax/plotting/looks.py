@@ -37,14 +37,14 @@ class DrawnBody:
     looks: list[Visual]  # all arrays with a leading axis of times; sizes are those at the first
 
     def extents(self) -> np.ndarray:
-        """Points (times, points, 3) in space, m, whose box holds the body."""
+        """Return points (times, points, 3) in space, m, whose box holds the body."""
         local = [np.broadcast_to(points, (len(self.positions), *points.shape[-2:])) for points in map(_corners_of, self.looks)]
         return np.einsum("tij,tpj->tpi", self.orientations, np.concatenate(local, axis=1)) + self.positions[:, None]
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What there is to draw of one motion."""
+    """The drawing of one motion."""
 
     ts: np.ndarray  # (times,), s; those that were reached
     reached: np.ndarray  # their numbers among all saved times
@@ -64,7 +64,9 @@ class Drawn:
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
-    """What there is to draw of a motion, at most so many of its saved times, evenly chosen; ValueError where it reached none of them."""
+    """Return the drawing of a motion, at most so many of its saved times, evenly chosen; ValueError if it
+    reached none of them.
+    """
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
         raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; give earlier `ts`")
@@ -74,7 +76,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None
 
 
 def looks_at(scene: Scene, state: State) -> Drawn:
-    """What there is to draw of one state, found without compiling."""
+    """Return the drawing of one state, without compilation."""
     seen = eager_if_concrete(_seen)(scene, state.t, state.q, state.u, None)
     return _drawn(np.asarray(state.t)[None], np.zeros(1, int), jax.tree.map(lambda x: np.asarray(x)[None], seen))
 
@@ -115,7 +117,9 @@ def _seen(scene, t, q, u, inputs):
 
 
 class Curved(eqx.Module):
-    """Stands for a ground that a function describes, which knows one instant alone: the scene is asked anew where the ground is drawn."""
+    """A placeholder for a ground given by a function of one instant: the scene is evaluated again where the
+    ground is drawn.
+    """
 
 
 def _at(tree, index):
@@ -123,7 +127,9 @@ def _at(tree, index):
 
 
 def _corners_of(visual: Visual) -> np.ndarray:
-    """Points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of a line its own, with a leading axis of times."""
+    """Return points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of
+    a line its own, with a leading axis of times.
+    """
     if visual.kind == "line":
         return np.asarray(visual.size)
     size = np.asarray(visual.size)[0]

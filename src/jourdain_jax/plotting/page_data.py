@@ -36,19 +36,19 @@ class Numbers:
     count: int = 0
 
     def add(self, array) -> tuple[int, int]:
-        """Where the array is kept, flat."""
+        """Return where the array is kept, flat."""
         flat = np.asarray(array, np.float32).ravel()
         self.parts.append(flat)
         self.count += flat.size
         return self.count - flat.size, flat.size
 
     def bytes(self) -> bytes:
-        """All of them, little-endian."""
+        """Return all of them, little-endian."""
         return np.concatenate(self.parts).astype("<f4").tobytes()
 
 
 def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Numbers]:
-    """The description of the page, and its numbers."""
+    """Return the description of the page, and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
     everywhere = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
@@ -138,7 +138,9 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """How many whole turns a body makes between saved times, beside the shortest way from one attitude to the next: of a wheel that spins fast."""
+    """Return how many whole turns a body makes between saved times, beside the shortest way from one attitude
+    to the next: of a wheel that spins fast.
+    """
     if len(ts) < 2:
         return np.zeros(1)
     a, b = quaternions[:-1], quaternions[1:]
@@ -153,12 +155,12 @@ def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray
 
 
 def _still(values: np.ndarray) -> np.ndarray:
-    """Values at all times; at one time where they stay what they are."""
+    """Return values at all times; at one time if they are constant."""
     return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + largest(values)) else values
 
 
 def _at_rest(drawn: Drawn) -> bool:
-    """Whether something stands in the inertial frame, such as a table."""
+    """Return whether something stands in the inertial frame, such as a table."""
     return "" in drawn.bodies and any(len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks)
 
 
@@ -167,7 +169,9 @@ def _moves(body: DrawnBody) -> bool:
 
 
 def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
-    """Points (points, 3), m, whose box holds the bodies at any one time, from their middle at that time."""
+    """Return points (points, 3), m, whose box holds the bodies at any one time, from their middle at that
+    time.
+    """
     points = []
     for one in drawn:
         moving = [body for name, body in one.bodies.items() if name and _moves(body)]
@@ -177,7 +181,8 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
-    """Name, point and scaled force of every contact at all times, of all motions; and what the longest arrow stands for.
+    """Return name, point and scaled force of every contact at all times, of all motions; and the force of the
+    longest arrow.
 
     Where a few forces are far larger than the others (a fall, a configuration that is nearly singular), the longest arrow stands for these and for less,
     so that the others are seen.

@@ -112,7 +112,8 @@ def draw_still(
 
 
 def scene_picture(scene) -> str:
-    """HTML of the bodies of a scene where its `example` puts them, in space, on a floor with their shadows; empty where there is none to draw.
+    """Return HTML of a scene's bodies at its `example`, in space, on a floor with their shadows; empty if
+    there are none.
 
     A scene that cannot be started has no picture: a notebook displays what is still being written, and `jj.start` says what is wrong.
     """

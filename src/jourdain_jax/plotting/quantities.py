@@ -58,7 +58,7 @@ def plot(
     - `title`: default: of a rollout, how its lanes ended. `path`: where to write it (.png, .svg, .pdf); `axes`: existing axes, one per name.
 
     Returns the matplotlib figure and an array of its axes, shape (names,). KeyError for an unknown name, with the nearest valid one; ValueError for an
-    unknown unit, bands outside 0 to 1, or anything that is no motion; ImportError without matplotlib.
+    unknown unit, bands outside 0 to 1, or anything that is not a motion; ImportError without matplotlib.
 
     **Examples**
 
@@ -104,7 +104,9 @@ def _plot_motions(motions: list, names: tuple[str, ...], units, labels: list[str
 
 
 def _plot_family(family: Family, names: tuple[str, ...], units, title: str | None, axes):
-    """Every further name against the first one: stable parts in full, others dashed, special points marked."""
+    """Return every further name against the first one: stable parts in full, others dashed, special points
+    marked.
+    """
     if len(names) < 2:
         raise ValueError(f"`plot` of a family takes the name on the horizontal axis and at least one name on the vertical axis, but {len(names)} were given")
     scene = family.equations.scene
@@ -128,7 +130,7 @@ def _plot_family(family: Family, names: tuple[str, ...], units, title: str | Non
 
 
 def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
-    """One panel for each name, below each other; those of the user where they are given."""
+    """Return one panel for each name, below each other; the user's axes if given."""
     if axes is None:
         size = 7.0, 1.2 + height * len(names)
         axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
@@ -141,7 +143,9 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
 
 
 def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
-    """Name -> unit and its size in SI; KeyError for an unknown name, ValueError for an unknown unit, or one of something else."""
+    """Return name -> unit and its size in SI; KeyError for an unknown name, ValueError for an unknown unit,
+    or one of something else.
+    """
     if not isinstance(units, Mapping | None):
         raise ValueError(f'`units` is {described(units)}, expected a dictionary from names to units, such as {{"lean": "deg"}}')
     kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
@@ -203,7 +207,9 @@ def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], co
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:
-    """Values at all times; of a rollout the lower and the upper end of each band in turn, and the median last."""
+    """Return values at all times; of a rollout the lower and the upper end of each band in turn, and the
+    median last.
+    """
     many, scene = isinstance(motion, Rollout), _scene(motion)
     valid = (*scene.coordinate_names, *scene.speed_names, *(() if many else ENERGIES))
     check_name(name, valid, f"nothing named `{name}` to plot", UnknownNameError)

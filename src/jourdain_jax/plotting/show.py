@@ -76,7 +76,7 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.P
 
 
 def _motions(given) -> list[Trajectory]:
-    """The single motions in what was given."""
+    """Return the single motions of the argument."""
     if isinstance(given, Rollout):
         chosen = np.unique(np.linspace(0, len(given) - 1, min(12, len(given))).astype(int))
         lanes = [given.lane(int(k)) for k in chosen]

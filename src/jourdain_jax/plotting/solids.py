@@ -12,7 +12,8 @@ Quads = Float[np.ndarray, "faces 4 3"]  # m; corners anticlockwise, seen from ou
 
 
 def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
-    """Faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and how dark each is painted, 0 to 1.
+    """Return faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and
+    their shades, 0 to 1.
 
     `thin`: radius of a line that has none, m.
     """
@@ -40,24 +41,24 @@ def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarr
 
 
 def radius_of(line: Visual) -> float:
-    """The radius of a line, m; 0: thin."""
+    """Return the radius of a line, m; 0: thin."""
     return 0.0 if line.radius is None else float(np.asarray(line.radius)[0])
 
 
 def quads(grid: Float[np.ndarray, "rows columns 3"]) -> Quads:
-    """Faces between the neighbours in a grid of points."""
+    """Return faces between the neighbours in a grid of points."""
     return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2).reshape(-1, 4, 3)
 
 
 def revolved(profile: Float[np.ndarray, "rows 2"], around: int) -> Float[np.ndarray, "rows columns 3"]:
-    """Points of a body of revolution about z, from a profile (radius, z) that rises."""
+    """Return points of a body of revolution about z, from a profile (radius, z) that rises."""
     radius, z = np.asarray(profile).T[..., None]
     angle = np.linspace(0, 2 * np.pi, around + 1)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z + 0 * angle], axis=-1)
 
 
 def triangles_of(mesh: Visual) -> Quads:
-    """Faces of a mesh as fans of triangles."""
+    """Return faces of a mesh as fans of triangles."""
     assert mesh.faces is not None
     return mesh.faces.corners[[(p[0], p[k], p[k + 1], p[k + 1]) for p in mesh.faces.polygons for k in range(1, len(p) - 1)]]
 
@@ -73,20 +74,22 @@ def _cylinder(radius: float, length: float) -> Float[np.ndarray, "4 2"]:
 
 
 def _box() -> Quads:
-    """The cube of side 1."""
+    """Return the cube of side 1."""
     square = np.array([[[-1.0, -1.0], [1.0, -1.0]], [[-1.0, 1.0], [1.0, 1.0]]]) / 2
     ends = [(side, np.concatenate([np.full((2, 2, 1), side), square * [2 * side, 1.0]], axis=-1)) for side in (-0.5, 0.5)]
     return np.concatenate([quads(np.roll(end, k, axis=-1)) for k in range(3) for _, end in ends])
 
 
 def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
-    """A bar of round section from a to b."""
+    """Return a bar of round section from a to b."""
     length = float(np.linalg.norm(b - a))
     return quads(revolved(_cylinder(radius, length), 8)) @ onto_axis(b - a).T + (a + b) / 2
 
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:
-    """Faces in parts with edges of at most about `longest`, so that nearer things hide no more than what is behind them; and of which face each part is."""
+    """Return faces split into parts with edges of at most about `longest`, so that nearer objects hide
+    farther ones correctly; and the face of each part.
+    """
     edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)  # from the last corner to the first, from there to the second, ...
     rows, columns = np.clip(np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20).astype(int)
     r, s = np.linspace(0, 1, rows + 1)[:, None], np.linspace(0, 1, columns + 1)

@@ -16,7 +16,7 @@ _INK = "#444444"  # of paths
 
 
 def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
-    """All bodies at the time with number `k`; `strength` below 1: paler."""
+    """Return all bodies at the time with number `k`; `strength` below 1: paler."""
     corners, colours, size = [], [], drawn.size
     for body in drawn.bodies.values():
         for look in body.looks:
@@ -45,7 +45,9 @@ def rgb(colour: str) -> Float[np.ndarray, "3"]:
 
 
 def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
-    """The lowest and the highest corner of the box that holds all points, m, and the floor below them, with some room at its sides."""
+    """Return the lowest and the highest corner of the box that holds all points, m, and the floor below them,
+    with some room at its sides.
+    """
     points = np.concatenate([x.reshape(-1, 3) for x in faces])
     low, high = points.min(axis=0), points.max(axis=0)
     room = 0.1 * float(max(high - low)) * np.array([1.0, 1.0, 0.5]) + 1e-3
@@ -75,7 +77,9 @@ def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, 
 
 
 def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarray, "2 3"]) -> None:
-    """Draw bodies with their shadows and paths (times, 3) in place of what is there; `box`: what is shown, from its lowest corner to its highest."""
+    """Draw bodies with their shadows and paths (times, 3), replacing the present content; `box`: the visible
+    region, from its lowest corner to its highest.
+    """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     for artist in tuple(axes.collections):

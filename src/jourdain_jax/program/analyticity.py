@@ -18,14 +18,15 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
 
 
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
-    """Whether an operation of these kinds on the way to the outputs depends on one of the variables."""
+    """Return whether an operation of these kinds on the way to the outputs depends on one of the variables.
+    """
     outputs, variables = list(outputs), set(variables)
     decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
     return any(depend_on(graph, decisions, variables))
 
 
 def depend_on(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[bool]:
-    """Whether each output needs one of the variables."""
+    """Return whether each output needs one of the variables."""
     variables = set(variables)
     return _with(graph, outputs, lambda n: n in variables)
 

@@ -42,12 +42,13 @@ class Call:
 
     @property
     def loop(self) -> str:
-        """The name of a loop in it; empty where there is none."""
+        """The name of a loop in it; empty if there is none."""
         return next(loops(self.closed.jaxpr), "")
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """The derivatives of each result with respect to those entries of the operands that move, with a leading axis of these.
+        """Return the derivatives of each result with respect to the moving entries of the operands, with a
+        leading axis of these.
 
         `Unsupported` where JAX has no forward derivative.
         """
@@ -70,7 +71,7 @@ class Call:
         return Call(closed, self.reasons)
 
     def results(self, *operands) -> tuple:
-        """The results; operands, and so results, may have last axes of lanes."""
+        """Return the results; operands, and so results, may have last axes of lanes."""
         function = jaxpr_as_fun(self.closed)
         avals = [v.aval for v in self.closed.jaxpr.invars]
         real = [x.dtype for x in operands if jnp.issubdtype(x.dtype, jnp.floating)]
@@ -116,11 +117,13 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
-_SEVERAL = tuple, list  # a union of types is made anew wherever it stands
+_SEVERAL = tuple, list  # a union of types is made again wherever it stands
 
 
 def description(x) -> Hashable:
-    """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions."""
+    """Return a key of a jaxpr, or of a parameter of an operation; two traces of one function have equal keys,
+    unless they hold new functions.
+    """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))
     if isinstance(x, dict):

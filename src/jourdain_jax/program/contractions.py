@@ -13,7 +13,7 @@ REDUCTIONS = frozenset(_OPERATIONS)
 
 
 def reduced(graph: Graph, ids: np.ndarray, axes: Sequence[int], name: str) -> np.ndarray:
-    """What one of the `REDUCTIONS` of JAX makes of an array of nodes."""
+    """Return the result of one of JAX's `REDUCTIONS` on an array of nodes."""
     op = _OPERATIONS[name]
     kept = [a for a in range(ids.ndim) if a not in axes]
     rows = np.transpose(ids, (*kept, *axes)).reshape(*(ids.shape[a] for a in kept), int(np.prod([ids.shape[a] for a in axes])))
@@ -33,14 +33,16 @@ def _of_all(graph: Graph, op: str, entries: list[int]) -> int:
 
 
 def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
-    """The extreme of more than two as the mean of those that reach it: where they meet, its derivative is the mean of theirs, as JAX has it."""
+    """Return the extreme of more than two as the mean of those that reach it: where they meet, its derivative
+    is the mean of theirs, as in JAX.
+    """
     reached = [graph.call("eq", entry, extreme) for entry in entries]
     total = graph.total(graph.call("select", reaches, graph.zero, entry) for reaches, entry in zip(reached, entries, strict=True))
     return graph.div(total, graph.total(graph.call("select", reaches, graph.zero, graph.one) for reaches in reached))
 
 
 def product(graph: Graph, equation, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """What `dot_general` of JAX makes of two arrays of nodes."""
+    """Return the result of JAX's `dot_general` on two arrays of nodes."""
     left, right = (m.reshape(int(np.prod(m.shape[:-2])), *m.shape[-2:]) for m in as_matrices(equation, x, y))
     right = np.swapaxes(right, 1, 2)
     _check_size(graph, left, right)

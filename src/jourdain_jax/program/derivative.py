@@ -28,12 +28,15 @@ def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int])
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
-    """The derivatives of each output with respect to the variables (nodes that are not looked into) on which it depends."""
+    """Return the derivatives of each output with respect to the variables (nodes that are not looked into) on
+    which it depends.
+    """
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
 
 def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
-    """The derivatives of each output along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
+    """Return the derivatives of each output along the named directions in which it changes, in one sweep;
+    `directions[k][n]` is dn/ds in direction k.
 
     Nodes in any direction are not looked into in any other.
     """
@@ -56,7 +59,7 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
 def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> list[int]:
     """sum_i w_i d output_i/d variable for each variable (nodes that are not looked into), in one sweep from the outputs back.
 
-    What a branch that is not taken would give is zero, however its derivative is: there a weight of zero counts, also times what is no number.
+    What a branch that is not taken would give is zero, however its derivative is: there a weight of zero counts, also times what is not a number.
     """
     variables = list(variables)
     total: dict[int, int] = {}
@@ -84,7 +87,7 @@ def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], var
 
 
 def _part(graph: Graph, node: int, i: int, weight: int) -> int:
-    """What the weight of a node gives to its argument with number i."""
+    """Return the part of a node's weight for its argument number i."""
     op, args = graph.op[node], graph.args[node]
     if op == "mul":
         return graph.mul(weight, args[1 - i])
@@ -98,19 +101,23 @@ def _part(graph: Graph, node: int, i: int, weight: int) -> int:
 
 
 def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
-    """Derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros among them."""
+    """Return derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros
+    among them.
+    """
     variables, rows = list(variables), jacobian(graph, outputs, variables)
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
 def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
-    """The Jacobian row by row, zeros among them."""
+    """Return the Jacobian row by row, zeros among them."""
     variables = list(variables)
     return [[row.get(n, graph.zero) for n in variables] for row in jacobian(graph, outputs, variables)]
 
 
 def _derivative(graph: Graph, node: int, dots: list):
-    """The rate of a node, given those of its arguments. That of an array is a tuple, entry by entry; that of a call a tuple of these."""
+    """Return the rate of a node, given those of its arguments: for an array a tuple, entry by entry; for a
+    call a tuple of these.
+    """
     op, args = graph.op[node], graph.args[node]
     if all(d == graph.zero for d in dots):
         return graph.zero
@@ -126,7 +133,7 @@ def _derivative(graph: Graph, node: int, dots: list):
 
 
 def _of_call(graph: Graph, node: int, dots: list) -> tuple:
-    """`d y_i = sum_j J_ij d x_j`, where another call computes the columns of J for those entries of the operands that vary."""
+    """Return `d y_i = sum_j J_ij d x_j`, with another call for the columns of J of the varying operands."""
     operands, call = graph.args[node], graph.value[node]
     entries = [graph.entries_of(a) for a in operands]
     numbers = [np.issubdtype(graph.value[a][-1], np.floating) for a in operands]
@@ -149,8 +156,9 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
 
 
 def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
-    """A function of the values of `variables` (all that the outputs depend on) that returns those of `outputs`, as arrays of one shape, in the precision
-    of the variable with number `like`; after them the values of the nodes `monitored`, which have no derivatives.
+    """Return a function of the values of `variables` (all that the outputs depend on) that returns those of
+    `outputs`, as arrays of one shape, in the precision of the variable with number `like`; then the values of
+    the nodes `monitored`, without derivatives.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
@@ -189,7 +197,9 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
 
 
 def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, list[int], list[int]]:
-    """The outputs on a new graph whose inputs are the variables: no simplification can look behind these."""
+    """Return the outputs on a new graph whose inputs are the variables: no simplification can look behind
+    these.
+    """
     own = Graph()
     inputs = [own.input(str(k), True) for k in range(len(variables))]
     new = own.copied(outputs, graph, dict(zip(variables, inputs, strict=True)))

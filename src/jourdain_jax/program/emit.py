@@ -42,7 +42,7 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
 
 
 def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> list[int]:
-    """Return the needed nodes, each soon after its arguments, of which the one that ends the longest chain of operations comes first.
+    """Return the needed nodes, each soon after its arguments, with the longest chains of operations first.
 
     So chains are followed from their beginning, sums grow term by term, and little is carried from piece to piece.
     """
@@ -82,7 +82,7 @@ def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) 
 
 
 def _fused_by_shape(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
-    """The values of the nodes, those of one shape and type computed together."""
+    """Return values of the nodes, with nodes of equal shape and type computed together."""
     alike: dict[tuple, list[int]] = {}
     for n in nodes:
         if jnp.issubdtype(jnp.result_type(values[n]), jnp.floating) and isinstance(values[n], jax.Array):

@@ -10,7 +10,7 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 
 class Probes:
-    """Values of the nodes of a graph at sample inputs; what was computed once is kept."""
+    """Values of the nodes of a graph at sample inputs; computed values are kept."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class Probes:
         return self._table[np.array([self._row[n] for n in nodes], int)]
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
-        """Probes at which some inputs are changed and all others are kept."""
+        """Return probes at which some inputs are changed and all others are kept."""
         return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant)
 
     def sign(self, node: int) -> int:
@@ -43,7 +43,9 @@ class Probes:
         return int(signs.pop()) if len(signs) == 1 else 0
 
     def in_the_middle(self, node: int) -> int:
-        """The node with numbers in the place of all inputs but parameters: those of the probe at which it is of middle size; 1 where it has none."""
+        """Return the node with numbers in place of all inputs except parameters: those of the probe with its
+        median magnitude; 1 if it has none.
+        """
         graph, size = self.graph, np.abs(self([node])[0])
         known = np.flatnonzero(np.isfinite(size) & (size > 0))
         if not known.size:

@@ -27,11 +27,12 @@ _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is
 
 
 class Unsupported(Exception):
-    """What was traced cannot become a scalar program; the text says why."""
+    """An operation that cannot become part of a scalar program; the text gives the reason."""
 
 
 class Graph:
-    """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant, the name of an input, or what a call is.
+    """Nodes are integers; `op[n]` and `args[n]` define node n, `value[n]` is the number of a constant, the
+    name of an input, or the description of a call.
 
     Products of matrices with more than `most_multiplications` are not taken apart; `keeps_rules`: nor are functions with a derivative of their own.
     """
@@ -46,7 +47,7 @@ class Graph:
         self.zero, self.one = self.const(0.0), self.const(1.0)
 
     def like(self, other: "Graph", node: int, args: tuple[int, ...]) -> int:
-        """The node that is here with `args` what `node` is in another graph."""
+        """Return the node with arguments `args` and the operation of `node` in another graph."""
         return self._node(other.op[node], args, other.value[node], other.varies[node])
 
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
@@ -69,16 +70,16 @@ class Graph:
     # leaves
 
     def const(self, value) -> int:
-        """A number."""
+        """Return a number."""
         value = float(value)
-        return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is no number
+        return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is not a number
 
     def input(self, name: str, varies: bool) -> int:
         """A named input: a parameter, or (`varies`) time, a coordinate, a speed, an input of the scene."""
         return self._node("input", (), name, varies)
 
     def is_const(self, node: int) -> bool:
-        """Whether a node is a number."""
+        """Return whether a node is a number."""
         return self.op[node] == "const"
 
     # arithmetic
@@ -131,7 +132,7 @@ class Graph:
         return self.product((left & right).elements())
 
     def _factors(self, node: int) -> list[int]:
-        """Factors of a product of few; the node itself where it is none."""
+        """Return factors of a product of few; the node itself otherwise."""
         factors, split = [node], True
         # 8 of a product that is looked at for squares of sines
         while split and len(factors) < 8:
@@ -255,7 +256,7 @@ class Graph:
         return self._node("array", entries, (shape, dtype))
 
     def opaque(self, call, operands: Iterable[int]) -> int:
-        """A call of arrays."""
+        """Return a call of arrays."""
         return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> list[int]:
@@ -263,12 +264,12 @@ class Graph:
         return [self._node("output", (call,), (k, *shape)) for k, shape in shapes.items()]
 
     def entries(self, output: int) -> np.ndarray:
-        """The entries of a result of a call."""
+        """Return the entries of a result of a call."""
         _, shape, _ = self.value[output]
         return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
 
     def entries_of(self, array: int) -> list[int]:
-        """The entries of an array, or of a result of a call."""
+        """Return the entries of an array, or of a result of a call."""
         return list(self.args[array]) if self.op[array] == "array" else self.entries(array).ravel().tolist()
 
     def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
@@ -280,22 +281,22 @@ class Graph:
         return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
 
     def copied(self, nodes: Iterable[int], of: "Graph", known: Mapping[int, int]) -> dict[int, int]:
-        """Nodes of another graph -> nodes of this one, where some are `known`."""
+        """Return nodes of another graph -> nodes of this one, where some are `known`."""
         nodes, new = list(nodes), dict(known)
         for node in of.needed(nodes, new):
             new[node] = self.const(of.value[node]) if of.is_const(node) else self.again(node, [new[a] for a in of.args[node]], of)
         return new
 
     def calls(self, nodes: Iterable[int]) -> list[int]:
-        """The calls that the nodes need."""
+        """Return the calls that the nodes need."""
         return [n for n in self.reachable(nodes) if self.op[n] == "opaque"]
 
     def total(self, terms: Iterable[int]) -> int:
-        """The sum of nodes."""
+        """Return the sum of nodes."""
         return reduce(self.add, terms, self.zero)
 
     def product(self, factors: Iterable[int]) -> int:
-        """The product of nodes."""
+        """Return the product of nodes."""
         return reduce(self.mul, factors, self.one)
 
     def dot(self, a: Iterable[int], b: Iterable[int]) -> int:
@@ -303,7 +304,7 @@ class Graph:
         return self.total(self.mul(x, y) for x, y in zip(a, b, strict=True))
 
     def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> list[int]:
-        """The outputs with some nodes replaced by others."""
+        """Return the outputs with some nodes replaced by others."""
         outputs = list(outputs)
         if not replacement:
             return outputs
@@ -320,11 +321,11 @@ class Graph:
     # what is in the graph
 
     def reachable(self, outputs: Iterable[int]) -> list[int]:
-        """All nodes that the outputs need, in an order in which they can be computed."""
+        """Return all nodes that the outputs need, in an order in which they can be computed."""
         return self.needed(outputs, known=())
 
     def needed(self, outputs: Iterable[int], known) -> list[int]:
-        """What must be computed for the outputs where the nodes in `known` are known, in order."""
+        """Return the nodes needed for the outputs if the nodes in `known` are known, in order."""
         args = self.args
         seen = {node for node in outputs if node not in known}
         stack = list(seen)
@@ -336,17 +337,19 @@ class Graph:
         return sorted(seen)  # arguments are older than what uses them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """What depends on parameters alone and is used by varying nodes; numbers, and not truth values."""
+        """Return nodes that depend on parameters only and are used by varying nodes; numbers, not truth
+        values.
+        """
         outputs = list(outputs)
         found = {a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]} | set(outputs)
         return tuple(sorted(n for n in found if not (self.varies[n] or self.is_const(n) or self.is_truth(n))))
 
     def is_truth(self, node: int) -> bool:
-        """Whether a node is a truth value."""
+        """Return whether a node is a truth value."""
         return self.op[node] in _TRUTHS or (self.op[node] == "select" and self.is_truth(self.args[node][1]))
 
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
-        """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
+        """Return the outputs with `a (1/b)` as one division, where `1/b` is used only once."""
         outputs = list(outputs)
         uses = Counter(a for node in self.reachable(outputs) for a in self.args[node])
         new: dict[int, int] = {}
@@ -361,7 +364,7 @@ class Graph:
         return [new[n] for n in outputs]
 
     def _divides_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
-        """Whether a node is a varying reciprocal with one use."""
+        """Return whether a node is a varying reciprocal with one use."""
         reciprocal = self.op[node] == "div" and self.args[node][0] == self.one and self.varies[node]
         return reciprocal and uses[node] == 1 and node not in outputs
 
@@ -370,7 +373,7 @@ class Graph:
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:
-        """How many more operations node a needs than node b: only what they do not share is looked at."""
+        """Return how many more operations node a needs than node b; only unshared ones are counted."""
         if a == b:
             return 0
         needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]

@@ -2,12 +2,12 @@
 
 Sums, products, quotients, roots, sines and cosines of generic numbers agree at random only if they agree everywhere (Schwartz, 1980; Zippel, 1979). Numbers
 near those of a scene are not generic, though (a parameter may be tiny, time may stop before a switch), and a function that has branches, or saturates, may do
-elsewhere what it does at no probe. So inputs are drawn anew, of the order of one and larger; and any other function is replaced by one of its operands that
+elsewhere what it does at no probe. So inputs are drawn again, of the order of one and larger; and any other function is replaced by one of its operands that
 is neither flat nor kinked anywhere. An identity that holds then holds whatever these functions are.
 
 Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (`calculus/round_off.py`), and two values are equal where they
 differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
-written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn anew at every probe. What holds of any R holds of this one.
+written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. What holds of any R holds of this one.
 """
 
 import math
@@ -35,7 +35,7 @@ _KEPT: Mapping[str, float] = MappingProxyType({})
 
 
 class Bounded(np.ndarray):
-    """Values with a bound of their round-off, infinite where they say nothing."""
+    """Values with a bound of their round-off, infinite where they are meaningless."""
 
     error: np.ndarray
 
@@ -47,7 +47,7 @@ class IdentityProbes:
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
-        # numbers in the place of 2^DIGITS
+        # numbers in place of 2^DIGITS
         self._radix = radix = np.random.default_rng(4).uniform(1.5, 3.0, self.count) if radix is None else radix
         # the bounds follow the values in one array, as if they were further probes
         self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
@@ -60,21 +60,25 @@ class IdentityProbes:
         return found
 
     def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
-        """Probes at which some inputs, and the bounds of their round-off, are changed and all others are kept."""
+        """Return probes at which some inputs, and the bounds of their round-off, are changed and all others
+        are kept.
+        """
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
-        """These probes, of another graph; `names`: of its inputs, and of those that they stand for."""
+        """Return these probes, of another graph; `names`: of its inputs, and of those that they replace."""
         errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 
     def varies(self, name: str) -> bool:
-        """Whether an input surely has other values at some probes than at others."""
+        """Return whether an input surely has other values at some probes than at others."""
         x, error = (np.broadcast_to(x, self.count) for x in (self.inputs[name], self._errors.get(name, 0.0)))
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """The probes numbered `at`, for each group of names in turn with the values that these inputs had at another probe; all others are kept."""
+        """Return the probes numbered `at`, for each group of names in turn with the values that these inputs
+        had at another probe; all others are kept.
+        """
 
         def in_turn(name, x):
             x = np.broadcast_to(x, self.count)
@@ -85,18 +89,20 @@ class IdentityProbes:
 
 
 def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Whether no operation that the nodes need is replaced by another function."""
+    """Return whether no operation that the nodes need is replaced by another function."""
     return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Whether the rows of each pair, values of expressions at generic probes, are equal but for round-off, at those that are `regular`."""
+    """Return whether the rows of each pair, values of expressions at generic probes, are equal to round-off,
+    at the `regular` ones.
+    """
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
 
 
 def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Whether no probe tells values from each other, of each pair of rows at each of the probes."""
+    """Return whether no probe distinguishes the values, for each pair of rows at each of the probes."""
     bound = SURE * (a.error + b.error)
     said = np.isfinite(bound) & regular
     a, b = np.asarray(a), np.asarray(b)
@@ -105,7 +111,9 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """The replacements, each of one node by another, that by themselves change none of the `nodes`; `probes`: generic ones."""
+    """Return the replacements, each of one node by another, that by themselves change none of the `nodes`;
+    `probes`: generic ones.
+    """
     graph, here = probes.graph, probes(nodes)
 
     def unchanged(old, new):
@@ -119,7 +127,9 @@ def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[in
 
 
 def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:
-    """Whether the vectors `a`, shape (probes, entries), are combinations of the `rows`, shape (probes, rows, entries), at all probes that say something."""
+    """Return whether the vectors `a`, shape (probes, entries), are combinations of the `rows`, shape (probes,
+    rows, entries), at all meaningful probes.
+    """
     said = np.isfinite(a).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=(1, 2))
     for v, e, B, E in zip(a[said], error[said], rows[said], errors[said], strict=True):
         x = np.linalg.lstsq(B.T, v, rcond=None)[0]
@@ -147,7 +157,8 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
 
 
 def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
-    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton from `near`; silent where it does not converge.
+    """Return generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton
+    from `near`; meaningless where it does not converge.
 
     The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
     """
@@ -167,7 +178,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
 
 
 def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
-    """A number with R drawn anew, and the bound of its round-off."""
+    """Return a number with R drawn again, and the bound of its round-off."""
     j = round(math.frexp(value)[1] / DIGITS) if math.isfinite(value) else 0
     moderate = math.ldexp(value, -DIGITS * j) * radix**j
     return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])
@@ -177,7 +188,7 @@ def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
 
 
 def _generic(name: str) -> Callable:
-    """A function of any number of numbers, another one for every name."""
+    """Return a function of any number of numbers, another one for every name."""
 
     def function(*operands):
         weights = np.random.default_rng(zlib.crc32(name.encode())).uniform(0.3, 1.7, (2, len(operands)))
@@ -191,7 +202,7 @@ def _generic(name: str) -> Callable:
 
 
 def _opaque(call, *operands) -> np.ndarray:
-    """One number per probe, made from all entries of the operands."""
+    """Return one number per probe, made from all entries of the operands."""
     return _generic(call.name)(*(column for x in operands for column in (x.T if x.ndim == 2 else [x])))
 
 

@@ -40,7 +40,9 @@ def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
 
 
 def effects_of(jaxpr) -> str:
-    """Which operation does more than compute, as printing does, in words without a verb; nothing where none does."""
+    """Return which operation does more than compute, as printing does, in words without a verb; nothing where
+    none does.
+    """
     for equation in jaxpr.eqns:
         if equation.effects:
             inner = called(equation.primitive.name, equation.params)
@@ -49,7 +51,7 @@ def effects_of(jaxpr) -> str:
 
 
 def as_nodes(graph: Graph, value: Value) -> np.ndarray:
-    """The nodes of a value; numbers become constants."""
+    """Return the nodes of a value; numbers become constants."""
     if isinstance(value, Nodes):
         return value.ids
     # 200_000 scalars in one array
@@ -102,7 +104,8 @@ def refuse(equation) -> None:
 
 
 def own_rule(name: str, params) -> str:
-    """What has a derivative that the graph does not know; nothing for functions of this package, whose rules are those of what they compute.
+    """Return the function with a derivative unknown to the graph; nothing for functions of this package,
+    whose rules match their values.
 
     Those of JAX are not: `softplus` and `sinc` compute with branches, which hide their derivatives where two of them meet.
     """
@@ -119,7 +122,7 @@ def own_rule(name: str, params) -> str:
 
 
 def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.ndarray]:
-    """Nodes moved as numbers would be; numbers that stand among them become constants."""
+    """Return nodes moved as numbers would be; numbers that stand among them become constants."""
     entries = _MOVES[name](len(inputs))
     if any(isinstance(x, Nodes) for i, x in enumerate(inputs) if i not in entries):
         raise Unsupported("an index that depends on the state")
@@ -128,7 +131,7 @@ def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.nd
 
 
 def _gather(graph, inputs, params):
-    """Where each entry comes from is what the operation makes of the positions."""
+    """Return the entries at the places found by applying the operation to positions."""
     x, indices = inputs
     with jax.ensure_compile_time_eval():
         positions = jnp.arange(x.size, dtype=jnp.int32).reshape(x.shape)
@@ -180,17 +183,17 @@ _OF_NODES: dict[str, Callable] = {
 
 
 def _is_rounded(dtype: np.dtype) -> bool:
-    """Whether numbers of a type have fewer digits than those of the program."""
+    """Return whether numbers of a type have fewer digits than those of the program."""
     return _kind(dtype) == "f" and dtype.itemsize < jnp.result_type(float).itemsize
 
 
 def _kind(dtype: np.dtype) -> str:
-    """As of NumPy, which does not know bfloat16 and its like for floating-point numbers."""
+    """Return the kind of a type as NumPy has it, including bfloat16 and similar floating-point types."""
     return "f" if jnp.issubdtype(dtype, jnp.floating) else dtype.kind
 
 
 def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:
-    """Nodes of another type: what holds or not is 1 or 0 as a number, a number holds where it is not zero."""
+    """Return nodes of another type: truth values become 1 or 0, and a number is true unless it is zero."""
     kinds = _kind(old), _kind(new)
     if kinds == ("f", "f") and jnp.finfo(new).eps > jnp.finfo(old).eps and _is_rounded(new):
         raise Unsupported(f"a number in {new}")

@@ -21,7 +21,9 @@ class Projected(NamedTuple):
 
 
 def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
-    """Return the probes with `inputs` (names, their nodes) on rows = 0, nearest to where they are; `limits` of steps as of `nearest_root`."""
+    """Return the probes with `inputs` (names, their nodes) moved to the nearest point with rows = 0; `limits`
+    of steps as in `nearest_root`.
+    """
     graph = probes.graph
     needed = set(graph.reachable(rows))
     moved = {name: n for name, n in inputs.items() if n in needed}
@@ -42,7 +44,7 @@ def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) 
 
 
 def _slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
-    """Derivatives of rows with respect to variables: where they are not zero by structure, and their nodes."""
+    """Return the structurally nonzero derivatives of rows with respect to variables: places and nodes."""
     place = {n: k for k, n in enumerate(variables)}
     entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
     return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]

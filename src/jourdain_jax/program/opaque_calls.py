@@ -1,6 +1,6 @@
 """A jaxpr run over scalars, with parts that have no scalar form as calls in the graph.
 
-An equation without a rule is opaque. So are those that hand large arrays to it, those that go on with large arrays from it, and what lies between
+An equation without a rule is opaque. So are those that hand large arrays to it, those that continue with large arrays from it, and what lies between
 two opaque ones; so a network is one call. Opaque equations that follow on one another, with nothing else in between, are one call:
 
     level of a scalar = the largest level of what it is made from,   level of an opaque equation = that, and one more behind a scalar
@@ -59,7 +59,7 @@ class _Step:
         return [x for x in self.inputs if isinstance(x, _Variable)]
 
     def results(self, inputs: list) -> list:
-        """What JAX makes of the inputs."""
+        """Return JAX's results for the inputs."""
         given = {v: x for v, x in zip(self.equation.invars, inputs, strict=True) if not isinstance(v, Literal)}
         alone = self.around.replace(constvars=[], invars=list(given), outvars=list(self.equation.outvars), eqns=[self.equation])
         return jaxpr_as_fun(ClosedJaxpr(alone, []))(*given.values())
@@ -67,7 +67,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Opaque:
-    """A value that is no array of scalars: the node of an array."""
+    """A value that is not an array of scalars: the node of an array."""
 
     node: int
 
@@ -95,7 +95,9 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
-    """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
+    """Append all equations, including those of inner jaxprs in place; functions with their own derivatives
+    stay whole.
+    """
 
     def results(equation, inputs: list) -> list:
         name = equation.primitive.name
@@ -139,7 +141,7 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
 
 
 def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
-    """The steps that need each variable."""
+    """Return the steps that need each variable."""
     users: dict[_Variable, list[_Step]] = {}
     for step in steps:
         for v in dict.fromkeys(step.variables):
@@ -148,7 +150,9 @@ def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
 
 
 def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
-    """Makes opaque what belongs to what is, and finds the parts that are one call."""
+    """Mark everything opaque that depends on opaque parts within a call, and find the parts that form one
+    call.
+    """
     maker = {v: step for step in steps for v in step.outputs}
     number = {id(step): k for k, step in enumerate(steps)}
 
@@ -175,7 +179,7 @@ def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked
 
 
 def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> dict:
-    """Values of what a part computes for others, by a call."""
+    """Return values computed by a part for others, by a call."""
     made = [v for step in part for v in step.outputs]
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
@@ -187,7 +191,7 @@ def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable
 
 
 def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:
-    """The part as a function of its operands."""
+    """Return the part as a function of its operands."""
 
     def function(*arrays):
         known = dict(zip(operands, arrays, strict=True))

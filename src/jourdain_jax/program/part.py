@@ -8,7 +8,9 @@ from jourdain_jax.program.graph import Graph
 
 
 def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
-    """Return a new graph, and for every node of `graph` its number there; -1 for those that are not needed. So a program keeps no failed attempts alive."""
+    """Return a new graph, and for every node of `graph` its number there; -1 for unneeded ones. So a program
+    keeps no failed attempts alive.
+    """
     kept = [n for n in graph.reachable(needed) if n > graph.one]  # in the old order, so that no sum is turned round
     found, place = Graph(graph.most_multiplications, graph.keeps_rules), np.full(len(graph.op), -1, np.int64)
     place[[graph.zero, graph.one]] = found.zero, found.one

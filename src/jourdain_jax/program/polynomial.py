@@ -21,7 +21,8 @@ class TooLarge(Exception):
 
 
 class NormalForms:
-    """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the other way took fewer operations in no model).
+    """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the reverse took
+    fewer operations in no model).
 
     - `most_terms`: of a normal form; 0: none are made, and nodes stay as they are.
     - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
@@ -44,13 +45,15 @@ class NormalForms:
         self._reciprocals: dict[int, int | None] = {}  # x of an atom 1/x, None of any other
 
     def simplified(self, node: int) -> int:
-        """The node in normal form where that takes fewer operations, otherwise the node with its parts simplified."""
+        """Return the node in normal form where that takes fewer operations, otherwise the node with its parts
+        simplified.
+        """
         if node not in self._simplified:
             self._simplified[node] = self._smaller(node)
         return self._simplified[node]
 
     def all_simplified(self, nodes: Iterable[int]) -> list[int]:
-        """Every node `simplified`."""
+        """Return every node `simplified`."""
         return [self.simplified(n) for n in nodes]
 
     def _smaller(self, node: int) -> int:
@@ -65,7 +68,7 @@ class NormalForms:
     # expansion
 
     def expanded(self, node: int) -> Polynomial:
-        """The polynomial of a node."""
+        """Return the polynomial of a node."""
         if node not in self._expanded:
             for part in self.graph.needed([node], self._expanded):  # arguments first: no deep recursion
                 try:
@@ -107,7 +110,7 @@ class NormalForms:
         return self._atom(atom) if graph.op[atom] == op else self.expanded(atom)
 
     def _rebuilt_or(self, node: int) -> int:
-        """A node from its normal form, or itself where it has none."""
+        """Return a node from its normal form, or itself where it has none."""
         found = self._expanded[node]
         return node if found is None else self.rebuilt(found)
 
@@ -127,7 +130,7 @@ class NormalForms:
         return p
 
     def _rooted(self, p: Polynomial) -> tuple[list[int], Polynomial] | None:
-        """Atoms to take out of the root, and what stays inside; None where nothing comes out."""
+        """Return atoms to take out of the root, and the rest; None if there are none."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
@@ -152,7 +155,9 @@ class NormalForms:
         return self._atom(value) if self.graph.op[value] == "abs" else self.expanded(value)
 
     def _magnitude(self, node: int) -> Polynomial:
-        """|x| that comes out of a root. That of a sine or a cosine, as lengths in contacts have it, is the one of the probed states; a guard says where."""
+        """Return |x| from a root. For a sine or a cosine, as in lengths of contacts, the sign is that of the
+        probed states; a guard marks its validity.
+        """
         sign = self._sign(node) if self.graph.op[node] in ("sin", "cos") and self.graph.varies[node] else 0
         if sign == 0:
             return self._kept_absolute(node)
@@ -200,7 +205,9 @@ class NormalForms:
         return result
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
-        """The terms of a monomial with squares replaced and without pairs x, 1/x; kept: the square of an atom is known before the atom is part of anything."""
+        """Return the terms of a monomial with squares replaced and without pairs x, 1/x; kept: the square of
+        an atom is known before the atom is part of anything.
+        """
         found = self._reductions.get(monomial)
         if found is None:
             rest = self._cancelled(monomial)
@@ -218,7 +225,7 @@ class NormalForms:
         return found
 
     def _first_square(self, monomial: Monomial) -> int | None:
-        """Where an atom comes twice whose square is another polynomial."""
+        """Return where an atom comes twice whose square is another polynomial."""
         before = None
         for at, atom in enumerate(monomial):
             if atom == before and atom in self._squares:
@@ -244,7 +251,8 @@ class NormalForms:
     # and back
 
     def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
-        """A node for the polynomial, divided by `divisor` (of parameters alone), with few operations."""
+        """Return a node for the polynomial, divided by `divisor` (of parameters alone), with few operations.
+        """
         graph = self.graph
         terms = []
         for varying, coefficient in self._gathered(p).items():
@@ -264,7 +272,7 @@ class NormalForms:
         return gathered
 
     def quotient(self, p: Polynomial, q: Polynomial) -> int:
-        """A node for p/q. What all terms of q have in common is cancelled term by term."""
+        """Return a node for p/q, with common factors of all terms of q cancelled term by term."""
         graph = self.graph
         if not p:
             return graph.zero
@@ -294,7 +302,7 @@ class NormalForms:
         return total
 
     def _coefficient(self, p: Polynomial) -> int:
-        """A polynomial in parameters alone: how many operations it takes does not matter."""
+        """Return a polynomial in parameters alone: how many operations it takes does not matter."""
         return self.graph.total(self.graph.mul(self.graph.const(c), self.graph.product(monomial)) for monomial, c in sorted(p.items()))
 
     def _horner(self, terms: list[tuple[Monomial, bool]]) -> int:

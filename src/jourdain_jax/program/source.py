@@ -25,7 +25,7 @@ class Language:
         return {getattr(operation, self.name) or name for name, operation in TABLE.items()}
 
     def written(self, op: str, operands: list[str]) -> str:
-        """A function of operands, which bind as loosely as may be."""
+        """Return a function of operands, which bind as loosely as may be."""
         form = getattr(TABLE[op], self.name) or self.library + op
         return f"({form.format(*operands)})" if "{" in form else f"{form}({', '.join(operands)})"
 
@@ -35,7 +35,9 @@ C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
-    """Lines that name what is used more than once, and the expressions of the outputs. `names`: of inputs and of nodes known already."""
+    """Return lines that name values used more than once, and the expressions of the outputs. `names`: of
+    inputs and of nodes already known.
+    """
     nodes = _needed(graph, outputs, names)
     uses = Counter([*outputs, *(a for node in nodes for a in graph.args[node])])
     written: dict[int, tuple[str, int]] = {n: (name, 9) for n, name in names.items()}  # text and how tightly it binds
@@ -52,7 +54,7 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
 
 
 def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dict) -> list[int]:
-    """What is to be written, in order; a ValueError where a call of JAX is among it."""
+    """Return the nodes to be written, in order; a ValueError if a call of JAX is among them."""
     nodes = graph.needed(outputs, names)
     reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
@@ -86,7 +88,7 @@ def _inside(part: tuple[str, int], level: int) -> str:
 
 
 def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, str]) -> list:
-    """The outputs as SymPy expressions; needs SymPy."""
+    """Return the outputs as SymPy expressions; needs SymPy."""
     import sympy
 
     values: dict = {n: sympy.Symbol(name) for n, name in names.items()}

@@ -52,7 +52,7 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """The scene itself; a ValueError where it is none, or the class and not one of its instances."""
+    """Return the scene itself; a ValueError if it is none, or the class and not an instance."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, BuiltFor):
@@ -63,7 +63,8 @@ def as_scene(scene) -> Scene:
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """Return the scene; ValueError where a contact may slip or fly, which the function `what` does not serve."""
+    """Return the scene; ValueError if a contact may slip or fly, which the function `what` does not support.
+    """
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
@@ -72,7 +73,8 @@ def as_rolling(scene, what: str) -> Scene:
 
 
 def of_known_numbers(function: F) -> F:
-    """The function of a scene, or of a motion, and more, run on numbers also inside `jit`, `vmap` and derivatives.
+    """Return the function of a scene, or of a motion, and more, run on numbers also inside `jit`, `vmap` and
+    derivatives.
 
     A DifferentiationModeError that names it where one is traced.
     """
@@ -91,17 +93,20 @@ def of_known_numbers(function: F) -> F:
 
 
 def as_time(t) -> Scalar:
-    """A time in s, as a number of the default floating-point type."""
+    """Return a time in s, as a number of the default floating-point type."""
     return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(real_type())
 
 
 def one_time(t, name: str = "t"):
-    """A time on NumPy, unless it is traced; None stays. A ValueError that names it where it is no number."""
+    """Return a time on NumPy, unless it is traced; None stays. A ValueError names it if it is not a number.
+    """
     return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
 
 
 def vector_of_times(ts) -> Float[Entries, "times"]:
-    """Times in s, on NumPy unless they are traced. A ValueError where they are no vector of at least one number."""
+    """Return times in s, on NumPy unless they are traced. A ValueError unless they are a vector of at least
+    one number.
+    """
     ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
     if ts.ndim != 1 or ts.size == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
@@ -114,7 +119,7 @@ def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
 
 
 def as_speeds(scene: Scene, u, what: str = "u") -> Speeds:
-    """u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
+    """Return u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
     return _as_vector(scene, what, u, as_scene(scene).speed_names.entries)
 
 
@@ -136,12 +141,14 @@ class ChangingInputs(eqx.Module):
     rates: Float[Array, "inputs"]  # per s
 
     def __call__(self, t) -> Float[Array, "inputs"]:
-        """The values near that time."""
+        """Return the values near that time."""
         return self.values + self.rates * (t - self.t)
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
-    """Values of the scene's inputs at one instant: from a vector, a dictionary (what is not named is zero), or None for all zero."""
+    """Return values of the scene's inputs at one instant: from a vector, a dictionary (missing ones are
+    zero), or None for all zero.
+    """
     names = scene.inputs.entries
     if inputs is None:
         return jnp.zeros(len(names), dtype)
@@ -161,7 +168,9 @@ _NOTE = "Lines of jourdain_jax between yours are left out of this traceback; JAX
 
 
 def shown_from_users_lines(function: F) -> F:
-    """The function, whose errors show users' lines where any of these was on the way: a method of a scene, an input, an event; in usual modes of promotion."""
+    """Return the function, whose errors show users' lines where any of these was on the way: a method of a
+    scene, an input, an event; in usual modes of promotion.
+    """
 
     @wraps(function)
     def called(*args, **kwargs):
@@ -178,7 +187,9 @@ def shown_from_users_lines(function: F) -> F:
 
 
 def users_level() -> int:
-    """The `stacklevel` with which a warning, given where this is called, shows the user's line that led there."""
+    """Return the `stacklevel` with which a warning, given where this is called, shows the user's line that
+    led there.
+    """
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and not _is_users(frame):
         frame, level = frame.f_back, level + 1
@@ -186,7 +197,7 @@ def users_level() -> int:
 
 
 def _is_shortened(error: BaseException) -> bool:
-    """Whether the error comes from a user's line, called from here; then it has the note."""
+    """Return whether the error comes from a user's line, called from here; then it has the note."""
     if jax.config.jax_traceback_filtering == "off":
         return False
     if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):
@@ -205,12 +216,12 @@ def _frames(traceback: TracebackType | None) -> list[TracebackType]:
 
 
 def _is_users(frame: FrameType) -> bool:
-    """Whether a line stands neither here nor in an installed package or Python's own library."""
+    """Return whether a line stands neither here nor in an installed package or Python's own library."""
     return not frame.f_code.co_filename.startswith((_OURS, *_INSTALLED, "<frozen"))
 
 
 def _of_users(traceback: TracebackType | None) -> TracebackType | None:
-    """The traceback without lines of this package and of JAX."""
+    """Return the traceback without lines of this package and of JAX."""
     kept: TracebackType | None = None
     for entry in reversed(_frames(traceback)):
         if _is_users(entry.tb_frame):

@@ -66,7 +66,7 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
-        """A disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
+        """Return a disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
 
         Uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are given, in kg m^2.
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
@@ -83,7 +83,8 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def ball(mass, radius, *, position, orientation, factor=0.4) -> "RigidBody":
-        """A ball of the given `radius` (m) with central moment of inertia `factor m r^2` (2/5 when solid, 2/3 when hollow).
+        """Return a ball of the given `radius` (m) with central moment of inertia `factor m r^2` (2/5 when
+        solid, 2/3 when hollow).
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
@@ -93,7 +94,8 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
-        """A thin uniform rod of the given `length` (m) along the body axis `axis` ("x", "y" or "z"), `m l^2/12` about the others.
+        """Return a thin uniform rod of the given `length` (m) along the body axis `axis` ("x", "y" or "z"),
+        `m l^2/12` about the others.
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another axis.
         """
@@ -107,7 +109,7 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def box(mass, sides, *, position, orientation) -> "RigidBody":
-        """A uniform cuboid with the three `sides` (m) along the body axes.
+        """Return a uniform cuboid with the three `sides` (m) along the body axes.
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """

@@ -45,7 +45,9 @@ class Wheel(eqx.Module):
         return self.radius if self.tyre is None else self.radius - self.tyre
 
     def lowest(self, n: Vector3) -> Vector3:
-        """The point farthest down where n is up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the axle k."""
+        """Return the point farthest down where n is up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with
+        the axle k.
+        """
         up = n - (n @ self.axle) * self.axle
         point = self.centre - self.circle * up / jnp.sqrt(up @ up)
         return point if self.tyre is None else point - self.tyre * n
@@ -59,7 +61,9 @@ class Ellipsoid(eqx.Module):
     semi_axes: Vector3  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """The point farthest down where n is up: `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, S the squares of the semi-axes."""
+        """Return the point farthest down where n is up: `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, S the
+        squares of the semi-axes.
+        """
         local = n @ self.orientation
         weighted = self.semi_axes**2 * local
         return self.centre - self.orientation @ (weighted / jnp.sqrt(local @ weighted))
@@ -77,7 +81,7 @@ class Touch(eqx.Module):
 
 
 def touch(shape: Shape, ground: Ground) -> Touch:
-    """The point of the body nearest to the ground, the ground's tangent plane there, and the gap."""
+    """Return the point of the body nearest to the ground, the ground's tangent plane there, and the gap."""
     if isinstance(ground, Plane):
         return Touch(shape.lowest(ground.normal), ground, None)
     if isinstance(shape, Ball) and isinstance(ground, Cylinder | Sphere):
@@ -88,7 +92,9 @@ def touch(shape: Shape, ground: Ground) -> Touch:
 
 
 def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
-    """The point of the circle within the tyre that is nearest to the sphere: nearest to its centre, or farthest from it when inside."""
+    """Return the point of the circle within the tyre that is nearest to the sphere: nearest to its centre, or
+    farthest from it when inside.
+    """
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle
     towards = in_plane / jnp.sqrt(in_plane @ in_plane)
@@ -96,7 +102,9 @@ def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
 
 
 def _of_core(core: Vector3, distance: Scalar, ground: Cylinder | Sphere) -> Touch:
-    """The point at `distance` (m) from the core towards the ground; NaN where a hollow has no room for it."""
+    """Return the point at `distance` (m) from the core towards the ground; NaN where a hollow has no room for
+    it.
+    """
     if ground.side == "inside":
         distance = jnp.where(distance < ground.radius, distance, jnp.nan)
     plane, arm = ground.plane_at(core), ground.arm_to(core)
@@ -121,7 +129,8 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
 
 
 def _guess(shape: Shape, ground: Ground) -> Float[Array, "4"]:
-    """The point of the body towards the ground, and the point of the surface near it: x and the gap."""
+    """Return the point of the body towards the ground, and the point of the surface near it: x and the gap.
+    """
     x = point = shape.lowest(normal_at(ground, shape.centre))
     for _ in range(3):  # steps along the gradient before Newton's method for the contact itself
         value, slope = jax.value_and_grad(ground.value)(x)

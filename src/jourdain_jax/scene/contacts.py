@@ -35,7 +35,7 @@ class Coulomb(eqx.Module):
 
 
 class Slipping(TypedDict, total=False):
-    """What contacts may state that slip, fly and strike."""
+    """Statements of contacts that slip, fly and strike."""
 
     friction: Parameter | Coulomb | None
     restitution: Parameter
@@ -104,7 +104,7 @@ class Contact(eqx.Module):
 
 
 class Rolling(Slipping, total=False):
-    """What all rolling bodies may state."""
+    """Statements of all rolling contacts."""
 
     centre: Vector | None  # m, body frame, of what rolls
     ground: Ground | None
@@ -185,7 +185,9 @@ def _radius(body: BodyPose, radius) -> Scalar:
 def rolling(
     body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
 ) -> Contact:
-    """The contact of what rolls, whose shape is a function of its centre (m, inertial frame); the other arguments: as in `ball_contact`."""
+    """Return the contact of a rolling shape, a function of its centre (m, inertial frame); the other
+    arguments: as in `ball_contact`.
+    """
     _checked_height(height)
     if not isinstance(body, BodyPose):
         raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')

@@ -34,11 +34,13 @@ class Names:
     groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
 
     def view(self, array: Float[Array, "*shape"]) -> Named:
-        """The array with named access."""
+        """Return the array with named access."""
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Position of `name`; a ValueError that lists the valid names, and says what `kind` of name it is, otherwise."""
+        """Return the position of `name`; otherwise a ValueError lists the valid names, and the `kind` of
+        name.
+        """
         check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
 
@@ -62,7 +64,7 @@ class Coordinates:
     plain: tuple[tuple[int, int], ...]  # coordinate, speed
 
     def reference(self) -> Float[np.ndarray, "coordinates"]:
-        """The reference configuration: zero, and the identity for every quaternion."""
+        """Return the reference configuration: zero, and the identity for every quaternion."""
         q = np.zeros(len(self.names), real_type())
         for first, _ in self.quaternions:
             q[first] = 1.0
@@ -91,7 +93,7 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
     quaternions, in order.
 
     Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds: `x_rate`, ..., `attitude_omega_z`.
-    ValueError for a name that is no identifier, is used twice or is taken.
+    ValueError for a name that is not an identifier, is used twice or is taken.
     """
     names: list[str] = []
     speeds: list[str] = []

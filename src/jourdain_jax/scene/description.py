@@ -1,6 +1,6 @@
 """Checks of a scene's class: spelling of methods, existing coordinate names, ordered bounds.
 
-A method with a misspelt name would be left out without a word, and with it a force or a row.
+A method with a misspelt name would be omitted without a word, and with it a force or a row.
 """
 
 import difflib
@@ -44,7 +44,9 @@ _MEANT = {  # what other programs and textbooks call them
 
 
 def check_description(scene, base: Any) -> None:
-    """A ValueError that names what is wrong with the description of `scene`, a subclass of `base`; traced values are not looked at."""
+    """Raise a ValueError that names a mistake in the description of `scene`, a subclass of `base`; traced
+    values are not checked.
+    """
     kind: Any = type(scene)
     misspelt = _misspelt(kind, base)
     if misspelt:
@@ -86,7 +88,7 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """What is wrong with the names of a class's methods, attributes and fields, in words; empty where nothing is."""
+    """Return a sentence on misspelt methods, attributes and fields of a class; empty if there are none."""
     own, owners = {field.name for field in fields(kind)}, [owner for owner in kind.__mro__ if owner not in base.__mro__]
     read = {name for owner in owners for member in vars(owner).values() for f in functions_in(member) for name in names_in(f.__code__)}
     for owner in owners:
@@ -114,7 +116,7 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """A count that is no static field would be a number of the equations, and a loop or a branch over it could not be traced."""
+    """A count that is not a static field would be a number of the equations, and a loop or a branch over it could not be traced."""
     for field in fields(scene):
         value = getattr(scene, field.name)
         if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):
@@ -133,7 +135,7 @@ def _check_domain(scene) -> None:
 
 
 def _is_ordered(pair: np.ndarray) -> bool:
-    """Whether numbers are finite and none falls below the one before."""
+    """Return whether numbers are finite and none falls below the one before."""
     return pair.dtype.kind in "biuf" and bool(np.all(np.isfinite(pair)) and np.all(np.diff(pair) >= 0))
 
 

@@ -20,7 +20,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 def digest(x: object) -> str:
-    """A short text that changes with the content of `x`."""
+    """Return a short text that changes with the content of `x`."""
     return _hashed(_content(x, 0, set(), {}))[:16]
 
 
@@ -29,7 +29,7 @@ def _hashed(content: object) -> str:
 
 
 def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]) -> object:
-    """`within`: the objects around it; `known`: what was met before, maybe in very many places, and its content in short."""
+    """Return the content for a digest. `within`: the enclosing objects; `known`: memo of digests."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -48,7 +48,7 @@ def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int
 
 
 def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
-    """The content of what has parts."""
+    """Return the content of a composite object."""
 
     def of(y: object) -> object:
         return _content(y, depth + isinstance(x, FunctionType | type), within, known)
@@ -81,13 +81,15 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Whether it is an expression of SymPy, whose symbols and functions have numbers of their own in every process, and show themselves by their names."""
+    """Return whether it is an expression of SymPy, whose symbols and functions have numbers of their own in
+    every process, and show themselves by their names.
+    """
     sympy = sys.modules.get("sympy")
     return sympy is not None and isinstance(x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction)
 
 
 def _pickled(x: object) -> object:
-    """What `pickle` keeps of an object; None of one that it refuses."""
+    """Return the pickled content of an object; None if `pickle` refuses it."""
     if isinstance(x, np.ndarray):
         return x.tolist()
     try:
@@ -104,7 +106,9 @@ def _function(f: FunctionType, of) -> object:
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """What the code reads of what it names: of a module of the user, the attributes that the code names, too."""
+        """Return the values that the code reads by name: for a module of the user, also the attributes that
+        it names.
+        """
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))

@@ -49,7 +49,7 @@ class _Ground(eqx.Module):
         self.angular_velocity = checked_real(angular_velocity, f"angular velocity of {what}", (3,))
 
     def _tangent(self, origin, normal, tangents) -> "Plane":
-        """A plane of known axes that moves with the ground."""
+        """Return a plane of known axes that moves with the ground."""
         parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
         return eqx.tree_at(parts, Plane(), (origin, normal, tangents, self.velocity_at(origin), self.angular_velocity))
 
@@ -66,7 +66,7 @@ class Plane(_Ground):
 
     A moving plane states its motion twice: `origin` and `tilt` or `normal` as functions of time, and `velocity` and `angular_velocity`, their rates and
     what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
-    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is no unit vector, where its scene is built.
+    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is not a unit vector, where its scene is built.
     """
 
     normal: Vector3  # unit vector, out of the ground
@@ -87,7 +87,9 @@ class Plane(_Ground):
 
     @property
     def axes(self) -> Matrix3:
-        """Rotation matrix whose columns are the two tangents and the normal: from components in the plane to those in the inertial frame."""
+        """Rotation matrix with the two tangents and the normal as columns: from components in the plane to
+        those in the inertial frame.
+        """
         return jnp.concatenate([self.tangents, self.normal[None]]).T
 
     def height_of(self, position: Vector) -> Scalar:
@@ -146,7 +148,7 @@ class Cylinder(_Round):
 
     `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s): a drum that
     turns has `angular_velocity = rate * axis`. All vectors in the inertial frame. The no-slip rows are along the axis and around it.
-    ValueError: a radius that is not positive, an unknown side; an axis that is no unit vector, where its scene is built.
+    ValueError: a radius that is not positive, an unknown side; an axis that is not a unit vector, where its scene is built.
     """
 
     axis: Vector3  # unit vector
@@ -189,7 +191,7 @@ class Surface(_Ground):
 
     `f`: a function of three numbers (m, inertial frame) to one, twice differentiable by JAX, with a gradient that does not vanish where it is touched;
     it may close over traced numbers, a surface that moves over the time: `lambda x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at
-    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. ValueError: an `f` that is no such function.
+    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. ValueError: an `f` that is not a such function.
     """
 
     f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
@@ -216,7 +218,7 @@ class HeightMap(_Ground):
 
     `h`: a function of two numbers (m, inertial frame) to one (m), twice differentiable by JAX. `velocity` (m/s) of its material point at `origin` (m)
     and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. The first no-slip row is along x, as seen in the surface.
-    ValueError: an `h` that is no such function.
+    ValueError: an `h` that is not a such function.
     """
 
     h: Callable = eqx.field(static=True)  # (x, y) -> height, m
@@ -261,7 +263,8 @@ def normal_at(ground: Ground, point: Vector3) -> Vector3:
 
 
 def tangents_of(n: Vector3) -> Tangents:
-    """Two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y after the shortest turn of z (or -z) to n.
+    """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y
+    after the shortest turn of z (or -z) to n.
 
     No field of tangents is continuous on a whole sphere: these change at n_z = 0, and the no-slip rows with them, not what they say.
     Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.

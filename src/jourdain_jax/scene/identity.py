@@ -1,7 +1,7 @@
 """Results kept per scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
 also by values.
 
-Reference parameters are numbers that stand in for parameters that JAX traces. What holds of a scene at every
+Reference parameters are numbers that replace parameters that JAX traces. What holds of a scene at every
 state, such as the rank of its rows and which speeds are independent, must be known before anything is
 compiled. It is found by evaluating the scene at a few states, which takes numbers for its parameters.
 """
@@ -28,7 +28,7 @@ from jourdain_jax.scene.parameters import stacked_parameters
 def clear_caches() -> None:
     """Empty the caches of this package and of JAX, and free their memory.
 
-    Every scene is traced, probed and compiled anew at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
+    Every scene is traced, probed and compiled again at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
     stays: it depends on the text of its program alone, and another thread may be running it.
     """
     for name, module in list(sys.modules.items()):
@@ -40,9 +40,10 @@ def clear_caches() -> None:
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """A function of a scene (and of what else tells its cases apart), run once per class and values, on concrete parameters, also while they are traced.
+    """Decorate a function of a scene (and of further case keys) to run once per class and values, on concrete
+    parameters, also during tracing.
 
-    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on numbers that stand in for them.
+    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on numbers that replace them.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -66,7 +67,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
 
 
 class Values:
-    """A scene by its class and the numbers of its leaves: what is found about it is cached by these."""
+    """A key of a scene by its class and the numbers of its leaves, for caches."""
 
     def __init__(self, leaves: list, treedef):
         self.leaves, self.structure = leaves, (treedef, jax.config.jax_enable_x64)
@@ -89,7 +90,7 @@ _latest: list[Values] = []  # a call asks about one scene several times; arrays 
 
 
 def _asked_about_before(leaves: list, treedef) -> Values | None:
-    """The latest scene, where these are the same objects."""
+    """Return the latest scene, where these are the same objects."""
     for known in _latest:
         if len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves)) and known.structure == (treedef, jax.config.jax_enable_x64):
             return known
@@ -103,7 +104,7 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Inside, numbers of `scene`, as far as it has them, stand in for parameters of its class that are traced.
+    """Inside, numbers of `scene`, as far as it has them, replace parameters of its class that are traced.
 
     For those that are `varied` (names; None: all), generic ones near them.
     """
@@ -115,7 +116,8 @@ def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterat
 
 
 def with_reference_parameters(scene):
-    """The scene with numbers in place of traced parameters: generic ones near those that stand in, the class's defaults, or one.
+    """Return the scene with numbers in place of traced parameters: generic ones near the reference, the
+    class's defaults, or one.
 
     Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
     """
@@ -149,7 +151,7 @@ def _defaults(scene) -> list:
 
 
 def _generic(x, near, place: int) -> np.ndarray:
-    """Numbers of the shape of x, near what is given (or one), unlike those at any other `place`."""
+    """Return numbers of the shape of x, near the given ones (or one), unlike those at any other `place`."""
     draws = np.random.default_rng(place).uniform(size=np.shape(x))
     try:
         near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
@@ -164,7 +166,8 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Numbers that differ from those given by fractions, `change` (of the same shape, after any leading axes), with `zero` in place of each zero.
+    """Return numbers that differ from the given ones by fractions, `change` (of equal shape, after any
+    leading axes), with `zero` in place of each zero.
 
     A tensor of inertia becomes that of the body stretched, sheared and turned, since tensors whose entries are changed one by one may be those of no body:
 
@@ -183,14 +186,17 @@ def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _is_inertia(x: np.ndarray) -> bool:
-    """Whether numbers can be a tensor of inertia, and are no rotation; within a hundredth, as published moments are."""
+    """Return whether numbers can be a tensor of inertia, and are no rotation; within a hundredth, as
+    published moments are.
+    """
     if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
         return False
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
 
 
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
-    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once.
+    """Decorate a function of a scene (and of further case keys) that depends on its class and the shapes of
+    its parameters only, to run once.
 
     `most`: cases that are kept.
     """
@@ -218,7 +224,7 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Inside, what these functions would find, by their name and the first part of the case, is not worked out."""
+    """Use stored results of these functions inside, by their name and the first part of the case."""
     token = _BEFORE.set(found)
     try:
         yield

@@ -36,7 +36,7 @@ class Load(eqx.Module):
 
 
 class Gravity(Load):
-    """What `gravity` makes: its `direction` is looked at when a scene is probed."""
+    """The load of `gravity`; its `direction` is checked when a scene is probed."""
 
     direction: Vector3
 

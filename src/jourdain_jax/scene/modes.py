@@ -33,7 +33,9 @@ class Modes:
         return tuple(name for name, _ in self.pairs)
 
     def number(self, name: str, value, where: str):
-        """Return the number of a mode's value, given by its name or as a number; ValueError where there is none. `where`: who gives it."""
+        """Return the number of a mode's value, given by its name or as a number; ValueError if there is none.
+        `where`: the origin of the value.
+        """
         names = self.values[name]
         if isinstance(value, str):
             check_name(value, names, f"{where} gives mode `{name}` the value `{value}`")
@@ -44,7 +46,7 @@ class Modes:
 
 
 def modes(**values) -> Modes:
-    """Declare modes: name -> names of its values, of which a motion begins with the first.
+    """Declare modes: name -> names of its values; a motion begins with the first.
 
     `motion.modes.name` is the number of the value: constant between events, and switched by `jj.Event(..., to={name: value})`.
     `inputs={name: value}` begins a motion in another one.

@@ -20,7 +20,7 @@ Vectors = Float[Array, "*times 3"]
 
 
 class Point(eqx.Module):
-    """A point of a body (or of the inertial frame, `body` None): where it is and how fast it moves."""
+    """A point of a body (or of the inertial frame, `body` None), with its position and velocity."""
 
     position: Vectors  # m, inertial frame
     velocity: Vectors  # m/s, inertial frame
@@ -58,7 +58,9 @@ class BodyPose(eqx.Module):
         return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
 
     def place(self, local: Any) -> Vectors:
-        """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
+        """Return position (inertial frame) of the point with body-frame coordinates `local` (m, relative to
+        the mass centre).
+        """
         local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
         return self.position + self.orientation @ local.astype(self.position.dtype)
 
@@ -92,12 +94,13 @@ class BodyMotion(eqx.Module):
         return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
-        """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""
+        """Return the material point with body-frame coordinates `local` (m, relative to the mass centre)."""
         position = self.place(local)
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
     def rate_of_pose(self) -> BodyPose:
-        """The rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`; mass and inertia do not change."""
+        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`; mass and inertia do not change.
+        """
         rate = eqx.tree_at(lambda b: b.position, jax.tree.map(jnp.zeros_like, self.body), self.velocity)
         if isinstance(rate, RigidBody):
             rate = eqx.tree_at(lambda b: b.orientation, rate, skew(self.angular_velocity) @ self.orientation)

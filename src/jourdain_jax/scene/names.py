@@ -8,14 +8,14 @@ from jaxtyping import Array, Float
 
 
 class UnknownNameError(KeyError):
-    """A name that does not exist; unlike a plain KeyError it prints its message as it is, without quotes around it."""
+    """A name that does not exist; unlike a plain KeyError it prints its message without quotes."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """The end of an error message: the nearest valid name, if any is near, and all valid names."""
+    """Return the end of an error message: the nearest valid name, if any is near, and all valid names."""
     valid = list(valid)
     match = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
     hint = f"did you mean `{match[0]}`? " if match else ""
@@ -23,7 +23,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
-    """Raise an error that says `what` is wrong, and the nearest valid name, unless the name is valid."""
+    """Raise an error with the text `what`, and the nearest valid name, unless the name is valid."""
     if name not in valid:
         raise error(f"{what}; {nearest(name, valid)}")
 
@@ -35,14 +35,14 @@ def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: ty
 
 
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
-    """Names as a tuple; those in a text are parted by blanks, as in `jj.coordinates`."""
+    """Return names as a tuple; in a text they are separated by spaces, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
         raise ValueError(f"`{names}` was given, expected names in one text or several")
     return tuple(names.split() if isinstance(names, str) else names)
 
 
 def as_labels(labels: "str | Iterable[str]") -> tuple[str, ...]:
-    """Names of another tool as a tuple, which may have blanks: a text is one."""
+    """Return names of another tool as a tuple, which may have blanks: a text is one."""
     return (labels,) if isinstance(labels, str) else as_names(labels)
 
 
@@ -72,5 +72,5 @@ class Named(eqx.Module):
         return name in self.keys()
 
     def keys(self) -> tuple[str, ...]:
-        """The names, in order."""
+        """Return the names, in order."""
         return tuple(slot for slot, _, _ in self.slots)

@@ -1,6 +1,6 @@
 """Names that methods read from outside their arguments.
 
-As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant of the trace: a part of the structure of the
+As everywhere in JAX, a method is traced once, and what it reads that is not a field of the scene is a constant of the trace: a part of the structure of the
 scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
 functions that a method loads itself:
 
@@ -9,7 +9,7 @@ functions that a method loads itself:
 - modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
-What helpers read is not followed. `clear_caches` makes every scene be traced anew.
+What helpers read is not followed. `clear_caches` makes every scene be traced again.
 """
 
 import dis
@@ -42,7 +42,9 @@ class StatefulError(ValueError):
 
 
 class NamesRead:
-    """Names that the methods of classes, or functions, read; a pytree without leaves, whose structure changes with what they stand for."""
+    """Names that the methods of classes, or functions, read; a pytree without leaves, whose structure changes
+    with their values.
+    """
 
     def __init__(self, roots: tuple[type | Callable, ...], strict: bool):
         self._roots, self._strict = roots, strict
@@ -99,7 +101,9 @@ def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """What the names that a function reads stand for now; None where one has state, or it is no function, so that a trace of it cannot be kept."""
+    """Return present values of the names that a function reads; None if one has state, or it is not a
+    function, so that its trace cannot be kept.
+    """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
     except (StatefulError, TypeError):  # the second: it cannot be hashed
@@ -107,12 +111,12 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 
 def is_function(x) -> bool:
-    """Whether it is a function that may read something, and not a module that holds numbers."""
+    """Return whether it is a function that may read something, and not a module that holds numbers."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(_attribute(x, "__wrapped__"))
 
 
 def is_installed(name: str | None) -> bool:
-    """Whether a module belongs to Python, to an installed package, or to this one."""
+    """Return whether a module belongs to Python, to an installed package, or to this one."""
     top = (name or "").partition(".")[0]
     if top == "__main__":
         return False
@@ -123,7 +127,9 @@ def is_installed(name: str | None) -> bool:
 
 
 def functions_in(member) -> list[FunctionType]:
-    """The functions of Python's in a member of a class, without wrappers that other modules put around them."""
+    """Return the functions of Python's in a member of a class, without wrappers that other modules put around
+    them.
+    """
     found, member = [], member.fget if isinstance(member, property) else member
     while member is not None and not isinstance(member, type):
         if isinstance(member, FunctionType) and (member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")):
@@ -134,7 +140,9 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def _attribute(x, name: str):
-    """An attribute, or None; an object's own `__getattr__` may raise anything, and so does a variable that is not yet set."""
+    """Return an attribute, or None; an object's own `__getattr__` may raise anything, and so does a variable
+    that is not yet set.
+    """
     try:
         return getattr(x, name, None)
     except Exception:
@@ -142,7 +150,9 @@ def _attribute(x, name: str):
 
 
 def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[], list]], ...]:
-    """The names that a function loads itself, with what looks them up: its globals, and the variables of the functions around it; None where not yet set."""
+    """Return the names that a function loads itself, with their sources: its globals, and the variables of
+    enclosing functions; None if not yet set.
+    """
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
     cells = {name: cell for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True) if name not in written}
@@ -151,7 +161,9 @@ def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[], list]
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
-    """Names on which code works, of attributes too, or those by some operations of Python's machine alone; functions inside it included."""
+    """Return names used by code, including attributes, or only by some instructions; inner functions
+    included.
+    """
     own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
     return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
 
@@ -170,7 +182,9 @@ class _Same:
 
 
 def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
-    """The key of what a name stands for; of what has state its identity, or, where it is said `where` it is read, a StatefulError."""
+    """Return the key of a name's value; for a value with state its identity, or, if `where` is given, a
+    StatefulError.
+    """
     try:
         return key(x)
     except StatefulError:
@@ -184,7 +198,8 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
 
 
 def key(x: Any) -> Hashable:
-    """What tells a value without state from another: its type and value, of functions, modules and classes their identity.
+    """Return a key of a value without state: its type and value; for functions, modules and classes their
+    identity.
 
     **Raises** StatefulError for what may change: arrays, containers, objects.
     """
@@ -199,7 +214,7 @@ def key(x: Any) -> Hashable:
 
 
 def _parts(x: Any) -> tuple | None:
-    """What a container holds that cannot change; None of anything else."""
+    """Return the contents of an immutable container; None for anything else."""
     if isinstance(x, slice):
         return x.start, x.stop, x.step
     if isinstance(x, partial):
@@ -213,7 +228,7 @@ def _parts(x: Any) -> tuple | None:
 
 
 def _is_constant(x: Any) -> bool:
-    """Whether it is a module, a class, a function, or something else that has no state of its own."""
+    """Return whether it is a module, a class, a function, or something else that has no state of its own."""
     if isinstance(x, BuiltinFunctionType | MethodType):
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":

@@ -13,7 +13,9 @@ from jourdain_jax.calculus.reals import Flag, as_real, described, has_unit, know
 
 
 def _as_leaf(value):
-    """A parameter as a floating-point array; what is no number is left, to be refused by name: a converter does not know the name."""
+    """Return a parameter as a floating-point array; other values stay, to be refused by name: a converter
+    does not know the name.
+    """
     try:
         return as_real(value)
     except (TypeError, ValueError):
@@ -68,7 +70,9 @@ def check_parameters(scene) -> None:
 
 
 def stacked_parameters(scene) -> str:
-    """Which parameters of a scene have one axis more than their defaults, in words, as those of many scenes at once have; empty where none has."""
+    """Return the parameters of a scene with one axis more than their defaults, in words, as for a batch of
+    scenes; empty if there are none.
+    """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}
     many = [f"`{name}` has the shape {shape}" for name, shape in shapes.items() if name in usual and shape[1:] == usual[name] != shape]

@@ -12,7 +12,7 @@ from jourdain_jax.scene.parameters import parameters_of
 
 
 class Printed:
-    """Base of results with a `_text()`: what `print`, a console and a notebook show."""
+    """Base of results with a `_text()`, shown by `print`, a console and a notebook."""
 
     def __str__(self) -> str:
         return shapes_of(self) if is_traced(self) else self._text()
@@ -24,7 +24,7 @@ class Printed:
         return f"<pre>{html.escape(str(self))}</pre>" + ("" if is_traced(self) else self._picture())
 
     def _picture(self) -> str:
-        """What a notebook shows below the text, as HTML."""
+        """Return HTML below the text in a notebook."""
         return ""
 
     def _text(self) -> str:
@@ -35,13 +35,15 @@ _picture: Callable = lambda scene: ""  # noqa: E731
 
 
 def show_scenes_with(picture: Callable) -> None:
-    """Have notebooks show what `picture(scene)` of a layer above, HTML, draws of a scene, too."""
+    """Have notebooks also show the HTML of `picture(scene)`, a function of a higher layer."""
     global _picture
     _picture = picture
 
 
 def scene_text(scene) -> str:
-    """A scene in a console, as one writes it: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; of large fields, what they are."""
+    """Return a scene as its constructor call: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; large
+    fields are described.
+    """
     shown = []
     for field in (field for field in dataclasses.fields(scene) if field.repr):
         value = getattr(scene, field.name)
@@ -55,7 +57,9 @@ def scene_text(scene) -> str:
 
 
 def scene_html(scene) -> str:
-    """A scene for a notebook: parameters with values and units, names of coordinates, speeds and inputs; a picture at its example start."""
+    """Return a scene for a notebook: parameters with values and units, names of coordinates, speeds and
+    inputs; a picture at its example start.
+    """
     left = "style='text-align:left'"
     cell = lambda text: f"<td {left}>{html.escape(text)}</td>"  # noqa: E731
     about = (type(scene).__doc__ or "").strip().split("\n")[0]
@@ -77,14 +81,14 @@ def _value(value) -> str:
 
 
 def in_digits(values) -> list[str]:
-    """Numbers with six digits; those that are round-off of the largest of them are 0."""
+    """Return numbers with six digits; those below the round-off of the largest are 0."""
     values = np.asarray(values)
     least = np.finfo(values.dtype).eps * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]
 
 
 def shapes_of(result) -> str:
-    """What can be said of a result whose numbers are not known yet."""
+    """Return the description of a result whose numbers are unknown."""
     shapes = [tuple(leaf.shape) for leaf in jax.tree.leaves(result) if hasattr(leaf, "shape")]
     largest = max(shapes, key=lambda shape: (len(shape), shape), default=())
     name = type(result).__name__

@@ -49,7 +49,7 @@ class Scene(eqx.Module):
     that a method itself reads as global names, or as variables of an enclosing function, may change: the next call notices it, as well as a replaced method
     and code changed by `%autoreload`. Arrays, lists, dictionaries and objects
     with state are refused by name: make them parameters or static fields. Changes of values read by
-    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()` starts anew.
+    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()` starts again.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -149,8 +149,8 @@ class Scene(eqx.Module):
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
-        """Named events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
-        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion go on.
+        """Named events at a `motion`: positive while it may continue; it stops where a value falls through zero, or is not a number beyond. At a
+        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion continue.
 
         Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
         through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),
@@ -187,7 +187,8 @@ class Scene(eqx.Module):
         return scene_text(self)
 
     def _repr_html_(self) -> str:
-        """For notebooks: what it is, its parameters with values and units, its coordinates, speeds and inputs."""
+        """Return HTML for notebooks: class, parameters with values and units, coordinates, speeds and inputs.
+        """
         return scene_html(self)
 
     def replace(self, **changes: Any) -> Self:
@@ -236,7 +237,9 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str,
 
 
 def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) -> list[str]:
-    """The other parts of a quaternion that is named in part, put to zero: otherwise its attitude would be any one that has these parts."""
+    """Return the other parts of a quaternion that is named in part, put to zero: otherwise its attitude would
+    be any one that has these parts.
+    """
     named = [name for name in parts if name in given]
     if len(named) in (0, 4):
         return []
@@ -252,7 +255,7 @@ def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) ->
 
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
-    """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
+    """Store a value, or a vector of values, under `name`; return the names of its entries."""
     if name not in names:
         return []
     if type(value) is not float:
@@ -292,7 +295,7 @@ class HeldFunction(eqx.Module):
         self.read = names_read(*filter(is_function, (function,)))
 
     def __call__(self, *args, **kwargs):
-        """What the function returns."""
+        """Return what the function returns."""
         return self.function(*args, **kwargs)
 
 

@@ -43,12 +43,14 @@ class Spline(eqx.Module):
         self.ts, self.values = checked_samples("Spline", ts, values, 2, "coordinate")
 
     def __call__(self, t):
-        """Value at time t (s)."""
+        """Return value at time t (s)."""
         return smooth_through_samples(jnp.asarray(t, real_type()), self.ts, self.values)
 
 
 def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
-    """Return times and values, at least so many, one `kind` for each `of` a scene. ValueError for other shapes, and for numbers that cannot be samples."""
+    """Return times and values, at least so many, one `kind` for each `of` a scene. ValueError for other
+    shapes, and for invalid numbers.
+    """
     ts = checked_real(ts, f"`ts` of `{kind}`", advice="give times in s")
     values = checked_real(values, f"`values` of `{kind}`", advice="give one number per time")
     if ts.ndim != 1 or ts.shape[0] < least or values.shape != ts.shape:
@@ -67,7 +69,7 @@ def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[A
 
 @jax.jit  # so that its name stands in what JAX traces: it need not be looked at for kinks
 def smooth_through_samples(t, ts, values):
-    """The cubic spline through `values` at `ts`, at time(s) t."""
+    """Return the cubic spline through `values` at `ts`, at time(s) t."""
     m, inside = _second_derivatives(ts, values), jnp.clip(t, ts[0], ts[-1])
     k = jnp.clip(jnp.searchsorted(ts, inside, side="right") - 1, 0, ts.shape[0] - 2)
     h, rise = ts[k + 1] - ts[k], values[k + 1] - values[k]

@@ -1,6 +1,6 @@
 """Contacts with friction as declarations of a scene: a mode, three events and a direction of slip each.
 
-Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It then has, besides what its class states,
+Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It then has, besides that which its class states,
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
@@ -25,14 +25,14 @@ from jourdain_jax.scene.motion_state import BodyPose, Pose
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
-GAINS_ENERGY, PAINLEVE, UNDECIDED = -1, -2, -3  # in place of a mode: why a motion cannot go on
+GAINS_ENERGY, PAINLEVE, UNDECIDED = -1, -2, -3  # in place of a mode: why a motion cannot continue
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
 
 
 @dataclass(frozen=True)
 class Switching:
-    """The contacts of a scene that have friction, and what the scene declares with them."""
+    """The contacts with friction of a scene, and their declarations."""
 
     contacts: tuple[str, ...] = ()
     coordinates: Coordinates | None = None
@@ -49,7 +49,7 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """What a class states, and an instance with contacts that have friction extends."""
+    """Declarations of a class, extended by an instance that has contacts with friction."""
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated
@@ -62,7 +62,7 @@ class Declared:
 
 
 def has_friction(kind: type) -> bool:
-    """Whether the methods `contacts` of a class speak of friction."""
+    """Return whether the methods `contacts` of a class speak of friction."""
     return any("friction" in _words(function.__code__) for owner in kind.__mro__ for function in functions_in(vars(owner).get("contacts")))
 
 

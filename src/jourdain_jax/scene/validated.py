@@ -24,7 +24,7 @@ _VANISH = "return numbers that vanish where the constraint is met"
 
 
 def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
-    """The bodies of a scene by name."""
+    """Return the bodies of a scene by name."""
     bodies = _dictionary(scene, "bodies", (t, q), '{"disc": jj.RigidBody(...)}')
     if not bodies:
         raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such as {{"disc": jj.RigidBody(...)}}')
@@ -35,7 +35,7 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
 
 
 def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
-    """The rates of all coordinates."""
+    """Return the rates of all coordinates."""
     directions = 2 * len(scene.switching.contacts)  # of slip: they come last, and are constant
     names = scene.coordinate_names.entries[: len(scene.coordinate_names) - directions]
     rates = checked_real(
@@ -48,7 +48,7 @@ def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "co
 
 
 def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
-    """The loads of a scene; a single one counts as a tuple of one."""
+    """Return the loads of a scene; a single one counts as a tuple of one."""
     given = scene.loads(motion)
     loads = (given,) if isinstance(given, Load) else tuple(given) if isinstance(given, Iterable) and not isinstance(given, dict | str) else None
     if loads is None:
@@ -70,13 +70,13 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
 
 
 def potential_of(scene: Scene, pose: Pose) -> Scalar | None:
-    """The scene's own potential energy, J; None where it has none."""
+    """Return the scene's own potential energy, J; None where it has none."""
     V = scene.potential(pose)
     return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
 
 
 def gauge_of(scene: Scene, pose: Pose) -> Scalar | None:
-    """The scene's gauge function, J s; None where it has none."""
+    """Return the scene's gauge function, J s; None where it has none."""
     S = scene.gauge(pose)
     return None if S is None else checked_real(S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None")
 
@@ -88,12 +88,12 @@ def prescribed_of(scene: Scene, t) -> dict[str, Scalar]:
 
 
 def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
-    """Values of the scene's own geometric rows."""
+    """Return values of the scene's own geometric rows."""
     return _numbers(scene, "geometric_constraints", pose, '{"edge": value}', "row", _VANISH, None)
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Values of the scene's own velocity rows."""
+    """Return values of the scene's own velocity rows."""
     return _numbers(scene, "velocity_constraints", motion, '{"edge": value}', "row", _VANISH, None)
 
 
@@ -109,7 +109,7 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
 
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
-    """The events by name; a plain value is that of an event that stops the motion."""
+    """Return the events by name; a plain value is that of an event that stops the motion."""
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
@@ -131,13 +131,13 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
 
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
-    """Values of the conserved quantities by name."""
+    """Return values of the conserved quantities by name."""
     advice = "give every component a name of its own"
     return _numbers(scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice)
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
-    """What the scene itself says of the look of its bodies, `""` for what stands in the inertial frame."""
+    """Return the scene's own looks of its bodies, `""` for shapes fixed in the inertial frame."""
     given = _dictionary(scene, "visuals", (pose,), '{"ball": jj.Visual.ball(0.1)}')
     found = {}
     for name, looks in given.items():
@@ -151,7 +151,7 @@ def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
 
 
 def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
-    """What a method returns, which must be a dictionary by name."""
+    """Return a method's result, which must be a dictionary by name."""
     given = getattr(scene, method)(*at)
     if not isinstance(given, dict):
         raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary by name; write return {example}")
@@ -162,7 +162,7 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
 
 
 def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: tuple[int, ...] | None = ()) -> dict[str, Array]:
-    """What a method returns at a time, pose or motion: numbers by name, or arrays of another `shape`."""
+    """Return a method's result at a time, pose or motion: numbers by name, or arrays of another `shape`."""
     given = _dictionary(scene, method, (at,), example)
     return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
 

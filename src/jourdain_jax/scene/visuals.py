@@ -64,17 +64,20 @@ class Visual(eqx.Module):
 
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":
-        """A ball of the given `radius` (m), its octants painted in turn, so that one sees it roll; `look` as for all shapes."""
+        """Return a ball of the given `radius` (m), its octants painted in turn, so that one sees it roll;
+        `look` as for all shapes.
+        """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
     @staticmethod
     def ellipsoid(semi_axes, **look: Unpack[Look]) -> "Visual":
-        """An ellipsoid with three `semi_axes` (m) along its axes; `look` as for all shapes."""
+        """Return an ellipsoid with three `semi_axes` (m) along its axes; `look` as for all shapes."""
         return shape("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), **look)
 
     @staticmethod
     def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
-        """A wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis` ("x", "y" or "z"), its quarters painted in turn.
+        """Return a wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis`
+        ("x", "y" or "z"), its quarters painted in turn.
 
         `look` as for all shapes.
         """
@@ -83,22 +86,28 @@ class Visual(eqx.Module):
 
     @staticmethod
     def box(sides, **look: Unpack[Look]) -> "Visual":
-        """A box with three `sides` (m) along its axes; `look` as for all shapes."""
+        """Return a box with three `sides` (m) along its axes; `look` as for all shapes."""
         return shape("box", _lengths(sides, "sides of a box", (3,)), **look)
 
     @staticmethod
     def cylinder(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
-        """A cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all shapes."""
+        """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all
+        shapes.
+        """
         return _about(axis, "cylinder", [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())], **look)
 
     @staticmethod
     def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
-        """A cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as for all shapes."""
+        """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as
+        for all shapes.
+        """
         return _about(axis, "capsule", [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())], **look)
 
     @staticmethod
     def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
-        """A bar of round section from each of the `points` (m, body frame) to the next; `radius` in m (default: thin); `colour`, `opacity` as for all."""
+        """Return a bar of round section from each of the `points` (m, body frame) to the next; `radius` in m
+        (default: thin); `colour`, `opacity` as for all.
+        """
         if len(points) < 2:
             raise ValueError(f"a line to be drawn has {len(points)} points, expected at least two; write jj.Visual.line(a, b)")
         stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
@@ -107,7 +116,9 @@ class Visual(eqx.Module):
 
     @staticmethod
     def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
-        """A spring between two points `a`, `b` (m, body frame): a wire of so many `turns` of the given `radius` (m); `colour`, `opacity` as for all shapes."""
+        """Return a spring between two points `a`, `b` (m, body frame): a wire of so many `turns` of the given
+        `radius` (m); `colour`, `opacity` as for all shapes.
+        """
         a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float) for p in (a, b))
         radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
         along = jnp.where(length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0]))
@@ -120,7 +131,7 @@ class Visual(eqx.Module):
 
     @staticmethod
     def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
-        """A body of flat faces.
+        """Return a body of flat faces.
 
         `vertices` (points, 3) in m and `faces`, one row of numbers of vertices for each, anticlockwise seen from outside, are known numbers; `scale`, one
         factor or three, may depend on parameters. `look` as for all shapes.
@@ -137,7 +148,8 @@ class Visual(eqx.Module):
 
     @staticmethod
     def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
-        """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
+        """Return the mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001
+        for millimetres).
 
         `look` as for all shapes. ImportError without `trimesh` (the extra `robots`); ValueError for a file that is missing, of an unknown format, or
         without faces.
@@ -158,7 +170,7 @@ def _lengths(value, what: str, shape=None) -> Float[Array, "*shape"]:
 
 
 def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
-    """A shape whose own z axis lies along `axis`."""
+    """Return a shape whose own z axis lies along `axis`."""
     k = _axis_index(axis)
     cyclic = np.eye(3)[:, [(k + 1) % 3, (k + 2) % 3, k]]
     placed = shape(kind, _stack(sizes), **look)
@@ -166,7 +178,7 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
 
 
 def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None) -> Visual:
-    """A shape of this kind; the other arguments as for all shapes."""
+    """Return a shape of this kind; the other arguments as for all shapes."""
     at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(real_type())
     turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))

@@ -4,7 +4,7 @@
     special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
 
     F (a b) = (a b) S(w)         pair on the imaginary axis: F (a + i b) = i w (a + i b);   double root: F a = w a, F b = w b + a;
-                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that go on at the same parameters
+                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that continue at the same parameters
 
 R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It has more rows than it needs, and they agree: G_X has full column rank, and its
 pseudo-inverse comes from Q R.
@@ -57,7 +57,7 @@ class Sensitivities(Printed, eqx.Module):
     held: tuple[str, ...] = eqx.field(static=True)  # what tells the motion apart and keeps its value
 
     def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
-        """The derivative by a parameter."""
+        """Return the derivative by a parameter."""
         return self.by_parameter[name]
 
     def _text(self) -> str:
@@ -68,7 +68,9 @@ class Sensitivities(Printed, eqx.Module):
 
 @of_known_numbers
 def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | tuple[str, ...]) -> Sensitivities:
-    """Derivatives of the eigenvalue s of small motions about a steady state, all by two reverse passes."""
+    """Return derivatives of the eigenvalue s of small motions about a steady state, all by two reverse
+    passes.
+    """
     scene, state, f = small
     equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f))
     z = equations.start
@@ -87,7 +89,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     X, zero = np.concatenate([equations.at(z), x.real, x.imag, np.zeros(4)]), np.zeros(len(look.R), complex)
 
     def pulled(of_rows, of_rates):
-        """Derivatives of `of_rows . R + of_rates . F x` by all numbers."""
+        """Return derivatives of `of_rows . R + of_rates . F x` by all numbers."""
         weights = np.concatenate([of_rows, of_rates, 1j * of_rates])
         real, imag = (np.asarray(program.pulled(X, part)) for part in (weights.real, weights.imag))
         return (real + 1j * imag)[: len(equations.given)]
@@ -128,7 +130,7 @@ class CriticalPoint(Printed, eqx.Module):
     kind: str = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Float[Array, "*batch"]:
-        """A coordinate, a speed, or the parameter that varies."""
+        """Return a coordinate, a speed, or the parameter that varies."""
         return self.parameters[name] if name in self.parameters else self.state[name]
 
     @property
@@ -219,7 +221,7 @@ class Special(eqx.Module):
         """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
-        of_ab = {  # of a zero eigenvalue, b is zero unless steady motions go on at the same parameters
+        of_ab = {  # of a zero eigenvalue, b is zero unless steady motions continue at the same parameters
             PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)],
             DOUBLE: [(a0, no, 1.0), (no, a0, 0.0)],
             ZERO: [(a0, no, 1.0), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
@@ -235,7 +237,9 @@ class Special(eqx.Module):
         return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
-        """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
+        """Return the step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the
+        largest.
+        """
         (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
         G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
         size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])
@@ -244,7 +248,7 @@ class Special(eqx.Module):
         return inverse @ jnp.concatenate([G, L @ X - c]), inverse, jnp.min(pivots) / jnp.max(pivots)
 
     def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
-        """The point of a scene at X."""
+        """Return the point of a scene at X."""
         of, w = self.equations, self.parts(X)[-1][0]
         q, u, varied = of.split(self.numbers(scene, X))
         eigenvalue = jax.lax.complex(*((0 * w, w) if self.kind == PAIR else (w, 0 * w)))
@@ -253,7 +257,7 @@ class Special(eqx.Module):
 
 @partial(compiled, options=RUN_SELDOM)
 def _solution(special: Special, scene: Scene) -> CriticalPoint:
-    """The point of a scene, differentiable twice."""
+    """Return the point of a scene, differentiable twice."""
     lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)  # each takes as many steps as it needs
     X, inverse, condition, code = jax.lax.stop_gradient(lane_by_lane(*jax.lax.stop_gradient((special, scene))))
     near = X
@@ -330,7 +334,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
 
 
 def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
-    """The equations, with vectors a and b at the point of the family."""
+    """Return the equations, with vectors a and b at the point of the family."""
     if not jax.config.jax_enable_x64:
         raise ValueError("critical points need float64; set jax.config.update('jax_enable_x64', True)")
     z, s = equations.place(point), point.eigenvalues

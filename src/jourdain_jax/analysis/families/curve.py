@@ -65,7 +65,8 @@ def along(equations: Motions, point: Point, s: float, guess: Vector | None = Non
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
-    """Points of a curve from its start on, and why it ends: at a target, at its own start, or where no further point is found.
+    """Return points of a curve from its start on, and why it ends: at a target, at its own start, or where no
+    further point is found.
 
     A step is halved where it turns sharply, takes many corrections, or moves eigenvalues so far that it is open which is which.
     """
@@ -100,7 +101,9 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Why a curve ends before a point: a parameter there has not the sign declared for it; None where all have."""
+    """Return why a curve ends before a point: a parameter there has not the sign declared for it; None where
+    all have.
+    """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):
         if name in equations.vary and ((declared["positive"] and values[name] <= 0) or (declared["non_negative"] and values[name] < -1e-12)):
@@ -109,7 +112,7 @@ def _left(equations: Motions, point: Point) -> str | None:
 
 
 def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point | None:
-    """The point at the end of a step; None where the step must be halved."""
+    """Return the point at the end of a step; None where the step must be halved."""
     there = along(equations, here, step)
     if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
         return None
@@ -118,7 +121,7 @@ def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point |
 
 
 def _closed(equations: Motions, first: Point, here: Point, there: Point) -> bool:
-    """Whether a step comes past the start of the curve."""
+    """Return whether a step comes past the start of the curve."""
     s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
     if not (0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step):
         return False
@@ -127,12 +130,13 @@ def _closed(equations: Motions, first: Point, here: Point, there: Point) -> bool
 
 
 def reversed_at(point: Point) -> Point:
-    """The point with the opposite tangent."""
+    """Return the point with the opposite tangent."""
     return replace(point, tangent=-point.tangent)
 
 
 def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
-    """The point between two neighbours at which a smooth `test`, of modes or not, changes its sign; None where the curve is lost, or undefined.
+    """Return the point between two neighbours at which a smooth `test`, of modes or not, changes its sign;
+    None where the curve is lost, or undefined.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
     it often lies in the middle.

@@ -84,7 +84,7 @@ class Motions(ABC):
         """What tells small motions apart, in any order, without what belongs to going on along the family."""
 
     def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
-        """The equations, with a row for each unknown that keeps its value."""
+        """Return the equations, with a row for each unknown that keeps its value."""
         if not len(self.held):
             return Look(R, J * self.size, small)
         return Look(np.append(R, (z - self.start)[self.held]), np.vstack([J * self.size, np.eye(len(z))[self.held]]), small)
@@ -121,7 +121,7 @@ class SteadyEquations(Motions):
         self.slopes = np.ix_(self.rows, columns), np.ix_(self.rates, self.states), np.ix_(self.of_states, self.states)
 
     def __call__(self, z: Vector) -> Look:
-        """The equations at z."""
+        """Return the equations at z."""
         v, D, _ = self.instant.of(self.at(z))
         J, F, C = (D[block] for block in self.slopes)
         return self.with_held(v[self.rows], J, z, (F, C))
@@ -137,9 +137,10 @@ class SteadyEquations(Motions):
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Eigenvalues of small motions in 1/s, by ascending real part, without the zeros of going on along the family or along what is held.
+        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of going on
+        along the family or along what is held.
 
-        Directions along which steady motions go on, T, belong to zeros by structure, and are taken out as a subspace, not by their size: with P orthonormal
+        Directions along which steady motions continue, T, belong to zeros by structure, and are taken out as a subspace, not by their size: with P orthonormal
         and across T the others are those of P' A P.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
@@ -156,13 +157,15 @@ class SteadyEquations(Motions):
 
 
 def numbered(scene: Scene) -> Scene:
-    """A scene with the place of its first number among all numbers in each parameter."""
+    """Return a scene with the place of its first number among all numbers in each parameter."""
     leaves, treedef = jax.tree.flatten(scene)
     return jax.tree.unflatten(treedef, np.cumsum([0, *map(np.size, leaves[:-1])]).tolist())
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Sizes of some coordinates, by their domain, and of all speeds: the units in which unknowns are measured."""
+    """Return sizes of some coordinates, by their domain, and of all speeds: the units in which unknowns are
+    measured.
+    """
     low, high = coordinate_bounds(scene)
     of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]
     return np.array([*of_coordinates, *[10.0] * len(scene.speed_names.entries)])  # SI units

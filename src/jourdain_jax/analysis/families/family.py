@@ -42,7 +42,7 @@ class FamilyPoint(Printed):
     about: str  # what the eigenvalues are
 
     def __getitem__(self, name: str) -> float:
-        """A coordinate, a speed, or the parameter that varies."""
+        """Return a coordinate, a speed, or the parameter that varies."""
         return self.values[name] if name in self.values else self.state[name]
 
     @property
@@ -60,7 +60,7 @@ class Family(Printed):
     """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
     periodic one are those at the start of a period.
 
-    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out. Of periodic
+    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are omitted. Of periodic
     motions they are multipliers, all of them.
     """
 
@@ -74,7 +74,7 @@ class Family(Printed):
         return len(self.points)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
-        """Values of a coordinate, a speed, or the parameter that varies, at all points."""
+        """Return values of a coordinate, a speed, or the parameter that varies, at all points."""
         check_name(name, self.equations.by_name, f"a family of `{type(self.equations.scene).__name__}` has no `{name}`", UnknownNameError)
         return np.array([self.equations.values(point.z)[name] for point in self.points])
 
@@ -104,7 +104,9 @@ class Family(Printed):
         return tuple(point for point in self.special if point.modes)
 
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
-        """Every point of the curve with this value of one coordinate, speed or parameter: `family.at(lean=0.4)`."""
+        """Return every point of the curve with this value of one coordinate, speed or parameter:
+        `family.at(lean=0.4)`.
+        """
         if len(named) != 1:
             raise ValueError(f"`at` takes one name with its value, but {len(named)} were given; give one")
         ((name, value),) = named.items()
@@ -115,7 +117,7 @@ class Family(Printed):
         return tuple(self.point(point) for point in (*exact, *found) if point)
 
     def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
-        """A point of the curve with its state and eigenvalues."""
+        """Return a point of the curve with its state and eigenvalues."""
         known = self.equations
         values, entries = known.values(point.z), (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
         q, u = (jnp.array([values[name] for name in names]) for names in entries)
@@ -123,7 +125,9 @@ class Family(Printed):
         return FamilyPoint(kind, state, point.modes, tuple(self.mode_names[k] for k in columns), values, point.tangent * known.size, known.modes)
 
     def to_xarray(self):
-        """Points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their names."""
+        """Return points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their
+        names.
+        """
         xarray = needed("xarray", "a family as labelled arrays")
         values = {name: ("point", self[name]) for name in self.equations.unknowns}
         about = dict(zip(("long_name", "units"), self.equations.modes.split(", "), strict=False))

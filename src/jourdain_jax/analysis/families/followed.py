@@ -41,7 +41,9 @@ def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]
 
 
 def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> list[Point]:
-    """The points, and one wherever a test nearly vanishes between them, not beside branch points: two special points may be there within a step."""
+    """Return the points, and one wherever a test nearly vanishes between them, not beside branch points: two
+    special points may be there within a step.
+    """
     points, k = list(points), 1
     while k < len(points) - 1:
         _, here, there = three = points[k - 1 : k + 2]
@@ -86,6 +88,6 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
 
 
 def across(equations: Motions, tangent: Vector) -> Point:
-    """The branch point at the guess, with the tangent of the other curve through it."""
+    """Return the branch point at the guess, with the tangent of the other curve through it."""
     other, look = min(tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent)), equations(equations.start)
     return Point(equations.start, other, look, equations.eigenvalues(look, other))

@@ -70,7 +70,7 @@ class PeriodicMotion(Printed, eqx.Module):
     unknowns: Unknowns  # states at which pieces begin, and the period
 
     def __getitem__(self, name: str) -> Scalar:
-        """A coordinate or speed at the start, by name."""
+        """Return a coordinate or speed at the start, by name."""
         return self.state[name]
 
     @property
@@ -182,7 +182,7 @@ class _Shooting(eqx.Module):
         return z[:n], z[n:]
 
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
-        """The motion from a state."""
+        """Return the motion from a state."""
         start = state_of(self.scene, t0, *self.split(z))
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options).nan_if_failed()
 
@@ -193,7 +193,7 @@ class _Shooting(eqx.Module):
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     def events(self, t, z: States) -> Float[Array, "events"]:
-        """Values of the stop events, c among them."""
+        """Return values of the stop events, c among them."""
         return event_values(self.scene, motion_at(self.scene, t, *self.split(z), inputs_at(self.inputs, t)))
 
     def constraints(self, t, z: States) -> tuple[Array, Array]:
@@ -211,7 +211,7 @@ class _Shooting(eqx.Module):
         return there
 
     def pieces_of(self, x: Unknowns) -> tuple[Float[Array, "pieces states"], Scalar]:
-        """States at which pieces begin, and the period."""
+        """Return states at which pieces begin, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
     def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
@@ -223,7 +223,7 @@ class _Shooting(eqx.Module):
         return jnp.concatenate([*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])])
 
     def ends(self, t, x: Unknowns) -> Float[Array, "pieces states"]:
-        """All f_k."""
+        """Return all f_k."""
         zs, period = self.pieces_of(x)
         return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
 
@@ -251,7 +251,9 @@ class _Shooting(eqx.Module):
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
-        """Eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going on along the motion where the period is unknown."""
+        """Return eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going
+        on along the motion where the period is unknown.
+        """
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
         rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
@@ -323,7 +325,7 @@ class OrbitEquations(Motions):
         self.held = np.array([self.index(name) for name in held], int)
 
     def __call__(self, z: Vector) -> Look:
-        """The equations at z."""
+        """Return the equations at z."""
         R, J, multipliers = map(np.asarray, _looked(self.problem, self.vary, self.t, self.at(z)))
         return self.with_held(R, J[:, self.places], z, (multipliers,))
 

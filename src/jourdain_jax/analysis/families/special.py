@@ -32,13 +32,15 @@ class Test:
     columns: tuple[int, ...] = ()  # of the eigenvalues concerned
 
     def changes(self, here: Point, there: Point) -> bool:
-        """Whether it changes its sign between two neighbours."""
+        """Return whether it changes its sign between two neighbours."""
         a, b = self.of(here), self.of(there)
         return a * b < 0 and min(abs(a), abs(b)) > self.least
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Where a test with the values f at three neighbours, the second at zero, nearly vanishes by a parabola through them; None where it changes its sign."""
+    """Return where a test with the values f at three neighbours, the second at zero, nearly vanishes by a
+    parabola through them; None where it changes its sign.
+    """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
         return None

@@ -12,7 +12,7 @@ Modes = Complex[np.ndarray, "modes"]
 
 
 def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states free"]:
-    """An orthonormal basis of the x with C x = 0."""
+    """Return an orthonormal basis of the x with C x = 0."""
     _, sigma, V = np.linalg.svd(C)
     return V[np.sum(sigma > 1e-9 * np.max(sigma, initial=1e-300)) :].T
 
@@ -34,12 +34,12 @@ def surely_matched(before: Modes, now: Modes) -> bool:
 
 
 def are_partners(before, now, k: int, j: int) -> bool:
-    """Whether two columns are a complex pair at one end at least."""
+    """Return whether two columns are a complex pair at one end at least."""
     return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
 
 
 def mode_names(scene: Scene, names: tuple[str, ...] | None, values: Modes) -> tuple[str, ...]:
-    """Names of the columns: as stated by the user, by the scene, or by number."""
+    """Return names of the columns: as stated by the user, by the scene, or by number."""
     named = getattr(scene, "mode_names", None)
     names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
     if len(names) != len(values):

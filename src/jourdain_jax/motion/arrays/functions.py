@@ -82,7 +82,7 @@ class Functions:
     shared: tuple[Sequence, ...]  # these arrays, then tangents of them
     asked: tuple[int, ...]  # of which of them cotangents are asked
     method: Any
-    middle: Array | None = None  # of the step whose stages are worked out
+    middle: Array | None = None  # of the step whose stages are computed
     modes: Sequence[Array] = ()
 
     def __post_init__(self) -> None:
@@ -190,7 +190,7 @@ class Functions:
         found = self.watched(self._args(self.shared[0]), t, self._state(self.w.load(y, self.y)))  # type: ignore[misc]
         self._store([found], values, len(self.form.watched))
 
-    # of events after which the motion goes on (`motion/native/transitions.py`)
+    # of events after which the motion continues (`motion/native/transitions.py`)
 
     def _reset(self, event, t, y, *shared) -> Float[Array, "rows *lanes"]:
         """Return the state and the modes after an event."""

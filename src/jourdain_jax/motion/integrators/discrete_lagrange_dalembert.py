@@ -65,7 +65,7 @@ class Interval(eqx.Module):
         return self.t0 + self.h
 
     def mean(self, f: Callable, q0, q1):
-        """The mean of `f(t, q, v)` over the interval, by the rule."""
+        """Return the mean of `f(t, q, v)` over the interval, by the rule."""
         v = (q1 - q0) / self.h
         if self.rule == "midpoint":
             return f((self.t0 + self.t1) / 2, (q0 + q1) / 2, v)
@@ -93,13 +93,15 @@ def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
 
 
 def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int) -> Float[Array, "rows"]:
-    """All rows over the interval; the first `geometric` ones as `g(t_1, q_1)/h`, which so hold at every node."""
+    """Return all rows over the interval; the first `geometric` ones as `g(t_1, q_1)/h`, which so hold at
+    every node.
+    """
     rows = over.mean(lambda t, q, v: velocity_residual(scene, t, q, v, inputs(t)), q0, q1)
     return rows if geometric == 0 else rows.at[:geometric].set(position_residual(scene, over.t1, q1) / over.h)
 
 
 def _has_forces(scene: Scene, t, q) -> bool:
-    """Whether any load has no potential: known while tracing."""
+    """Return whether any load has no potential: known while tracing."""
     return any(load.potential is None for load in loads_of(scene, motion_at(scene, t, q, jnp.zeros_like(q))))
 
 
@@ -137,8 +139,8 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
             raise ValueError(f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; {nearest(str(self.rule), RULES)}")
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """The full `field` of the state, which the method itself keeps on the rows. ValueError where it does not apply to the `scene`, and where
-        another state was `asked` for.
+        """Return the full `field` of the state, which the method itself keeps on the rows. ValueError where
+        it does not apply to the `scene`, and where another state was `asked` for.
         """
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)
@@ -184,7 +186,9 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 
 def _projected(args, over: Interval, q0, q1) -> Float[Array, "speeds"]:
-    """Speeds on the rows with the momentum at the end of the interval, but for a constraint impulse: linear in both."""
+    """Return speeds on the rows with the momentum at the end of the interval, but for a constraint impulse:
+    linear in both.
+    """
     _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)
     _, p1 = discrete_momenta(scene, over, q0, q1, inputs)
@@ -217,7 +221,7 @@ def _fault(scene: Scene, structure: Structure) -> str:
 
 
 def _work(args, over: Interval, y: Integrated, q1, u1):
-    """The work of the step, by the midpoint rule."""
+    """Return the work of the step, by the midpoint rule."""
     if y.work is None:
         return None
     field, scene, inputs, fixed, _ = args

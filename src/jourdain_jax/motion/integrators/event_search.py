@@ -3,7 +3,7 @@
 The formulas are those of arrays of JAX and of values of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events
 are lists, one for each event.
 
-An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it goes on
+An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it continues
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
 
@@ -118,7 +118,7 @@ def falls_through(w, h, a, slope_a, b, slope_b):
 def trial(w, t, c, step, last, guess) -> tuple:
     """Return the next time to try in a step of length `step`, and whether the last one is near enough, of the times and values of a bracket.
 
-    The first one is after the part `guess` of the way back. With `last` the search ends, at a time where the value is a number.
+    The first one is after the part `guess` of the backward pass. With `last` the search ends, at a time where the value is a number.
     """
     eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
@@ -347,7 +347,7 @@ def monitored(
 
 
 def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
-    """Whether the value of a lane's event has no slope where it falls through zero."""
+    """Return whether the value of a lane's event has no slope where it falls through zero."""
     return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
 
 

@@ -129,7 +129,7 @@ _ALL = {method.name: method for method in (TSIT5, DOPRI5, DOPRI8)}
 
 
 def method_of(solver) -> Method | None:
-    """The method of a solver of diffrax; None where our own loop has no such one."""
+    """Return the method of a solver of diffrax; None where our own loop has no such one."""
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
 
@@ -174,7 +174,9 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
 
 
 def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """The code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step that would be next."""
+    """Return the code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step
+    that would be next.
+    """
     # the last steps against the average one
     # 0.01 of the average step: a singularity is near
     shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))

@@ -37,7 +37,7 @@ class ImplicitMethod(eqx.Module):
 
     @property
     def name(self) -> str:
-        """The name of the method, as it stands in a trajectory."""
+        """The name of the method, as shown in a trajectory."""
         return type(self).__name__
 
     @abc.abstractmethod
@@ -66,11 +66,15 @@ class FixedStepMethod(ImplicitMethod):
 
 
 def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
-    """The size of each unknown, against which round-off counts: that of the state x and of its change; 1 where both are zero."""
+    """Return the size of each unknown, against which round-off counts: that of the state x and of its change;
+    1 where both are zero.
+    """
     size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(change))
     return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))
 
 
 def even_step(longest: Float[Array, ""], rest: Float[Array, ""]) -> Float[Array, ""]:
-    """The first of the fewest equal steps no longer than `longest` that cover a `rest`; a ratio 1e-9 above a whole number counts as that number."""
+    """Return the first of the fewest equal steps no longer than `longest` that cover a `rest`; a ratio 1e-9
+    above a whole number counts as that number.
+    """
     return rest / jnp.maximum(jnp.ceil(rest / longest - 1e-9), 1)

@@ -1,9 +1,9 @@
 """Reverse mode of the loop over steps as machine code: cotangents of the start from those of the states and
 the end.
 
-Lanes side by side begin and end together here. On the way forth every try of a step leaves a slot: the state before it, the slopes of its stages, by how
-far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved before it
-(`record.py`). On the way back, a step being a number,
+Lanes side by side begin and end together here. On the forward pass every try of a step leaves a slot: the state before it, the slopes of its stages, by how
+far the state continued (zero where the step was refused, or the lane had ended), and how many times had been saved before it
+(`record.py`). On the backward pass, a step being a number,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
 
@@ -115,7 +115,7 @@ def _write_added(w: MachineWriter, form: Form) -> None:
 
 
 def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
+    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that continued in it."""
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         step_back(w, form, method, asked, state, here, g, by_known)
 
@@ -130,7 +130,7 @@ def _used(method: Method) -> list[int]:
 
 
 def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Number, here: Number, g: Number, by_known: Number) -> None:
-    """Go back over the step in the slot `here`, in lanes that went on in it."""
+    """Go back over the step in the slot `here`, in lanes that continued in it."""
     slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
     h, t = w.load(here, slot.taken), w.load(here, slot.t)
     took, k = w.differs(h, 0.0), w.at(here, slot.y)
@@ -294,7 +294,8 @@ def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotange
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable:
-    """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
+    """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
+    (with its time last), and the goals.
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """

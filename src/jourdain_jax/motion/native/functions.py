@@ -38,7 +38,7 @@ class Outputs(NamedTuple):
 
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
-    """The first `pushed` of the nodes with their tangents."""
+    """Return the first `pushed` of the nodes with their tangents."""
     program, count = form.program, len(form.moving)
     if not count:
         return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
@@ -63,7 +63,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
 
 
 def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
-    """The values of outputs, and their tangents; `known`: as from `known_values`."""
+    """Return the values of outputs, and their tangents; `known`: as from `known_values`."""
     given = given_values(w, form, own, known, state, tau, y)
     found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
     tangents = iter(found[len(own.values) :])
@@ -71,7 +71,7 @@ def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], 
 
 
 def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
+    """Return values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
@@ -82,7 +82,7 @@ def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Va
 
 
 def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Values of all nodes that are given from outside."""
+    """Return values of all nodes that are given from outside."""
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
     known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
@@ -97,7 +97,7 @@ def write_rates(w: MachineWriter, form: Form) -> None:
     quantities, pivots first.
     """
     program = form.program
-    # 120 operations: so few are written anew at each stage
+    # 120 operations: so few are written again at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):

@@ -308,7 +308,7 @@ class Lanes:
         self.w.store(value, self.pointer, self.rows[name].start)
 
     def every(self, name: str) -> list[Number]:
-        """The vectors of all rows of this name."""
+        """Return the vectors of all rows of this name."""
         return [self.w.load(self.pointer, row) for row in self.rows[name]]
 
     def put(self, name: str, values: Sequence[Number]) -> None:
@@ -317,11 +317,11 @@ class Lanes:
             self.w.store(value, self.pointer, row)
 
     def place(self, name: str, lane: Number) -> Number:
-        """Where the number of one lane is."""
+        """Return where the number of one lane is."""
         return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
     def of(self, name: str, lane: Number, type: str = "double") -> Number:
-        """The number of one lane."""
+        """Return the number of one lane."""
         return self.w.load(self.place(name, lane), type=type)
 
     def set(self, name: str, lane: Number, value) -> None:
@@ -340,7 +340,7 @@ def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number
 
 
 def arguments_of_samples(form: Form) -> int:
-    """How many arguments of a handler are samples."""
+    """Return how many arguments of a handler are samples."""
     return 2 if form.sampled else 0
 
 

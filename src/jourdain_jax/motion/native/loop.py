@@ -244,7 +244,7 @@ class Start(NamedTuple):
     modes: tuple[Float[Array, "*lanes"], ...] = ()
 
     def rows(self, form: Form) -> Float[Array, "given *lanes"]:
-        """The rows of a lane at the start."""
+        """Return the rows of a lane at the start."""
         rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros_like(self.goals[0]), jnp.ones_like(self.goals[0])
         progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one]
@@ -329,7 +329,7 @@ OF_SAMPLES = 'machine code does not differentiate with respect to samples of an 
 
 
 def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
-    """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
+    """Return the motion by a kernel; `order`: of Taylor series, in place of the tableau."""
 
     def motion(form: Form) -> Callable[[Start], Found]:
         # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
@@ -345,7 +345,9 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
 
 
 def differentiated(motion: Callable[[Form], Callable[[Start], Found]], form: Form, check: Callable[[Form, Start], None]) -> Callable[[Start], Found]:
-    """The motion of a form, whose derivative is the motion of the state with one more tangent of each part; `check`: whether there is such a one."""
+    """Return the motion of a form, whose derivative is the motion of the state with one more tangent of each
+    part; `check`: whether there is such a one.
+    """
     own = jax.custom_jvp(motion(form))
 
     @partial(own.defjvp, symbolic_zeros=True)
@@ -361,7 +363,7 @@ def differentiated(motion: Callable[[Form], Callable[[Start], Found]], form: For
 
 
 def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
-    """The form and the start that have these tangents too."""
+    """Return the form and the start that have these tangents too."""
     every = (tuple(range(len(start.known[0]))), *form.moving)
     moves = [[not is_zero(dx) for dx in part] for part in along.known]
     moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))

@@ -196,7 +196,9 @@ MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is w
 
 
 def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None) -> str:
-    """Why machine code cannot integrate a scene, by Taylor series up to an `order` where one is given, in words; empty where it can."""
+    """Return why machine code cannot integrate a scene, by Taylor series up to an `order` where one is given,
+    in words; empty where it can.
+    """
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
     if reason := ffi.reason_against():
@@ -214,7 +216,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
 
 @lru_cache(maxsize=64)
 def _reason_against_program(form: Form, order: int | None) -> str:
-    """Why machine code cannot evaluate the program of a form, in words; empty where it can."""
+    """Return why machine code cannot evaluate the program of a form, in words; empty where it can."""
     program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:
@@ -263,7 +265,7 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
 
 
 def modes_among(inputs: Inputs) -> tuple[int, ...]:
-    """Which of the inputs that are no functions of time are modes."""
+    """Return which of the inputs that are no functions of time are modes."""
     return tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Mode))
 
 
@@ -313,7 +315,7 @@ def start_of(setup: Setup, begun: Begun) -> Start:
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
-    """The numbers of the modes at the start."""
+    """Return the numbers of the modes at the start."""
     return tuple(jax.lax.stop_gradient(jnp.asarray(channel.value, real_type())) for channel in inputs.channels if isinstance(channel, Mode))
 
 

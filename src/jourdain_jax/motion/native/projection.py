@@ -81,7 +81,7 @@ def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> 
             w.store(w.larger(w.load(longest), length), longest)
         with w.counted(0, rows) as i:
             length = w.load(weights, i)
-            short = length <= w.load(longest) * cutoff  # never where one is no number, which shows
+            short = length <= w.load(longest) * cutoff  # never where one is not a number, which shows
             w.store(w.where(short, 0.0, w.number(1.0) / w.where(short, 1.0, length * length)), weights, i)
 
 
@@ -181,7 +181,7 @@ class Rows:
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
 
     def reason_against(self) -> str:
-        """Why this is not written as machine code, in words; empty where it can be."""
+        """Return why this is not written as machine code, in words; empty where it can be."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)

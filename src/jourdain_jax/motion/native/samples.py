@@ -78,7 +78,9 @@ def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> Non
 
 
 def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
-    """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
+    """Return the values at the time t since the start of all inputs that are given by samples, then their
+    slopes.
+    """
     count = len(form.sampled) * (1 + with_slopes)
     values = w.room(count)
     w.run("sampled_inputs", state, t, values)

@@ -7,7 +7,7 @@ This is the one source of a step. It asks a writer for arithmetic, memory, branc
 code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Relations whose signs are watched (`motion/integrators/crossings.py`), stop
 events and the search for one (`motion/integrators/event_search.py`) are by the formulas there.
 
-A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state advances by
+A step ends at every time requested and at every knot of the inputs; the step size found before such a shortened step is remembered. The state advances by
 the difference of the times at the ends of a step, as they are after rounding.
 
 Where rows are about to lose rank, sigma being the sine between a row and those before it, round-off eps of a row is a velocity eps/sigma^2 across it, which
@@ -76,7 +76,7 @@ def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable
 
 
 def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number) -> Trial:
-    """A step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
+    """Return a step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
     aim = aimed(w, p, p["goal"], reach_of(w, form, p, p["h"]), p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     y1, error = w.room(form.integrated), w.room(form.y)
@@ -108,12 +108,14 @@ def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Call
 
 
 def reach_of(w: StepWriter, form: Form, p: Lanes, h: Number) -> Number:
-    """The step `h`, or as far as relations let one go."""
+    """Return the step `h`, or as far as relations let one go."""
     return w.smaller(h, reach(w, p)) if form.relations else h
 
 
 def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k: Number) -> Trial:
-    """A step by Taylor series, which goes over the times to save at; puts the coefficients into `k`, and after them the slope at the end of the step."""
+    """Return a step by Taylor series, which goes over the times to save at; puts the coefficients into `k`,
+    and after them the slope at the end of the step.
+    """
     count = form.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
     locating = w.equal(p["code"], LOCATING)
@@ -197,9 +199,10 @@ class Rank(NamedTuple):
 
 
 def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number) -> tuple[Number, Number, Rank | None]:
-    """The smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing rank.
+    """Return the smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing
+    rank.
 
-    Puts the slopes of all stages into `k`, and into `y1` the state of the next stage, worked out once, until it is that at the end of the step.
+    Puts the slopes of all stages into `k`, and into `y1` the state of the next stage, computed once, until it is that at the end of the step.
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()

@@ -37,7 +37,7 @@ Coefficients = list[Value]
 
 
 def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
-    """Why a series of the outputs cannot be written, in words; empty where it can."""
+    """Return why a series of the outputs cannot be written, in words; empty where it can."""
     for node in graph.reachable(outputs):
         op = graph.op[node]
         if op in ("const", "input"):
@@ -128,7 +128,7 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """The numbers j in the order in which both factors of a_j b_{k-j} are known."""
+    """Return the numbers j in the order in which both factors of a_j b_{k-j} are known."""
     return sorted(js, key=lambda j: max(j, k - j))
 
 
@@ -149,7 +149,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     uses = Counter(a for n in nodes for a in graph.args[n])
     whole = {*outputs, *(a for n in nodes if graph.op[n] not in (*signs, "mul") for a in graph.args[n])}
     forms: dict[int, Terms] = {n: [((n,), one)] for n in moving}
-    sums: dict[int, Terms] = {}  # of what is a factor, or asked for; new ones have negative numbers
+    sums: dict[int, Terms] = {}  # of what is a factor, or requested; new ones have negative numbers
 
     def named(n: int) -> Terms:
         sums[n] = forms[n]
@@ -288,7 +288,7 @@ def _judged(w: MachineWriter, form: Form, values: Sequence[Value]) -> Monitored:
 
 
 def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
-    """How long a step may be; zero where a coefficient is no number."""
+    """Return how long a step may be; zero where a coefficient is not a number."""
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
     order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h

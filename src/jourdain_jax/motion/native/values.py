@@ -6,7 +6,7 @@ in which an instruction takes less time. What a lane computes does not depend on
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
-Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. For programs that are too large these are JAX's derivatives of
+Each is machine code of its own, made when it is requested: derivatives are taken on the graph. For programs that are too large these are JAX's derivatives of
 the program as XLA runs it.
 
 Beside the steps stand numbers that depend on parameters alone, and all speeds, pivots and energies at saved states: functions of JAX on one state or scene,
@@ -41,7 +41,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def called(write: Callable[[MachineWriter], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
-    """A module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the
+    arguments.
 
     The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
     """
@@ -81,13 +82,13 @@ def _results(*arguments, shapes: Callable, **_) -> list:
 
 
 def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
-    """The call in a program for the CPU."""
+    """Return the call in a program for the CPU."""
     _check_here(ctx)
     return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
 
 
 def _on_nvidia(ctx: mlir.LoweringRuleContext, *arguments, kernel: Callable, **_):
-    """The call in a program for an NVIDIA GPU."""
+    """Return the call in a program for an NVIDIA GPU."""
     _check_here(ctx)
     if reason := nvidia.reason_against():
         raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
@@ -120,7 +121,7 @@ batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _ca
 
 
 def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
-    """Values of nodes of a graph as a function of the values of the variables."""
+    """Return values of nodes of a graph as a function of the values of the variables."""
 
     def write(w: MachineWriter) -> None:
         with w.procedure("row", "state found") as (state, found):
@@ -197,7 +198,7 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Values of nodes as a function of the values of the variables: by XLA, and by machine code.
+    """Return values of nodes as a function of the values of the variables: by XLA, and by machine code.
 
     Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
     """
@@ -234,7 +235,7 @@ class AtStates(NamedTuple):
 
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
-    """All this; None where it cannot be machine code."""
+    """Return all this; None where it cannot be machine code."""
     graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
     # 60_000 operations
     if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
@@ -287,7 +288,7 @@ def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]
     """As `Lowered.fixed_values`."""
     own = beside(program)
     parameters = [] if own is None else entries(scene, own.needed)
-    if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
+    if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing requested
         return program.fixed_values(scene)
     return entries_of(own.fixed(jnp.concatenate(parameters)))
 
@@ -309,7 +310,9 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
 
 
 def is_right(program: RowProgram, scene: Scene, t, q, u, inputs) -> Flag:
-    """Whether parameters are right, and the bodies and contacts that they make; as `parameter_faults` and `faults_at`."""
+    """Return whether parameters are right, and the bodies and contacts that they make; as `parameter_faults`
+    and `faults_at`.
+    """
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs]
     parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
     run = nodes_called(program.graph, [program.right], [*parameters, program.t, *program.q, *program.u, *program.inputs])

@@ -24,7 +24,7 @@ class Energies(eqx.Module):
     kinetic: Float[Array, "*lanes times"]
     potential: Float[Array, "*lanes times"]
     work: Float[Array, "*lanes times"] | None
-    lost: Float[Array, "*lanes times"] | None = None  # by events until then; None where no event lets a motion go on
+    lost: Float[Array, "*lanes times"] | None = None  # by events until then; None where no event lets a motion continue
 
     @property
     @with_nan_as_a_mark
@@ -112,7 +112,7 @@ def lost_of(trajectory: Record) -> Float[Array, "*lanes times"] | None:
 
 
 def _lacks_work(trajectory: Record) -> bool:
-    """Whether work was done that is not tracked, so that T + V is not constant."""
+    """Return whether work was done that is not tracked, so that T + V is not constant."""
     return trajectory.work is None and needs_work(trajectory.scene, structure_of(trajectory.scene))
 
 
@@ -182,7 +182,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
 
 
 def summary(trajectory: Record, message: str) -> str:
-    """A printed summary: steps, drift, residuals, contacts, result."""
+    """Return a printed summary: steps, drift, residuals, contacts, result."""
     found = diagnose(trajectory)
     ts = np.asarray(trajectory.ts)
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
@@ -216,13 +216,13 @@ def summary(trajectory: Record, message: str) -> str:
 
 
 def _phases_text(trajectory: Record) -> str:
-    """The first events after which a motion went on."""
+    """Return the first events after which a motion continued."""
     lines = trajectory.phases.texts()
     return ("; ".join(lines[:6]) or "no event") + f"; and {len(lines) - 6} more" * (len(lines) > 6)
 
 
 def _left_domain(trajectory: Record) -> str:
-    """Which coordinate or speed left the scene's `domain` first, and when."""
+    """Return which coordinate or speed left the scene's `domain` first, and when."""
     scene, first = trajectory.scene, []
     for names, values in ((scene.coordinate_names, trajectory.q), (scene.speed_names, trajectory.u)):
         for k, name in enumerate(names.entries):

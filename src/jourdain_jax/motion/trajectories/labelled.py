@@ -28,7 +28,9 @@ OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion
 
 @of_known_numbers
 def to_xarray(record: Record, units: Mapping[str, str] | None = None):
-    """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
+    """Return the motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a
+    coordinate or speed -> its unit.
+    """
     xarray = needed("xarray", "a motion as labelled arrays")
     lanes = _lanes(record)
     units = _units(record.scene, units)
@@ -64,7 +66,9 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
 
 @of_known_numbers
 def to_pandas(record: Record):
-    """Coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and time."""
+    """Return coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and
+    time.
+    """
     pandas = needed("pandas", "a table of a motion")
     lanes, ts = _lanes(record), np.asarray(record.ts)
     if not lanes:

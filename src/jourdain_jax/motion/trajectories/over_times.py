@@ -206,7 +206,7 @@ def contacts(scene, t, q, u, inputs):
 
 
 def residuals(scene, t, q, u, inputs):
-    """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
+    """Return residuals of the geometric rows and quaternion norms, and of the velocity rows."""
     return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
 
 

@@ -7,7 +7,7 @@ from jourdain_jax.motion.trajectories.over_times import Record
 
 
 def sketch(record: Record) -> str:
-    """Draw each coordinate, with its name and its range; times that were not reached are left out."""
+    """Draw each coordinate, with its name and its range; times that were not reached are omitted."""
     return _drawn(record, np.asarray(record.ts), np.asarray(record.q)[None])
 
 

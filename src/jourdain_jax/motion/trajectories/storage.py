@@ -64,7 +64,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
 
     A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
-    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
+    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is not an array, number or text.
     Read it with `load_trajectory` or `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):
@@ -159,7 +159,7 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     except TypeError as error:
         raise refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
     parameters, static = _stored_fields(scene)
-    if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would stand in for what moved
+    if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would replace what moved
         raise ValueError(
             f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written before the class had it: "
             "pass the class as it was when the file was written"
@@ -277,7 +277,7 @@ def _unpacked(file) -> dict[str, np.ndarray]:
 
 
 def _parameters(arrays: dict) -> dict:
-    """The parameters of the scene among the arrays of a file."""
+    """Return the parameters of the scene among the arrays of a file."""
     return {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
 
 

@@ -39,7 +39,9 @@ class Trajectory(Record, Printed):
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
-        """A coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the times."""
+        """Return a coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the
+        times.
+        """
         if name == "t":
             return self.ts
         for names, array in ((self.scene.coordinate_names, self.q), (self.scene.speed_names, self.u)):
@@ -170,7 +172,7 @@ class Trajectory(Record, Printed):
 
         A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
         reduction that do not determine the others in this precision; contacts that would have to pull.
-        Computed where it is asked for; needs numbers: not under jit or vmap.
+        Computed where it is requested; needs numbers: not under jit or vmap.
         """
         failure = () if int(self.result) <= results.EVENT else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
@@ -204,7 +206,7 @@ class Trajectory(Record, Printed):
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Their derivatives are NaN, too. Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect
+        Their derivatives are NaN, too. Lanes that are omitted of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect
         to what all lanes share.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731

@@ -38,7 +38,7 @@ class UsualLengths(eqx.Module):
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:
-    """The usual lengths for the parameters of `scene`; no derivative passes through them."""
+    """Return the usual lengths for the parameters of `scene`; no derivative passes through them."""
     with jax.ensure_compile_time_eval():  # they are kept from one call to the next, whether inside `jit` or not
         own_speeds = _of_own_speeds(scene)
         if not is_traced(scene):
@@ -87,7 +87,7 @@ class ByMatrices(VectorField):
     cutoff: float | None = eqx.field(static=True)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     def now(self, inputs, t):
-        """The values of the inputs, with their own rates where rows depend on them."""
+        """Return the values of the inputs, with their own rates where rows depend on them."""
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
@@ -130,7 +130,7 @@ class MinimalByMatrices(ByMatrices):
         return self._kinematics(scene, t, y, inputs).u
 
     def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
-        """All speeds, and the pivot with the sign of det A_z."""
+        """Return all speeds, and the pivot with the sign of det A_z."""
         found = self._kinematics(scene, t, y, inputs)
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
@@ -167,7 +167,7 @@ class FullByMatrices(ByMatrices):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether round-off might decide on which branch a motion goes on."""
+        """Whether round-off might decide on which branch a motion continues."""
         return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
     @property
@@ -199,7 +199,9 @@ def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows s
 
 
 def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
-    """The full state in place of another form, for a solver that keeps it on the rows by `own_equations`."""
+    """Return the full state in place of another form, for a solver that keeps it on the rows by
+    `own_equations`.
+    """
     return FullByMatrices(
         independent=None,
         reduction=field.reduction,

@@ -71,7 +71,7 @@ class Formulation(eqx.Module):
 
     @property
     def baumgarte(self) -> Baumgarte | None:
-        """The terms added to the rows; None where there are none."""
+        """The terms added to the rows; None if there are none."""
         return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
 
 
@@ -79,7 +79,7 @@ _DEFAULT = Formulation()
 
 
 def as_formulation(formulation) -> Formulation:
-    """The formulation, the default one for None; ValueError for anything else."""
+    """Return the formulation, the default one for None; ValueError for anything else."""
     if formulation is None:
         return _DEFAULT
     if not isinstance(formulation, Formulation):
@@ -148,7 +148,7 @@ class VectorField(eqx.Module):
 
     @property
     def reduction_name(self) -> str:
-        """Name of the reduction, as it stands in a trajectory."""
+        """Name of the reduction, as shown in a trajectory."""
         return getattr(self.reduction, "name", "")
 
     @property
@@ -168,7 +168,7 @@ class VectorField(eqx.Module):
 
     @property
     def needs_pivot(self) -> bool:
-        """Whether a small pivot, or one that changes sign, ends a motion: a state that is all there goes on, with a warning."""
+        """Whether a small pivot, or one that changes sign, ends a motion: a state that is all there continues, with a warning."""
         return True
 
     @property
@@ -182,7 +182,7 @@ class VectorField(eqx.Module):
         return False
 
     def fixed(self, scene: Scene) -> tuple:
-        """What the rates need of the scene: computed once per motion."""
+        """Return what the rates need of the scene: computed once per motion."""
         return ()
 
     def now(self, inputs, t):
@@ -190,7 +190,7 @@ class VectorField(eqx.Module):
         return inputs(t)
 
     def pack(self, q, u) -> Integrated:
-        """The integrated state of (q, u)."""
+        """Return the integrated state of (q, u)."""
         v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
@@ -214,7 +214,7 @@ class VectorField(eqx.Module):
         """
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
+        """Return values of the stop events, in the order of their names; lanes only where `lowers_events`."""
         return event_values(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
 
     def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
@@ -250,7 +250,7 @@ class ByProgram(VectorField):
 
     program: Lowered = eqx.field(static=True)
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    native: bool = eqx.field(static=True, default=False)  # machine code of our own works out what stands beside the steps
+    native: bool = eqx.field(static=True, default=False)  # machine code of our own computes what stands beside the steps
 
     @property
     def lowered(self) -> Lowered:
@@ -287,14 +287,14 @@ class ByProgram(VectorField):
         return self.projects and bool(self.program.squares)
 
     def fixed(self, scene: Scene) -> tuple:
-        """What depends on parameters alone."""
+        """Return what depends on parameters alone."""
         return values.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
     def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
-        """All speeds, and the smallest pivot of the elimination."""
+        """Return all speeds, and the smallest pivot of the elimination."""
         if self.native:
             return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
@@ -329,6 +329,6 @@ class ByProgram(VectorField):
         return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
-        """The state put back onto the rows."""
+        """Return the state projected onto the constraints."""
         q, v = self.program.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
         return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
