@@ -117,7 +117,7 @@ SENSORS: dict[str, str] = {
     "jj.Estimate(1.0, range=(0.0, 1.0))": "`range` of `Estimate` is a tuple, expected `bounds",
     "jj.Estimate(1.0, per_run=1)": "`per_run` of `Estimate` is an int, expected True or False",
     "jj.Estimate(1.0, prior=0.1)": "`prior` of `Estimate` is a float, expected `jj.Normal(mean, sigma)`",
-    "jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0))": "expected a standard deviation above zero; a number that is known needs no estimate",
+    "jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0))": "expected a standard deviation above zero; give known numbers without `Estimate`",
     "jj.Actuator(1.0)": "`command` of `Actuator` is a float, expected `jj.Sampled",
     "jj.Actuator(command, hold=1)": "`hold` of `Actuator` is an int ... expected True",
     "jj.Actuator(command, gain=[1.0, 2.0])": "`gain` of `Actuator` has shape (2,), expected one number",

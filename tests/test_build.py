@@ -118,7 +118,7 @@ def crane() -> type[jj.Scene]:
 def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_says_so():
     kind = crane()
     built = [jj.build(kind(*numbers)) for numbers in ((1.0, 1.0), (1.0, 10.0), (10.0, 1.0))]
-    chosen, told = [model.freedoms.privileged for model in built], ["which stand in for parameters that JAX traces" in str(model) for model in built]
+    chosen, told = [model.freedoms.privileged for model in built], ["which replace parameters that JAX traces" in str(model) for model in built]
     assert told == [privileged != chosen[0] for privileged in chosen]
     assert any(told)
 

@@ -112,7 +112,7 @@ def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_deriv
         return found.q_end[0], found.crossings
 
     for derivative in (jax.grad, jax.jacfwd):
-        with pytest.warns(jj.SensitivityWarning, match="leave out how the time of the jump moves"):
+        with pytest.warns(jj.SensitivityWarning, match="omit the shift of the time of the jump"):
             assert derivative(end, has_aux=True)(0.0)[1] == 2
 
 
@@ -172,7 +172,7 @@ class Ring(OnPlane):
 def test_a_tolerance_that_the_precision_does_not_hold_is_the_cause_that_is_told(backend):
     lost = jj.simulate(Ring(), {"x": 1.0, "y_rate": 1.0}, ts=[1.0], rtol=1e-60, atol=1e-60, backend=backend, formulation=jj.Formulation("full"))
     assert lost.result == results.UNRESOLVED
-    assert "`rtol` is less than this precision resolves" in lost.message
+    assert "`rtol` is below the resolution of this precision" in lost.message
 
 
 # No step is longer than a part of the span: in machine code, in XLA's loop, by Taylor series and by diffrax; the same steps in the first two.

@@ -251,7 +251,7 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     values = noisy(0, sigma=(0.01, 0.01)).values
     assert not fit(Cart(mass=1.7), cart_run(values=values, sigma=0.01), ("mass",)).warnings
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
-    assert "the residuals of `x_rate` are smaller than the sigmas foretell by a factor of about 7.9: sigmas are too large" in warning
+    assert "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are too large" in warning
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=jj.huber()).warnings
     assert "the residuals are smaller than the sigmas foretell" in warning
 
@@ -310,7 +310,7 @@ def test_a_gap_in_a_logged_input_is_named():
     ts = np.linspace(0.0, 4.0, 81)
     gap = (ts > 1.0) & (ts < 1.9)
     log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}  # noqa: E731
-    with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is a straight line"):
+    with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is interpolated linearly"):
         log_likelihood(CART, cart_run(inputs=log(~gap)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -442,7 +442,7 @@ def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
     assert 0.75 < claimed.autocorrelation["x"][0] < 0.95
     assert found[0].warning == ""
     own = fit(Cart(mass=1.9), [noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)], ("mass",), errors="runs")
-    assert "which makes intervals of what is a run's own too narrow (`run 0: x`)" in own.warning
+    assert "which makes intervals of unknowns of single runs (`run 0: x`)" in own.warning
     spread = np.std([float(f["mass"].value) for f in found])
     honest, naive = np.mean([float(f["mass"].standard_error) for f in found]), float(claimed["mass"].standard_error)
     assert honest == pytest.approx(spread, rel=0.5)  # 14 % is the sampling error of a deviation from 25

@@ -115,7 +115,7 @@ def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
     assert "positive spin rolls forward" in disc.python_source()
     assert "const double spin_rate = speeds[2];" in disc.c_source()
     two = jj.lower(TwoLateralRows())
-    assert "rows left out, as the others imply them: second" in str(two)
+    assert "redundant rows omitted: second" in str(two)
 
 
 class TwoLateralRows(jj.models.ChaplyginSleigh):

@@ -136,7 +136,7 @@ def test_work_that_is_left_out_is_no_fault():
     driven = jj.simulate(small.BeadOnTurningWire(), {"r": 0.5}, t1=1.0, work=False)
     assert jj.diagnose(driven).energy_drift > 0.1
     assert driven.warnings == ()
-    assert "T + V, which the work changes that was left out" in str(driven)
+    assert "T + V, changed by work that was not integrated" in str(driven)
 
 
 def test_what_changes_the_mass_is_named():

@@ -92,10 +92,10 @@ def neighbours(form):
             change(at(root, place), at(root, place[:-1]))
             return reader, ElementTree.tostring(root, encoding="unicode")
 
-        yield f"{where}-text", *changed(lambda x, _: setattr(x, "text", "0 1 0")), r"the text `0 1 0` in .* is not read"
+        yield f"{where}-text", *changed(lambda x, _: setattr(x, "text", "0 1 0")), r"the text `0 1 0` in .* is not supported"
         yield f"{where}-tail", *changed(lambda x, above: setattr(x, "tail", "0 1 0") if x is not above else setattr(x, "text", "0 1 0")), "the text `0 1 0` in "
-        yield f"{where}-attribute", *changed(lambda x, _: x.set("spring", "3")), r'`spring="3"` of .* is not read'
-        yield f"{where}-child", *changed(lambda x, _: ElementTree.SubElement(x, "loop_joint", name="l")), r"`loop_joint` `l` in .* is not read"
+        yield f"{where}-attribute", *changed(lambda x, _: x.set("spring", "3")), r'`spring="3"` of .* is not supported'
+        yield f"{where}-child", *changed(lambda x, _: ElementTree.SubElement(x, "loop_joint", name="l")), r"`loop_joint` `l` in .* is not supported"
         if place and element.tag not in SEVERAL:
             yield f"{where}-twice", *changed(lambda x, above: above.append(copy.deepcopy(x))), f"has 2 elements `{element.tag}`, expected one|several shapes"
         for name in element.attrib:
@@ -104,7 +104,7 @@ def neighbours(form):
                 def misspell(x, _, name=name):
                     x.set(name[:-1] + "_", x.attrib.pop(name))
 
-                yield f"{where}-{name}", *changed(misspell), rf"`{name[:-1]}_=.*is not read"
+                yield f"{where}-{name}", *changed(misspell), rf"`{name[:-1]}_=.*is not supported"
 
 
 NEIGHBOURS = {name: rest for form in FILES for name, *rest in neighbours(form)}
@@ -143,7 +143,7 @@ def test_what_is_said_twice_is_refused(form):
     if form == "mjcf":
         with pytest.raises(ValueError, match="two `default` are of the class `heavy`"):
             reader(text.replace("</default></default>", '</default><default class="heavy"/></default>'))
-        with pytest.raises(ValueError, match="the text `3` in `joint` of the class `heavy` is not read"):
+        with pytest.raises(ValueError, match="the text `3` in `joint` of the class `heavy` is not supported"):
             reader(text.replace('<joint damping="0.1"/>', "<joint>3</joint>"))
         with pytest.raises(ValueError, match="the class `main` states `geom` twice"):
             reader(text.replace('<geom density="500"/>', '<geom density="500"/><geom density="400"/>'))
@@ -164,13 +164,13 @@ ASIDE = [
 @pytest.mark.parametrize(("old", "new", "key"), ASIDE)
 def test_what_is_refused_can_be_left_out_on_purpose(old, new, key):
     text = URDF.replace(old, new)
-    with pytest.raises(ValueError, match=rf"is not read; .*ignore=\(\"{key}\",\)"):
+    with pytest.raises(ValueError, match=rf"is not supported; .*ignore=\(\"{key}\",\)"):
         jj.from_urdf(text)
     assert jj.from_urdf(text, ignore=key)().coordinate_names.entries == ("turn", "slide")
 
 
 def test_a_misspelt_name_is_put_right():
-    with pytest.raises(ValueError, match=r'`dampin="0.7"` of `dynamics` of joint `turn` is not read; did you mean `damping`\?'):
+    with pytest.raises(ValueError, match=r'`dampin="0.7"` of `dynamics` of joint `turn` is not supported; did you mean `damping`\?'):
         jj.from_urdf(URDF.replace('damping="0.7"', 'dampin="0.7"'))
 
 

@@ -194,4 +194,4 @@ def test_verification_leaves_out_a_derivative_that_does_not_exist_and_says_so():
     scene = TwoBlades()
     found = jj.verify(scene, jj.consistent(scene, 0.0, [0.1, 0.2], [1.0, 0.5]))
     assert found.passed
-    assert "parameters left out" in str(found)
+    assert "parameters omitted" in str(found)

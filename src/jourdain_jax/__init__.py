@@ -4,7 +4,7 @@ Importing this package switches JAX to 64-bit floats, unless the environment var
 threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile small loops on the CPU into one function each, unless XLA_FLAGS
 holds `xla_backend_extra_options`. The last two take effect if JAX has not computed anything yet.
 
-What a first motion does not need, such as fits, studies and pictures, is imported when it is first requested.
+Fits, studies, pictures and other parts that a first motion does not need are imported on first use.
 """
 
 import os as _os

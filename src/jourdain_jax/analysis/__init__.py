@@ -1,7 +1,7 @@
 """Analyses of scenes and states (integrability, report, energy, verification), and identification from
 measurements.
 
-The way of a fit, from what is given to what is told:
+The way of a fit, from arguments to results:
 
     experiment   what was measured in each run: times, channels, sigmas, start, inputs
     sensors      between a motion and a channel, between a command and an input: gain, bias, delay, lag       quantities: what a channel shows

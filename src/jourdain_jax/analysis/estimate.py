@@ -233,4 +233,4 @@ def _check_prior(prior) -> None:
     except (AttributeError, TypeError):
         raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, sigma)`") from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
-        raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; a number that is known needs no estimate")
+        raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give known numbers without `Estimate`")

@@ -1,9 +1,9 @@
 """Estimates of a fit: values with their uncertainty, residuals, the fitted scene, and undetermined
 combinations.
 
-What a fit tells of one unknown, and of the residuals of one channel.
+Results of a fit for one unknown, and for the residuals of one channel.
 
-What follows from the minimum that a fit found: standard errors and intervals, residuals by channel, the fitted scene.
+Results at the minimum of a fit: standard errors and intervals, residuals by channel, the fitted scene.
 
 interval      estimate -+ q e,  within the bounds      e: standard error, q: quantile (see `spread`); at a bound: up to a limit by profile likelihood
 freedom       samples - rank + tr(C P)       what the samples determined is less than the rank by what priors tell; P: their information, C: covariance
@@ -56,8 +56,8 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[st
         jumps = moving_jumps(modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
         if jumps and one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings:
             found.append(
-                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: the slopes that are fitted by leave out how the times of "
-                "jumps move, and so do standard errors; let loads change within a short time or length"
+                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: derivatives and "
+                "standard errors omit the shift of the times of jumps; let loads change within a short time or length"
             )
         if type(scene).events is Scene.events:
             continue
@@ -71,7 +71,7 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[st
         if motion.event >= 0 and samples:
             event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
             found.append(
-                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it went on; leave these out, or give "
+                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it continued; omit these, or give "
                 "the time at which it was observed, in `events`"
             )
     return tuple(found)
@@ -184,7 +184,7 @@ class Estimated(Printed, eqx.Module):
         if self.value.ndim:
             return f"{described(self.value)}{unit}: its fields `value`, `standard_error`, `low`, `high` have that shape"
         if np.isnan(self.low + self.high):
-            return f"{self.value:.6g}{unit}, which the measurements do not tell"
+            return f"{self.value:.6g}{unit}, not determined by the measurements"
         error = f"standard error {self.standard_error:.2g}" if np.isfinite(self.standard_error) else "at its bound"
         return f"{self.value:.6g}{unit}, {error}, 95 % interval [{self.low:.6g}, {self.high:.6g}]"
 
@@ -223,8 +223,8 @@ GONE = {
 class Estimates(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum is computed when it is first asked
-    for; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. Results at the minimum are computed on first
+    access; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
     `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
     """
 
@@ -305,7 +305,7 @@ class Estimates(Printed):
         pairs = sorted(zip(*np.nonzero(np.abs(found) >= 0.98), strict=True), key=lambda ij: -abs(found[ij]))
         return tuple(
             f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
-            "the data tell a combination of them far better than either"
+            "the data determine a combination of them far better than either"
             for i, j in pairs
         )
 

@@ -52,7 +52,7 @@ def filtered_log_likelihood(
 
     **Arguments**
     - `data`: one run or several. A start value is known, or a first guess with an `Estimate(prior=Normal(mean, sigma))` in `unknown_start`: the motion then
-      begins with this spread. Sensors show what is now, with known gain and bias; all numbers are known.
+      begins with this spread. Sensors are without delay and lag, with known gain and bias; all numbers are known.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the speed)^2 / s: left to it alone, the variance of
       the speed grows by q t. Speeds that are not named are not disturbed. Which speeds are independent: `scene.privileged`, or the engine's choice.
     - `options`, `by_name`: as of `simulate`.

@@ -52,9 +52,10 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     """Return the minimum from each `theta`; where none is found, or residuals are far beyond their sigmas,
     the lower one of it and that over growing spans.
 
-    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
-    a short span does not tell stays near the first guess. What is far off, and comes no nearer, gives way to growing spans, and goes on only where these do not
-    lead to small residuals either. Where each theta is a first guess of one problem, spans grow only where none led to a minimum with small residuals.
+    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins at the end of the fit over the shorter span, and
+    unknowns not determined by a short span stay near the first guess. A distant fit without progress is
+    replaced by growing spans, and continues only if these do not lead
+    to small residuals either. Where each theta is a first guess of one problem, spans grow only where none led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
@@ -140,11 +141,11 @@ def fit(
       is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
       `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
       `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. The name of a body, with
-      `possible_inertia()`, frees its moments of inertia. What `unknown_start`, sensors and actuators of the runs name is free as well.
+      `possible_inertia()`, frees its moments of inertia. Unknowns in `unknown_start`, sensors and actuators of the runs are free as well.
     - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
-      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
+      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` is the number of guesses that led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
-      starts of their own, and continuity between them is an equation. What is minimised stays the same.
+      starts of their own, and continuity between them is an equation. The objective is unchanged.
 
     By name (`by_name`):
     - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it

@@ -117,7 +117,7 @@ def fit_page(
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]
     if profiles:
         about = (
-            "By how much the sum of squares rises where one unknown is held and all others are fitted anew. The interval ends where it passes 3.84 (red, "
+            "The rise of the sum of squares when one unknown is held and all others are fitted again. The interval ends where it passes 3.84 (red, "
             "dashed). Grey: the parabola of the standard error; where both differ, trust the profile."
         )
         figures = [profile(one, float(fit[one.name].standard_error)) for one in profiles.values()]
@@ -129,7 +129,7 @@ def fit_page(
         sections.append(_predicted("Data (dots) and prediction (line)", "", fitted, units, "run"))
     if held_out:
         about = (
-            "These runs had no part in the fit. What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each "
+            "These runs had no part in the fit. Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of each "
             "run, are fitted to the run itself."
         )
         sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
@@ -149,7 +149,7 @@ def _informed(shares: Informed) -> Section:
         run, begin, end = shares.half(i)
         rows.append((name, *(f"{100 * share[i]:.1f} %" for share in columns.values()), f"run {run}, {begin:.3g} to {end:.3g} s"))
     more = shares.of_runs.shape[1] - len(shown)
-    note = [f"The {len(shown)} runs that tell most are shown; {more} more are not."] if more else []
+    note = [f"The {len(shown)} most informative runs are shown; {more} more are not."] if more else []
     return Section("What informs which unknown", about, table(rows) + note)
 
 
@@ -190,7 +190,7 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
 
 
 def _way(fit: Estimates) -> Section:
-    told = fit.agreement if fit.guesses > 1 else "one first guess was tried; `guesses=30` would tell how many lead here"
+    told = fit.agreement if fit.guesses > 1 else "one first guess was tried; `guesses=30` would show how many lead here"
     rows = [("what is minimised", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
     return Section("The way to the minimum", told, table(rows))

@@ -41,11 +41,11 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
         yield "no minimum was found; raise `max_iterations`, or start nearer to it"
     if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
         verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
-        yield f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds"
+        yield f"{', '.join(names)} {verb}; standard errors are meaningless: widen the bounds"
     for name in fit.untold:
         yield (
-            f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: estimates are drawn to meet its samples exactly, and "
-            "intervals take nothing from them"
+            f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: its samples are fitted exactly, and "
+            "do not count in intervals"
         )
 
 
@@ -58,12 +58,12 @@ def _of_the_data(fit: Estimates) -> Iterator[str]:
             here = f"`{name}` of run {run}"
             there = first.setdefault(counted.tobytes(), here)
             if here != there and len(np.unique(counted)) > 3:  # different residuals that two channels may share by chance
-                yield f"{there} and {here} hold the same numbers: counted as two measurements, they make intervals too narrow; leave one out"
+                yield f"{there} and {here} hold equal numbers: counted as two measurements, they make intervals too narrow; omit one"
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
         yield f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds"
     for name, far in zip(fit.labels, fit.from_prior, strict=True):
         if abs(far) > 4.0:  # standard deviations: an estimate that lies further from its prior is no chance
-            yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: the prior, the data or the scene is not right"
+            yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: check the prior, the data and the scene"
 
 
 def _of_residuals(fit: Estimates) -> Iterator[str]:
@@ -71,7 +71,7 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     sizes, sure = _sizes_of_residuals(fit), 5.0  # standard deviations: a mean square that is further from 1 is no chance
     coloured = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
     if large := [size for size in sizes if size.least > _by_chance(size.narrow, sure)]:
-        why = "a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
+        why = "a local minimum (start nearer), a wrong scene, or sigmas that are too small"
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
     def larger(channels: list[str]) -> float:
@@ -83,8 +83,8 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     if small := [size for size in sizes if size.most * larger(size.channels) < _by_chance(size.wide, -sure)]:
         times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
         yield (
-            f"the residuals{small[0].named} are smaller than the sigmas foretell{times}: sigmas are too large, so that intervals are too wide, or samples were "
-            "smoothed or have no noise; a sigma of `None` is estimated"
+            f"the residuals{small[0].named} are smaller than the sigmas predict{times}: sigmas are too large, which makes intervals too wide, or samples were "
+            "smoothed or have no noise; give `None` to estimate a sigma"
         )
     wide = {name for size in small for name in size.channels}
     named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
@@ -92,11 +92,11 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     start = f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals"
     if named and fit.errors == "sigmas":
         yield (
-            f"{start} too narrow: the scene, a sensor or the noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs "
-            'or more, errors="runs" gives intervals that allow for it'
+            f"{start} too narrow: check the scene, sensors and noise; `correlation_time=None` estimates the correlation of the noise, and with five runs "
+            'or more, errors="runs" accounts for it'
         )
     elif named and own:
-        yield f"{start} of what is a run's own too narrow (`{own[0]}`): how runs differ says nothing of it"
+        yield f"{start} of unknowns of single runs (`{own[0]}`) too narrow: differences between runs do not show them"
 
 
 class _Size(NamedTuple):
@@ -163,7 +163,7 @@ def text(fit: Estimates) -> str:
     if fit.guesses > 1:
         lines.append(fit.agreement)
     if fit.errors == "runs":
-        lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
+        lines.append(f"standard errors from the differences between the {len(fit.residuals)} runs")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
     lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
@@ -205,7 +205,7 @@ class Fit(Estimates):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene;
     `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; what follows below is of one fit.
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; the following describes one fit.
     """
 
     @property
@@ -223,8 +223,8 @@ class Fit(Estimates):
         range within which 2 (F - F_min) stays below 3.84 when all others are fitted again, "bounded",
         "one-sided" or "flat". `data`: the runs of the fit.
 
-        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by what variances
-        and quantiles are the larger for it. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
+        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by the
+        increase of variances and quantiles. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
         not estimated.
         """
         self._check_one()
@@ -237,7 +237,7 @@ class Fit(Estimates):
         """Predict `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the unit of the
         channel) and `r_squared`.
 
-        What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
+        Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
         ValueError for a fit of a batch or one that failed, and for runs that do not fit its scene or whose motion fails.
         """
         self._check_one()

@@ -10,14 +10,14 @@ An unknown with a part in the remaining directions V_0 has no standard error and
 would be its standard error, while all unknowns move along V_0 by about their sizes.
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 
-Numbers that follow from what a fit found: their estimates, standard errors and intervals, to first order.
+Numbers that depend on the estimates of a fit: their estimates, standard errors and intervals, to first order.
 
     y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
 
-A number can be told although its parts cannot: it has a standard error where g has no part in the directions that do not show.
+A number can be determined although its parts are not: it has a standard error where g has no part in the directions that do not show.
 Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
 
-Combinations of unknowns that the data tell, but poorly ("sloppy" directions), in words.
+Poorly determined combinations of unknowns ("sloppy" directions), in words.
 
 C_rel = C_ij / (size_i size_j),      C_rel v = s^2 v:      the unknowns may change together along d theta_i/size_i = s v_i, s being one standard error
 
@@ -279,10 +279,10 @@ def weak_combinations(
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
         *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
         if others:
-            said = "together are one standard error: the data tell this combination poorly"
+            said = "together are one standard error: the data determine this combination poorly"
             found.append(f"{', '.join(others)} and {last} {said}")
         else:
-            found.append(f"{last} is one standard error: the data tell it poorly")
+            found.append(f"{last} is one standard error: the data determine it poorly")
     return tuple(found)
 
 

@@ -54,12 +54,12 @@ def possible_inertia() -> PossibleInertia:
 
     In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments D (kg m^2) and shears l as unknowns,
     `"rear frame second moment[0]"` and `"rear frame shear[0]"`. Principal moments of inertia are then positive, and each is at most the sum of the other two.
-    `Fit.tied` tells moments and products themselves, with standard errors and intervals to first order; none where D is at its bound, which means that the
-    body is flat as far as the data tell. Where two axes have one parameter, as those of a wheel do, they have one D.
+    `Fit.tied` has moments and products, with standard errors and intervals to first order; none where D is at its bound, where the body
+    is flat according to the data. Where two axes have one parameter, as those of a wheel do, they have one D.
 
     It is for scenes that have a parameter for each of the three moments, and for none, one or all of the products; ValueError, from `fit`, for others, and
     where the first guess is no inertia of a body with a thickness. Source: P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3
-    (2018) 60, for what inertias bodies have.
+    (2018) 60, for possible inertias.
     """
     return PossibleInertia()
 
@@ -173,7 +173,7 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
         if not where:
             if i != j and abs(I[i, j]) <= round_off * size:
                 return None
-            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is no parameter"))
+            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is not a parameter"))
         of, index = where[0]
         factor = float(slopes[of][(i, j, *index)])
         straight = all(abs(M[i, j] - factor * x[of][index]) <= round_off * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
@@ -198,7 +198,7 @@ def _slopes(name: str) -> Callable:
 
 
 def _refusal(scene: Scene, name: str, why: str) -> str:
-    return f"the inertia of body `{name}` of `{type(scene).__name__}` cannot be told by `possible_inertia`: {why}; {_OTHERWISE}"
+    return f"the inertia of body `{name}` of `{type(scene).__name__}` cannot be given by `possible_inertia`: {why}; {_OTHERWISE}"
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
         except (TypeError, ValueError):
             raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a number or an array of shape {expected}") from None
         if found.shape != expected:
-            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, expected {expected}, that of the parameter")
+            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, expected {expected}, the shape of the parameter")
         return found
 
     found = Tie(name, Call(jax.make_jaxpr(of_leaves)(*leaves), ("a tied parameter",)))

@@ -10,7 +10,7 @@ Bounds end steps, since a bijection onto their inside never reaches them: of ten
 steps, and all ten do in 4 here. The method of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be differentiated with
 respect to the starts of all others. It has no bounds. It evaluates residuals and derivatives one after the other.
 
-Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
+Several problems of one shape (`members`) go side by side; ended ones cost nothing.
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum slopes in place of
 values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 """

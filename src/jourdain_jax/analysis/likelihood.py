@@ -2,9 +2,9 @@
 
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 
-What is odd about measurements though nothing forbids it: inputs that are not sampled where a run needs them, and angles that jump by a turn.
+Oddities of measurements that are not errors: inputs that are not sampled where a run needs them, and angles that jump by a turn.
 
-What a run will tell before it is made: the Fisher information of a planned experiment, differentiable with respect to its start and inputs.
+The information of a planned run: the Fisher information of a planned experiment, differentiable with respect to its start and inputs.
 
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior,     cov(theta) >= F^-1 (Cramer and Rao)
 
@@ -72,8 +72,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
     spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > beyond * max(intervals[-2:]) else []
     if spans:
         yield (
-            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if it did so, repeat that value in its samples, otherwise give more "
-            "of them, or measurements of less"
+            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, repeat that value in its samples, otherwise give "
+            "more samples, or shorter measurements"
         )
     usual = float(np.median(intervals))
     (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # intervals that are missing
@@ -81,8 +81,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
         k = int(gaps[0])
         more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
         yield (
-            f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, where it is a straight line; if that is not what it "
-            "did, give the samples, or measurements of less"
+            f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, where it is interpolated linearly; if this is "
+            "wrong, give the samples, or shorter measurements"
         )
 
 
@@ -98,7 +98,7 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
     if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
         yield (
-            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: an angle that was wrapped, where coordinates go on; "
+            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: a wrapped angle, but coordinates are continuous; "
             "give `np.unwrap` of it"
         )
 
@@ -118,7 +118,7 @@ def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Ma
 def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experiment, ...]:
     """Return one run or several, checked against the scene; ValueError as in `checked`, and without any run.
 
-    What is odd about a run (`oddities`) is warned of.
+    Oddities of a run (`oddities`) cause warnings.
     """
     as_scene(scene)
     if not isinstance(data, Experiment | Iterable):

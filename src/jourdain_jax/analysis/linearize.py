@@ -89,7 +89,7 @@ class Linearization(Printed, eqx.Module):
         if names:
             lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)]
             lines += matrix("F", self.F, names, self.inputs) if self.inputs else []
-            lines.append(f"  coupling to what is not named {float(self.coupling):.1e}")
+            lines.append(f"  coupling to other coordinates {float(self.coupling):.1e}")
         else:
             lines += matrix("A", self.A, self.states, self.states)
             lines += matrix("B", self.B, self.states, self.inputs) if self.inputs else []
@@ -169,7 +169,7 @@ def linearize(
     - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
       is well conditioned at the state (over the scene's domain, while state or parameters are traced).
 
-    Nothing is integrated and nothing searched for, so that no field of `jj.Options` would mean anything; `jj.build` settles the backend.
+    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` settles the backend.
 
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
     determine the others, all is NaN there and `code` is not 0: name others.

@@ -149,7 +149,7 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[s
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
     compared with that at generic states (default: the scene's example, where some configurations lose rank). `print(report(scene))` shows a table;
     `as_dict()` is for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
-    angles): what holds at all of them is taken to hold everywhere. A DifferentiationModeError where numbers are traced.
+    angles): a property of all of them counts as general. A DifferentiationModeError where numbers are traced.
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)

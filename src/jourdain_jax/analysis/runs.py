@@ -3,7 +3,7 @@ one length.
 
 r = (reading - value) / sigma, zero where a sample is missing
 
-What a scene predicts for the measurements of many runs, against what was measured, with derivatives, in one compiled program.
+Predictions of a scene for many runs minus their measurements, with derivatives, in one compiled program.
 
 A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
 compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.

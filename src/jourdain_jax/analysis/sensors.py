@@ -7,7 +7,7 @@ Each number is known, or a `jj.Estimate`. Source: L. Ljung, System Identificatio
 
 Equal intervals of time, where the motion is computed that late sensors read between.
 
-What a sensor shows of a quantity that is known at equal intervals of time: late by a delay, and through a first-order low-pass.
+The reading of a sensor for a quantity known at equal intervals of time: late by a delay, and through a first-order low-pass.
 
     reading(t) = y(t - delay),      lag y' + y = x,      y(t0) = x(t0):      the filter starts at rest
 

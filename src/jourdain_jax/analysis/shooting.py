@@ -4,7 +4,7 @@
     continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
 
 Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it may show, and for it the piece continues beyond
-t_i+1. What a sensor's low-pass gives is part of s.
+t_i+1. The output of a sensor's low-pass is part of s.
 
 Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
 Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
@@ -65,7 +65,7 @@ class MultipleShooting:
     - `pieces`: how many pieces each run has; give one of the two.
 
     Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole
-    run: steps are those of a problem that is almost linear. What is minimised, and its minimum, are those of a fit without `shooting`.
+    run: steps are as for an almost linear problem. The objective and its minimum equal those of a fit without `shooting`.
 
     **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
     """
@@ -77,7 +77,7 @@ class MultipleShooting:
         if (self.pieces is None) == (self.duration is None):
             raise ValueError("`MultipleShooting` expects either `pieces` (their number in each run) or `duration` (of a piece, in s), such as `duration=0.5`")
         if self.pieces is not None:
-            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for one piece leave out `shooting`")
+            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for one piece omit `shooting`")
         else:
             number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
             if not (np.isfinite(number) and number > 0):

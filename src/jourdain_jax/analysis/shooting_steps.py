@@ -9,10 +9,11 @@ Without 2., the minimum is found from 17, 16 and 8 in place of all of 20 first g
 Converged: the step changes the residuals by at most `tolerance` in all, no unknown by more than that fraction, and pieces join to the simulation's tolerance.
 Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
 
-First guesses of the states between pieces, from what was measured there.
+First guesses of the states between pieces, from measurements there.
 
 A coordinate or speed that a channel shows is that of a parabola through the samples about the node; so is the rate of a coordinate,
-qdot = N(q) u + nu, met by the smallest change of the speeds. What no channel shows stays as it is at the start; coordinates that no geometric row depends on
+qdot = N(q) u + nu, met by the smallest change of the speeds. Quantities without a channel keep their value at
+the start; coordinates that no geometric row depends on
 continue from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and the quantity is y + lag y'.
 """
 

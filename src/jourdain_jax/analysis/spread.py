@@ -27,7 +27,7 @@ How large noise is that nobody stated: what sigmas are estimated to be, once it 
     variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    as the weights of channels and priors are estimated, too
 
 With one channel and no prior n - p is left, and intervals are those of Student's t. Under a robust loss the same holds of all samples together, and the factor
-by which their variance is to be multiplied takes the place of sigma^2. Priors and channels whose sigma is given are taken as they are.
+by which their variance is to be multiplied takes the place of sigma^2. Priors and given sigmas count as known.
 Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; M. G. Kenward and J. H. Roger,
 Biometrics 53 (1997) 983.
 """
@@ -98,7 +98,7 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
             points.append((origin + way * delta, rise))
             note = note if at.converged[0] else f"no minimum over the others was found {where}, so that the interval may be too narrow"
         if rise < -2 * close * end:
-            return Side(bound, False, at, points, f"a lower minimum than that of the fit lies {where}: fit again from there")
+            return Side(bound, False, at, points, f"a lower minimum than the fit lies {where}: fit again from there")
         if abs(rise / end - 1) < close:
             return Side(origin + way * delta, True, at, points, note)
         if rise < end:
@@ -187,12 +187,12 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
 
     sentences = []
     if names := named(range(len(labels)), to_bounds):
-        why = "and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell"
+        why = "and others may be, too: up to a bound nearby, the squares rise less than standard errors predict"
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
     if names := named(shared[:8], to_ends):
-        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors foretell; {ADVICE}")
+        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors predict; {ADVICE}")
     return sentences
 
 

@@ -208,11 +208,11 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     weights = jnp.asarray(generator.normal(size=2 * u.shape[0]), u.dtype)
     du = jnp.asarray(generator.normal(size=u.shape), u.dtype)
     dq = coordinate_rates(scene, t, q, Z @ du) - coordinate_rates(scene, t, q, jnp.zeros_like(u))
-    left_out = "parameters left out: a change of them splits rows that are dependent, and accelerations have no derivative there"
+    left_out = "parameters omitted: changing them makes redundant constraints independent, so accelerations have no derivative there"
     cases = (relative, ""), (jax.tree.map(jnp.zeros_like, relative), left_out)
     case = next((case for case in cases if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)), None)
     if case is None:
-        note = "left out: the rows lose rank at this very state, and accelerations have no derivative there"
+        note = "omitted: the constraints lose rank at this state, so accelerations have no derivative there"
         return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
     change, note = case
     arguments, point, direction = (names, weights, t, inputs, fixed, usual_rows(scene)), (moving, q, u), (change, dq, du)

@@ -55,7 +55,7 @@ def verify(
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
-    Values are relative to the size of what is compared; thresholds go with the floating-point type (`analysis.statements`): in single precision
+    Values are relative to the size of the compared quantities; thresholds go with the floating-point type (`analysis.statements`): in single precision
     gross errors are found, and nothing is certified. Where no reduction applies (no inertia along a free direction) there are no gradients to check, and
     the verification fails.
 

@@ -2,7 +2,7 @@
 
 Format of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al. 2007, `#` comments.
 Its sets in YAML, `name: value`, with or without a section `values`, are read as well. A missing sigma counts as zero. The
-files carry no covariance: sigmas are those of independent errors.
+files carry no covariance: sigmas belong to independent errors.
 """
 
 import re
@@ -130,7 +130,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
         got = ", ".join(f"{name} = {known[name]:g}" for name in PARAMETER_NAMES if any(f"`{name}`" in s for s in broken))
         raise ValueError(
             f"{path}: degenerate bicycle: {'; '.join(broken)}; got {got}. The nonlinear model rolls on real wheels: "
-            f"give their true radii, masses and moments of inertia (SI units, radians), or leave this bicycle out."
+            f"give their true radii, masses and moments of inertia (SI units, radians), or omit this bicycle."
         )
     return MeasuredBicycle(
         name=path.stem.removesuffix("Benchmark") or path.stem,
@@ -202,7 +202,7 @@ def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, floa
     the name.
     """
     parts = text.replace("±", "+/-").split("+/-", 1)
-    advice = f"; form: {_FORMAT}. Measure it, or leave this bicycle out."
+    advice = f"; form: {_FORMAT}. Measure it, or omit this bicycle."
     value, *rest = (files.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
     sigma = rest[0] if rest else None
     if sigma is not None and sigma < 0:

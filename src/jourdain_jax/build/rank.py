@@ -63,9 +63,9 @@ def contradictions(
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
     idle = [name for name, s in wrong if not A[:, s].any()]
     if idle:
-        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state what holds between coordinates in `geometric_constraints`",)
+        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state relations between coordinates in `geometric_constraints`",)
     several = ", ".join(f"`{name}`" for name, _ in wrong)
-    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of {len(A)} random states; leave one out, or mend it",)
+    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of {len(A)} random states; omit one, or correct it",)
 
 
 def redundant_rows(

@@ -24,12 +24,12 @@ from jourdain_jax.scene.scene import Scene
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    listing = verbs.add_parser("models", help="list the models, or what one has: parameters, coordinates, speeds, a typical start")
+    listing = verbs.add_parser("models", help="list the models, or describe one: parameters, coordinates, speeds, a typical start")
     listing.add_argument("model", nargs="?", help="name of the one to describe (default: list all)")
     listing.add_argument("--json", action="store_true", help="machine-readable: a list of objects")
     listing.set_defaults(run=_models)
 
-    about = verbs.add_parser("report", help="what kind of system a model is: freedoms, rows, integrability, cyclic coordinates")
+    about = verbs.add_parser("report", help="report on a model: freedoms, constraints, integrability, cyclic coordinates")
     _model_options(about)
     about.set_defaults(run=_report)
 

@@ -54,9 +54,9 @@ def add(verbs) -> None:
     """Add the verb to the parser."""
     sweep = verbs.add_parser("sweep", help="many motions: run a study that a TOML file describes; `sweep status|resume|export|merge FOLDER`")
     sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="a TOML file; or one of " + ", ".join(ACTIONS) + ", and folders of studies")
-    sweep.add_argument("--out", help="folder of the study to make or go on with; of `export`, the file to write (.nc)")
+    sweep.add_argument("--out", help="folder of the study to create or continue; for `export`, the file to write (.nc)")
     sweep.add_argument("--workers", type=int, default=1, help="processes that compute (default 1)")
-    sweep.add_argument("--memory", help="what all of them may hold together, such as 2GB")
+    sweep.add_argument("--memory", help="memory for all of them together, such as 2GB")
     sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for `sweep merge` later")
     sweep.add_argument("--quiet", action="store_true", help="no bar")
     sweep.add_argument("--json", action="store_true", help="machine-readable")
@@ -67,7 +67,7 @@ def _sweep(options) -> bool:
     action, *paths = options.words
     if action not in ACTIONS:
         if paths:
-            raise ValueError(f"`{action}` is not known to `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
+            raise ValueError(f"`{action}` is not a verb of `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
         # bytes of a file, whose tables may have a row for each sample
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)

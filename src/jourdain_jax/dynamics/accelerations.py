@@ -111,7 +111,7 @@ def accelerations(
     - `stabilisation`: Baumgarte terms (default: none).
     - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: as found for this scene).
 
-    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is constant. Look at `applicable`
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is constant. Check `applicable`
     and `residual`: nothing is raised where a reduction does not apply. ValueError for an unknown reduction, and for known parameters with impossible
     values of bodies, loads or planes. Eqs. (41), (68)-(70).
     """

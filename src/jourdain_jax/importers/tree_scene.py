@@ -272,7 +272,8 @@ def _check_moments(mass: Mass, what: str) -> None:
     least, middle, largest = np.linalg.eigvalsh(mass.inertia)
     if max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * mass.mass):
         raise ValueError(
-            f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has; expected none below zero, and the "
+            f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, "
+            "impossible for a body; expected none below zero, and the "
             f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia, or give "
             'ignore=("inertia",) to accept them'
         )

@@ -122,7 +122,7 @@ class XmlFile:
         """A ValueError for something that is not read, unless `ignore` has its `key`; `valid`: names that may be meant."""
         if key not in self.ignore:
             meant = "".join(f"did you mean `{name}`? Otherwise " for name in difflib.get_close_matches(key, valid.split(), 1, 0.7))
-            raise ValueError(f'{self.source}: {what} is not read; {meant}{advice}, and give ignore=("{shortened(key)}",) to read the file without')
+            raise ValueError(f'{self.source}: {what} is not supported; {meant}{advice}, and give ignore=("{shortened(key)}",) to read the file without it')
 
     def warn(self) -> None:
         """Warn of omitted elements, apart from those that `ignore` names."""

@@ -179,8 +179,8 @@ class Model(BuiltFor, Printed):
             said.append("the privileged speeds that the scene states do not determine the others everywhere in its domain: all speeds are integrated")
         if self.structure.decisions != _decisions_where_traced(self.reference.scene):
             said.append(
-                "numbers near the class's defaults, which stand in for parameters that JAX traces, lead to other choices; "
-                "under `jit` and derivatives take `model.replace(...)`, which keeps those of this model"
+                "numbers near the class's defaults, which replace parameters that JAX traces, lead to other choices; "
+                "under `jit` and derivatives use `model.replace(...)`, which keeps those of this model"
             )
         return tuple(said)
 
@@ -287,7 +287,8 @@ def load_model(path: str | os.PathLike, scene: Scene) -> Model:
         jj.build(bicycle).save("bicycle.model")
         model = jj.load_model("bicycle.model", bicycle)
 
-    `path`: of the file; `scene`: of the same class, methods and values. Nothing of a file is run, but it decides what is integrated: take files of your own.
+    `path`: of the file; `scene`: of the same class, methods and values. Nothing in a file is executed, but it
+    decides the integrated equations: take files of your own.
     ValueError where the file is damaged, or is that of another scene, version or precision.
     """
     found, how = model_file.read(path, as_scene(scene))

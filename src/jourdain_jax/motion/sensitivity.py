@@ -116,7 +116,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
             f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "
-            "its derivatives leave out how the time of the jump moves. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
+            "its derivatives omit the shift of the time of the jump. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
             "there by an event and start another; the motion itself is right"
         )
         warnings.warn(text, SensitivityWarning, stacklevel=users_level())

@@ -79,7 +79,7 @@ class Solved(eqx.Module):
 class Integrator(abc.ABC):
     """How a motion is integrated: by our own steps (`motion/own_steps.py`) or by diffrax (`motion/diffrax_steps.py`).
 
-    What is a number of its own in every call stands in the `Setup`.
+    Numbers that change with every call are in the `Setup`.
     """
 
     max_steps: int

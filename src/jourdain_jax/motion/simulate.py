@@ -148,7 +148,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
-        asked, advice = ("backend='native'", "use backend='auto', which takes what serves") if order is None else _BY_SERIES
+        asked, advice = ("backend='native'", "use backend='auto', which chooses the fastest possible") if order is None else _BY_SERIES
         raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
 

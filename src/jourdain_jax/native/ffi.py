@@ -61,7 +61,7 @@ def reason_against() -> str:
     if reason := host.reason_against() if backend == "cpu" else nvidia.reason_against():
         return reason
     if version() is None:
-        return "the foreign function interface of this jaxlib is not known"
+        return "the foreign function interface of this jaxlib is unknown"
     return ""
 
 

@@ -1,9 +1,9 @@
 """The host processor: support of machine code, number of lanes, compilation, and the cache on disk.
 
-Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the user's cache. A file is named by what its code was
-made from. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or exchanged for another is made again.
-Code from others would run in this process: a folder or a file that somebody else owns or may write is not used. The digest holds no secret, and LLVM does
-not check what it loads: who may write as the user can make a file that runs code or ends the process, and may change what Python imports anyway.
+Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the user's cache. A file is named by the source of
+its code. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or exchanged for another is made again.
+Code from others would run in this process: a folder or a file that somebody else owns or may write is not used. The digest holds no secret, and LLVM
+does not check loaded code: who may write as the user can make a file that runs code or ends the process, and may change what Python imports anyway.
 """
 
 import contextlib
@@ -205,9 +205,9 @@ def _is_ours(place: Path) -> bool:
 def _against(found: os.stat_result) -> str:
     """Return the reason not to trust a folder or a file; empty if there is none."""
     if found.st_uid != os.geteuid():
-        return f"it belongs to user {found.st_uid}, and what lies there would run as {os.geteuid()}"
+        return f"it belongs to user {found.st_uid}, and its files would run as {os.geteuid()}"
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return "others may write to it, and what lies there runs in your process (chmod go-w ends that)"
+        return "others may write to it, but its files run in your process (forbid it by chmod go-w)"
     return ""
 
 

@@ -7,7 +7,7 @@ is neither flat nor kinked anywhere. An identity that holds then holds whatever 
 
 Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (`calculus/round_off.py`), and two values are equal where they
 differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
-written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. What holds of any R holds of this one.
+written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. A property of any R holds for this one.
 """
 
 import math

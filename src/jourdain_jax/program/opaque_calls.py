@@ -201,4 +201,4 @@ def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]
 
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))
     reasons = tuple(dict.fromkeys(step.reason for step in part if step.reason))
-    return Call(closed, reasons or ("what is made of the arrays of another call",))
+    return Call(closed, reasons or ("a result of the arrays of another call",))

@@ -2,7 +2,7 @@
 
 Kinds and shapes are known while a function is traced: no compiled program contains these checks.
 
-Errors in a user's own methods: the traceback shows their lines, and leaves out those of this package and of JAX between them. As with JAX's own filtering,
+Errors in a user's own methods: the traceback shows their lines, and omits lines of this package and of JAX between them. As with JAX's own filtering,
 JAX_TRACEBACK_FILTERING=off shows all of them. Errors on whose way no user's method was keep their whole traceback.
 """
 
@@ -164,7 +164,7 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
 
 _OURS = str(Path(__file__).parents[1])
 _INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-_NOTE = "Lines of jourdain_jax between yours are left out of this traceback; JAX_TRACEBACK_FILTERING=off shows them."
+_NOTE = "Lines of jourdain_jax between yours are omitted from this traceback; JAX_TRACEBACK_FILTERING=off shows them."
 
 
 def shown_from_users_lines(function: F) -> F:

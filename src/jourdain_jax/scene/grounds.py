@@ -266,7 +266,7 @@ def tangents_of(n: Vector3) -> Tangents:
     """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y
     after the shortest turn of z (or -z) to n.
 
-    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and the no-slip rows with them, not what they say.
+    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and with them the no-slip constraints, but not their solutions.
     Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
     """
     x, y, z = n

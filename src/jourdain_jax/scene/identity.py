@@ -1,9 +1,9 @@
 """Results kept per scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
 also by values.
 
-Reference parameters are numbers that replace parameters that JAX traces. What holds of a scene at every
-state, such as the rank of its rows and which speeds are independent, must be known before anything is
-compiled. It is found by evaluating the scene at a few states, which takes numbers for its parameters.
+Reference parameters are numbers that replace parameters that JAX traces. Facts that hold at every
+state of a scene, such as rank and independent speeds, must be known before compilation. It is found by
+evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
 import sys

@@ -9,7 +9,7 @@ functions that a method loads itself:
 - modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
-What helpers read is not followed. `clear_caches` makes every scene be traced again.
+Values read by helper functions are not tracked. `clear_caches` makes every scene be traced again.
 """
 
 import dis

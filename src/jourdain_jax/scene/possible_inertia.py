@@ -73,5 +73,5 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
             f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 (`inertia` of `log_cholesky`): each must be "
-            "positive, and less than the sum of the other two; of a flat body, give the largest a little less than that sum"
+            "positive, and less than the sum of the other two; for a flat body, give the largest a little less than that sum"
         )

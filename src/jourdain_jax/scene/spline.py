@@ -6,7 +6,7 @@ On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second d
     h_k-1 m_k-1 + 2 (h_k-1 + h_k) m_k + h_k m_k+1 = 6 ((v_k+1 - v_k)/h_k - (v_k - v_k-1)/h_k-1)
 
 with the third derivative continuous at the second and the last but one knot ("not a knot"). A piecewise linear curve has no second derivative but at its
-knots, where no integrator looks: what is moved along it exerts no force of inertia.
+knots, where no integrator looks: a motion along it has no force of inertia.
 """
 
 import equinox as eqx

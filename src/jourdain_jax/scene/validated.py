@@ -110,7 +110,7 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     """Return the events by name; a plain value is that of an event that stops the motion."""
-    advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
+    advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; name every condition"
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
         event, where = given if isinstance(given, Event) else Event(given, stop=True), f"event `{name}` of `{_name(scene)}`"

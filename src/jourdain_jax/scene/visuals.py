@@ -1,7 +1,7 @@
 """Looks of bodies: shapes in the frame of their body, for pictures only.
 
-A scene states them in `visuals(self, pose)`; bodies that it leaves out are drawn by what is known of them otherwise: the line that a body was given as its
-`outline`, what rolls in its contacts, its inertia.
+A scene states them in `visuals(self, pose)`; omitted bodies are drawn by other information: their `outline`, the shapes of
+their contacts, their inertia.
 """
 
 import os
@@ -42,8 +42,8 @@ class Visual(eqx.Module):
     - `turn`: (3, 3), from its own axes to those of the body (default: the same axes).
     - `colour`: "#rrggbb" (default: the body's, one of a palette). `opacity`: 0 to 1.
 
-    Under the name `""` in `visuals`, shapes stand in the inertial frame. Sizes are those at the first saved time; places, turns and the points of lines may
-    change with the pose. ValueError for what is no shape.
+    Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Sizes are those at the first saved time; places, turns and the points of lines may
+    change with the pose. ValueError for anything but a shape.
 
     **Examples**
 

@@ -56,7 +56,7 @@ def stability_chart(
     - `prior`: parameter (one number) -> `jj.Normal`, as `measured_bicycle(...).prior`: `chart.bands` are the
       standard deviations that these make, to the first order and independent, where the first number keeps its
       value.
-    - `asked`: what `family` takes: `held`, `inputs`, `names`.
+    - `asked`: arguments of `family`: `held`, `inputs`, `names`.
 
     A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
     number, found to round-off. A boundary that does not pass the middle is not seen, and one that turns back along the first number has gaps.

@@ -57,7 +57,7 @@ class Motions(ABC):
 
     def index(self, name: str) -> int:
         """Return the number of an unknown; a ValueError with the nearest names if there is none."""
-        check_name(name, self.unknowns, f"`{name}` is no unknown of the {self.what} of `{type(self.scene).__name__}`")
+        check_name(name, self.unknowns, f"`{name}` is not an unknown of the {self.what} of `{type(self.scene).__name__}`")
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:

@@ -140,7 +140,7 @@ class Rollout(Printed, eqx.Module):
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
         if self.crossed_together.size:
-            lines.append(f"  {len(self.crossed_together)} crossed two or more relations in one step, which may miss what acts between them: give `max_step`")
+            lines.append(f"  {len(self.crossed_together)} crossed two or more relations in one step, which may miss an effect between them: give `max_step`")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)

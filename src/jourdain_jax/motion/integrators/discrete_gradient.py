@@ -37,8 +37,8 @@ class DiscreteGradient(FixedStepMethod):
     Needs a minimal state and a constant T + V: rows linear and homogeneous in the speeds, loads with potentials, nothing that depends on time, and
     no geometric rows.
 
-    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also of those where the other methods drift
-    because no symmetry helps them. Other integrals are kept to the order of the method only, and it is the most expensive of these methods per step.
+    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also where the other methods drift
+    for lack of symmetry. Other integrals are kept to the order of the method only, and it is the most expensive of these methods per step.
 
     Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
     J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.

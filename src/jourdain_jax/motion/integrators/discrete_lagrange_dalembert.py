@@ -216,7 +216,7 @@ def _fault(scene: Scene, structure: Structure) -> str:
     if structure.varying_inertia:
         return "its masses or inertias change along the motion, which a Lagrangian does not describe"
     if structure.dependent_rows:
-        return "its rows are dependent, and none may be left out everywhere"
+        return "its constraints are redundant, but none can be omitted everywhere"
     return ""
 
 

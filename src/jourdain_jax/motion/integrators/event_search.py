@@ -11,7 +11,7 @@ if the value is positive after a first step, which is tried again at half its le
 the zero at the start); then the event has happened at
 the start, as it has where the value is lower, or does not rise.
 
-All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. What is not a number is not positive: such a value lies
+All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. NaN is not positive: such a value lies
 beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
 and t_a, is by the cubic through values and rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe,
 otherwise the middle). Where a trial finds another event, all that

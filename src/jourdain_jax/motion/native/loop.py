@@ -2,7 +2,7 @@
 ends.
 
 Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
-narrow registers, in which an instruction takes less time. What a lane computes does not depend on the width. A call is given two arrays with one row per
+narrow registers, in which an instruction takes less time. Results of a lane do not depend on the width. A call is given two arrays with one row per
 lane: the rows of `Form.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
 were reached one after the other. Where inputs are given by samples, their tables and knots come first (`layout.py`).
 

@@ -12,7 +12,7 @@ Dense linear algebra is written as loops, one matrix per lane: entries are vecto
     M = L L'                                                        Cholesky
 
 Sources: M. R. Hestenes, J. SIAM 6 (1958) 51-90, for rows in place of columns; J. Demmel and K. Veselic, SIAM J. Matrix Anal. Appl. 13 (1992) 1204-1245, on
-its accuracy. What a lane computes depends on nothing but its own numbers.
+its accuracy. Results of a lane depend only on its own numbers.
 """
 
 import math

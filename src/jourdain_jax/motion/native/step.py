@@ -15,7 +15,7 @@ fills the error of short steps. In a step that starts at sigma < 0.1 the stages 
 along the rows, less n^2, and the distance that the projection moves the state, less n. Here n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of
 the stages; a displacement n across the rows moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
 
-In single precision the state is summed with compensation (Kahan): what rounding leaves off an increment is added to the next one. Otherwise a state whose
+In single precision the state is summed with compensation (Kahan): the rounding error of an increment is added to the next one. Otherwise a state whose
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 

@@ -2,7 +2,7 @@
 of a motion.
 
 Arrays without lanes go in, and under `vmap` all lanes go to one call. Many lanes run side by side in the widest registers; one by itself runs in narrow ones,
-in which an instruction takes less time. What a lane computes does not depend on the width.
+in which an instruction takes less time. Results of a lane do not depend on the width.
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
@@ -10,8 +10,8 @@ Each is machine code of its own, made when it is requested: derivatives are take
 the program as XLA runs it.
 
 Beside the steps stand numbers that depend on parameters alone, and all speeds, pivots and energies at saved states: functions of JAX on one state or scene,
-for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's (`lowering/lowered.py`). What machine code
-computes costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place of 1,070.
+for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's (`lowering/lowered.py`). Machine code
+costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place of 1,070.
 """
 
 from collections.abc import Callable, Sequence

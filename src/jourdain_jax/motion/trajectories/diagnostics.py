@@ -92,7 +92,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
         energy_drift=_span(energy.balance),
-        energy_kind=energy.kind + (", which the work changes that was left out" if lacks_work else ""),
+        energy_kind=energy.kind + (", changed by work that was not integrated" if lacks_work else ""),
         # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
         energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
@@ -139,8 +139,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
     elif high < usual:
         warned.append(
-            f"rows have rank {high} all along, but {usual} at generic states: a singular configuration, or another way to assemble the scene; "
-            "state a `domain` around the motion to have it judged there"
+            f"rows have rank {high} on the whole motion, but {usual} at generic states: a singular configuration, or another assembly of the scene; "
+            "state a `domain` around the motion to decide"
         )
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
@@ -175,7 +175,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     if np.isfinite(float(trajectory.together)):
         warned.append(
             "two or more relations (`<`, `where`, `sign`, `abs`, `floor`, ...) changed in the one step that ends at "
-            f"t = {float(trajectory.together):.6g} s: what acts between them may be missed; give a smaller `max_step`, or a shorter span"
+            f"t = {float(trajectory.together):.6g} s: an effect between them may be missed; give a smaller `max_step`, or a shorter span"
         )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))

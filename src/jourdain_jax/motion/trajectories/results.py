@@ -15,37 +15,37 @@ MESSAGES = {
     MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() or retry=True where forces are stiff, or look for a "
     "singularity near the last time",
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
-    NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
-    "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
+    NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or constraint is NaN there, or they are not determined (rows that lose "
+    "rank, no inertia along a free direction); examine the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a body begins below the ground "
     "of a contact with friction, or Coulomb's law has no solution for its contacts (an impact that gains energy, Painleve's paradox)",
-    SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
-    "`privileged` may serve there, and retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, do unless the rows lose rank; or where the "
-    "scene's own `coordinate_rates` become infinite: state other speeds there",
+    SINGULAR_PARTITION: "the motion came near a configuration where the privileged speeds do not determine the others: try another choice of "
+    "`privileged`, or retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, unless the rows lose rank; or where the "
+    "scene's own `coordinate_rates` become infinite: use other speeds",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
-    STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "
-    "put a row in the place of a stiff spring or damper, or loosen the tolerances",
-    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change, or a solver of "
-    "diffrax left them by more than errors of its steps explain: take shorter steps, the default solver, or look for rows that lose rank",
+    STIFF: "stiff: ran out of steps, kept short by stability rather than accuracy, and an implicit solver did not reach the end either; "
+    "replace a stiff spring or damper by a constraint, or loosen the tolerances",
+    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection undid more than half of it, or a solver of "
+    "diffrax left them by more than its step errors explain: use shorter steps, or the default solver, or look for rows that lose rank",
     BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and "
-    "`t1`; or time runs back, which it cannot where contacts have friction",
-    ENERGY_LOST: "the energy, which nothing changes, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
-    "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
-    CONTRADICTORY_ROWS: "velocity rows that depend on each other are not met together at some saved time: they contradict each other there; leave one out, "
-    "or mend the inputs and times that they follow",
-    PROCESS_DIED: "processes died on it again and again, and an earlier version's study skipped it",
-    UNRESOLVED: "the step size shrank to nothing, and `rtol` is less than this precision resolves, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
+    "`t1`; or time runs backward, which is impossible with friction",
+    ENERGY_LOST: "the energy, which should be constant, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
+    "missed a short feature of a load, or a load's potential does not belong to its force (`verify`)",
+    CONTRADICTORY_ROWS: "redundant velocity constraints contradict each other at some saved time; omit one, "
+    "or correct the inputs and times that they follow",
+    PROCESS_DIED: "processes died on it repeatedly, and a study of an earlier version skipped it",
+    UNRESOLVED: "the step size shrank to zero, and `rtol` is below the resolution of this precision, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
     "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
-    TOO_MANY_TRANSITIONS: "events after which the motion goes on happened more than `max_transitions` times, or followed each other within "
-    "round-off, as the bounces of a ball that comes to rest do: switch to a mode in which it rests, or raise `max_transitions`",
+    TOO_MANY_TRANSITIONS: "more than `max_transitions` events at which the motion continues, or events within "
+    "round-off of each other, like the last bounces of a ball: switch to a mode in which it rests, or raise `max_transitions`",
     IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; give the contact "
     "impact='energetic', or a smaller restitution",
     PAINLEVE: "Coulomb's law has no solution at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
-    CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no combination of modes that was tried satisfies Coulomb's law at each; "
+    CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no tried combination of modes satisfies Coulomb's law at each; "
     "or slip turns during an impact that is followed along its impulse: give the contact impact='moreau'",
-    UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
+    UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; use a shorter step, or look for a singularity there",
 }
 
 # In what other ways a motion was run again, with `retry=True`, after the first way had failed; they add up: `Trajectory.fallback`.

@@ -35,7 +35,7 @@ class Trajectory(Record, Printed):
     """A motion over time. Times after an early end (event, failure) hold NaN.
 
     `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
-    NaN. What is made of them by itself, such as a loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
+    NaN. Automatic uses, such as a loss to be minimised, should take `motion.nan_if_failed()`, or check `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
@@ -136,7 +136,7 @@ class Trajectory(Record, Printed):
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states those of its parameters only. ImportError without xarray.
+        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states only units of parameters. ImportError without xarray.
         """
         return labelled.to_xarray(self, units)
 
@@ -170,7 +170,7 @@ class Trajectory(Record, Printed):
         """Reasons to doubt the motion, the most serious first; empty if there are none. The printed summary
         shows them.
 
-        A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
+        A failure; rows that gain or lose rank, or come near it, so that constraint forces and derived quantities may not be unique; privileged speeds of a
         reduction that do not determine the others in this precision; contacts that would have to pull.
         Computed where it is requested; needs numbers: not under jit or vmap.
         """
@@ -186,7 +186,8 @@ class Trajectory(Record, Printed):
     def faults(self) -> tuple[str, ...]:
         """Return known causes of a failure, as texts for messages.
 
-        Parameters that are not finite or have the wrong sign, otherwise what bodies, contacts and gravity cannot have; where steps became short, a load that
+        Parameters that are not finite or have the wrong sign, otherwise impossible values of bodies, contacts
+        and gravity; where steps became short, a load that
         jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
@@ -206,8 +207,8 @@ class Trajectory(Record, Printed):
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Their derivatives are NaN, too. Lanes that are omitted of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect
-        to what all lanes share.
+        Their derivatives are NaN, too. Samples omitted from a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with
+        respect to shared values.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731
         failed = lambda x: jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape)  # noqa: E731
@@ -218,7 +219,7 @@ class Trajectory(Record, Printed):
         """Return the trajectory itself; raise a SimulationError with reason and time if it did not reach its
         end or an event.
 
-        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; `nan_if_failed` serves there.
+        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; use `nan_if_failed` there.
         """
         if int(self.result) > results.EVENT:
             raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")

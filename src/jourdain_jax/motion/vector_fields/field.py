@@ -127,7 +127,7 @@ class Watched(NamedTuple):
 class VectorField(eqx.Module):
     """How a scene's state is packed, unpacked, differentiated in time and projected. All choices are static.
 
-    `fixed`: what the rates need of the scene and computed once per motion; `inputs`: their values at the time, for `rates` and `rates_and_pivots` from `now`.
+    `fixed`: the scene's part of the rates, computed once per motion; `inputs`: their values at the time, for `rates` and `rates_and_pivots` from `now`.
     """
 
     independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
