@@ -28,7 +28,7 @@ ROOMS = (
     ("motion/trajectories", "states over time, result codes, files", True),
     ("motion/arrays", "the same steps on arrays of JAX", True),
     ("motion/native", "steps, and their loop as machine code", True),
-    ("motion/integrators", "methods, relations, stop events, diffrax", True),
+    ("motion/integrators", "methods, stop events, diffrax", True),
     ("motion/vector_fields", "what is integrated, and its rates", True),
     ("lowering", "equations of motion as scalar programs", False),
     ("dynamics", "accelerations, forces, power at one state", False),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from machine_code import BACKENDS
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
@@ -73,14 +73,13 @@ def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(k
     found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
     assert abs(exact.q_end[0] - SPAN) > 5e-3, "nothing acted"
     for one in found:
-        assert_allclose(one.q_end, exact.q_end, atol=2e-3)
+        assert_allclose(one.q_end, exact.q_end, atol=1e-6)
         assert one.crossings == int(exact.crossings) >= 2
-        assert not np.isfinite(one.together)
         assert (int(one.accepted), int(one.rejected)) == (int(found[0].accepted), int(found[0].rejected))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_neighbours_in_lanes_are_right_or_flagged(kind):
+def test_neighbours_in_lanes_are_right(kind):
     generator = np.random.default_rng(5)
     a, width = generator.uniform(0.2, 1.4, 200), 10 ** generator.uniform(-4, -0.5, 200)
     options = {"parameters": {"a": a, "width": width}, "ts": [SPAN], "rtol": 1e-8, "atol": 1e-8, "progress": False}
@@ -89,17 +88,7 @@ def test_neighbours_in_lanes_are_right_or_flagged(kind):
     exact = jj.rollout(KINDS[kind], starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
     assert not exact.failed.size
     wrong = np.abs(found.lanes.q_end - exact.lanes.q_end)[:, 0] > 1e-5
-    assert not np.any(np.delete(wrong, found.crossed_together)), "wrong in silence"
-    assert len(found.crossed_together) < 100
-
-
-def test_a_load_that_is_passed_in_one_step_is_named():
-    scene = STRIP.replace(width=1e-5)
-    assert np.isfinite(motion(scene).together)
-    assert "changed in the one step" in " ".join(motion(scene).warnings)
-    lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3)
-    assert_array_equal(lanes.crossed_together, [0])
-    assert "1 crossed two or more relations in one step" in str(lanes)
+    assert not np.any(wrong)
 
 
 def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_derivatives():
@@ -111,9 +100,12 @@ def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_deriv
         found = motion(STRIP, {"x": x, "x_rate": 1.0})
         return found.q_end[0], found.crossings
 
+    # v^2 = 1 - 6 w beyond the strip, t = a + (1 - v)/3 + s
+    v = np.sqrt(1 - 6 * STRIP.width)
     for derivative in (jax.grad, jax.jacfwd):
-        with pytest.warns(jj.SensitivityWarning, match="omit the shift of the time of the jump"):
-            assert derivative(end, has_aux=True)(0.0)[1] == 2
+        slope, count = derivative(end, has_aux=True)(0.0)
+        assert count == 2
+        assert_allclose(slope, v, atol=1e-12)
 
 
 class Cart(Sliding):
@@ -156,11 +148,12 @@ def test_what_is_not_watched_is_said():
     assert "solvers of diffrax do not" in by_diffrax.unwatched
 
 
-def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
+def test_a_motion_that_sticks_names_the_load_that_jumps():
     lanes = jj.rollout(Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)), {"x_rate": np.array([1.0, 50.0])}, t1=1.0, max_steps=2000)
-    assert lanes.failed.tolist() == [0]
+    assert lanes.result.tolist() == [results.STICKS, results.SUCCESS]
     for text in (lanes.lane(0).message, str(lanes)):
-        assert "(the force along `x_rate` jumps, or has a kink, at the last state" in text
+        assert "pushes the motion back onto its jump from both sides" in text
+        assert "(the force along `x_rate`)" in text
 
 
 class Ring(OnPlane):

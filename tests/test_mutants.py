@@ -128,7 +128,7 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None, relations=None, dt0: float = 1.0, longest=np.inf) -> Callable:
+def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None, dt0: float = 1.0, longest=np.inf) -> Callable:
     """`(y0, goals, k)` -> (loop on arrays, its start); functions are of (t, y, k), the state is one of coordinates."""
     state = lambda y: Integrated(y, jnp.zeros(0), None)  # noqa: E731
     given = SimpleNamespace(
@@ -138,16 +138,13 @@ def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None,
         within=lambda middle, k: k,
     )
     functions.integrands = given
-    several, watched = range(2 if relations else 0), relations and (lambda k, t, y: relations(t))
 
     def run(y0, goals, k=1.0):
         known, rest = functions.split(jnp.asarray(k))
-        form = functions.ArrayForm(
-            None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0, relations=several, watched=several
-        )
+        form = functions.ArrayForm(None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0)
         control = tuple(map(jnp.asarray, (rtol, rtol, 1e-14, longest, dt0, 2000.0)))
         start = Start(() if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,))
-        return Loop(form, method_of(diffrax.Dopri8()), watched, rest, 2000), start
+        return Loop(form, method_of(diffrax.Dopri8()), rest, 2000), start
 
     return run
 
@@ -198,25 +195,6 @@ def a_motion_leaves_an_event_at_which_it_starts():
     run = motion(loop(lambda t, y, k: jnp.array([1.0 - t]), rtol=1e-8, dt0=1e-3, events=lambda t, y, k: y))
     for start, expected in ((0.0, 2.0), (-1e-5, 0.0)):
         assert_allclose(run(jnp.full(1, start), np.full(1, 4.0)).t_end, expected, atol=1e-8, err_msg="leaves")
-
-
-def a_pulse_is_met():
-    def within(t):
-        return (jnp.abs(t - 0.7) < 0.01) * 1.0
-
-    def watched(t):
-        return jnp.stack([t - 0.7, 0.01 - jnp.abs(t - 0.7)])
-
-    end = motion(loop(lambda t, y, k: within(t)[None], rtol=1e-6, longest=0.5, relations=watched))(jnp.zeros(1), np.full(1, 2.0))
-    assert end.crossings == 3, "crossings"
-    assert_allclose(end.y_end.q, 0.02, atol=1e-4, err_msg="pulse")
-    assert int(end.rejected) < 80, f"too many refused steps, {end.rejected}"
-    assert int(end.accepted) < 100, "too many steps"
-
-
-def a_pulse_within_a_step_is_named():
-    run = loop(lambda t, y, k: 0 * y, rtol=1e-6, longest=0.5, relations=lambda t: jnp.stack([t - 0.7, 1e-5 - jnp.abs(t - 0.7)]))
-    assert abs(motion(run)(jnp.zeros(1), np.full(1, 2.0)).together - 0.7) < 3e-3, "not named"
 
 
 # Their derivatives in both modes
@@ -398,11 +376,6 @@ MUTANTS = [
     Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "reach_of_noise(w, span) * rate", "rate", LEAVES, "leaves"),
-    Mutant("no step refused", step, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", a_pulse_is_met, "pulse"),
-    Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", a_pulse_is_met, "too many|crossings"),
-    Mutant("signs of the first state", step, "note_signs", "w.where(moving & counts, new, old)", "old", a_pulse_is_met, "crossings"),
-    Mutant("a change never behind", step, "note_signs", "passed = counts & (", "passed = ~counts & counts & (", a_pulse_is_met, "too many|crossings"),
-    Mutant("only the ends of a step", step, "watched", "2.0, 0.0)", "0.0, 0.0)", a_pulse_within_a_step_is_named, "not named"),
     Mutant("no cotangents of later stages", backwards, "step_back", "columns[stage][j], total)", "0 * columns[stage][j], total)", TIMES, "derivative"),
     Mutant("one stage without parameters", backwards, "step_back", "at, v, of_stage, added)", "at, v, of_stage, w.room(max(asked, 1)))", TIMES, "by k"),
     Mutant("a projection not gone back over", backwards, "step_back", "at, g1, added)", "at, w.room(count), added)", TIMES, "by y0"),

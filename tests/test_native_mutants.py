@@ -83,6 +83,13 @@ class Strip(OnLine):
         return {"window": jnp.abs(motion.q.x - 1.2) - self.width + 0.02}
 
 
+class Dry(OnLine):
+    """A bead that dry friction stops."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-jnp.sign(motion.u.x_rate)),)
+
+
 def pushed_position(t, x, v, k):
     """x(t) where x(0) = x and x'(0) = v."""
     w = jnp.sqrt(k)
@@ -159,9 +166,8 @@ def a_motion_leaves_an_event_at_which_it_starts():
 def a_strip_is_met():
     found, v = strip(0.004, events=False), np.sqrt(1 - 6 * 0.008)
     assert found.crossings == 3, "crossings"
-    assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-3, err_msg="strip")
-    assert int(found.rejected) < 80, f"too many refused steps, {found.rejected}"
-    assert int(found.accepted) < 100, "too many steps"
+    assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-12, err_msg="strip")
+    assert int(found.accepted + found.rejected) < 60, "too many steps"
 
 
 def a_motion_below_an_event_has_none():
@@ -169,8 +175,9 @@ def a_motion_below_an_event_has_none():
     assert float(below.t_end) == 0.0, "starts below"
 
 
-def a_strip_within_a_step_is_named():
-    assert abs(strip(1e-5, events=False, rtol=1e-2, atol=1e-2).together - 0.7) < 3e-3, "not named"
+def friction_at_rest_sticks():
+    found = jax.jit(lambda: motion(Dry(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0]))()
+    assert found.code == results.STICKS, "sticks"
 
 
 def an_event_where_a_relation_changes_is_found():
@@ -345,7 +352,7 @@ EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to
 BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
 LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
 LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
-STRIP, NAMED, WINDOW = a_strip_is_met, a_strip_within_a_step_is_named, an_event_where_a_relation_changes_is_found
+STRIP, STICKS, WINDOW = a_strip_is_met, friction_at_rest_sticks, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
 ON, ON_BACK, ON_TWICE = forward_mode_through_a_transition, reverse_mode_through_a_transition, a_hessian_through_a_transition
 TRIED, WRONG = "tried_by_stages", "derivative with respect to"
@@ -365,12 +372,9 @@ MUTANTS = [
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, span) * rate)", "", LEAVES_BELOW, "below"),
-    Mutant("no step refused", step, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
-    Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
-    Mutant("signs of the first state", step, "note_signs", "w.where(moving & counts, new, old)", "w.where(moving & counts, old, old)", STRIP, "crossings"),
-    Mutant("a change that is never behind", step, "note_signs", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
-    Mutant("only the ends of a step", step, "watched", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
-    Mutant("no event between the ends of a step", step, "watched", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
+    Mutant("another side at the start", step, "first_sides", "w.where(x < 0.0, -1.0", "w.where(x < 0.0, 1.0", STRIP, "strip|crossings"),
+    Mutant("no side at the start", step, "first_sides", "w.where(fresh, side,", "w.where(fresh, 0.0,", WINDOW, "passed over|place"),
+    Mutant("friction that is pushed back", event_search, "pass_event", "~rests & (rate < 0.0)", "~rests & (rate > 0.0)", STICKS, "sticks"),
     Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),

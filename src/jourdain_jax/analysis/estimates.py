@@ -53,8 +53,8 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[st
         one = run_of(run).at(layout, shared, local[index])
         scene = layout.scene(problem.scene, shared)
         motion = partial(one.motion, scene, simulate, options=options)
-        jumps = moving_jumps(modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
-        if jumps and one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings:
+        jumps = partial(moving_jumps, modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
+        if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
             found.append(
                 f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: derivatives and "
                 "standard errors omit the shift of the times of jumps; let loads change within a short time or length"

@@ -22,7 +22,7 @@ from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
-from jourdain_jax.lowering.relations import jumps, relations
+from jourdain_jax.lowering.relations import jumps, relations, sided
 from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -191,9 +191,12 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     (power,) = nodes.pop("power")
     rates = [*nodes["qdot"], *nodes["ydot"]]
     _check_resets(scene, builder, best)
-    nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes)
+    of_contacts = builder.traced.inputs.tolist()[len(scene.inputs) - len(scene.switching.contacts) :]
+    nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes, of_contacts)
+    every = [n for part in watched for n in part]
+    nodes["sided"] = sided(graph, every, [*rates, *nodes["events"]], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
-    nodes["fixed"], own = graph.fixed([*outputs, *(n for part in watched for n in part)]), builder.traced
+    nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
     given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist(), *(n for x in own.parameters for n in x.ravel().tolist())]
     # without what was tried for it
     alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
@@ -221,6 +224,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=0.0,  # not known yet
+        sides=0,
         **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
 

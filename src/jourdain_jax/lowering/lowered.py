@@ -19,6 +19,12 @@ from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
 
+# Parts of a program that are nodes; `power` is another one.
+NODES = (
+    *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
+    *("projected_q", "projected_u", "relations", "event_relations", "sided", "jumps"),
+)
+
 
 class NotLowered(Exception):
     """The reason why a scene is not lowered."""
@@ -64,6 +70,7 @@ class Lowered:
     energies: tuple[int, ...]  # kinetic and potential
     relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
     event_relations: tuple[int, ...]  # and those that do so in stop events besides
+    sided: tuple[int, ...]  # of both, those whose branches go on beyond where the number vanishes (`lowering/sides.py`)
     jumps: tuple[int, ...]  # of the relations, those at whose zeros rates may jump
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds projected onto the constraints; none where dependent speeds are eliminated
@@ -75,6 +82,7 @@ class Lowered:
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
     fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
+    sides: int  # how many of the last modes and events are of relations
 
     @property
     def graph(self) -> Graph:

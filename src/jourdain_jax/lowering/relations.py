@@ -1,4 +1,4 @@
-"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: what steps watch (`motion/integrators/crossings.py`).
+"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: they become sides (`sides.py`).
 
     a < b, max(a, b), ...    a - b          sign(x), |x|    x          floor(x)    sin(pi x)          round(x)    cos(pi x)
 
@@ -19,7 +19,7 @@ from jourdain_jax.program.graph import Graph
 MOST_WATCHED = 32  # of a scene
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
 ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
-_WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
+WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
@@ -42,9 +42,9 @@ def _own(graph: Graph, node: int) -> int | None:
         return graph.sub(*args)
     if op in ("abs", "sign"):
         return args[0]
-    if op not in _WHOLE:
+    if op not in WHOLE:
         return None
-    return graph.call(_WHOLE[op], graph.mul(graph.const(np.pi), graph.div(*args) if op == "rem" else args[0]))
+    return graph.call(WHOLE[op], graph.mul(graph.const(np.pi), graph.div(*args) if op == "rem" else args[0]))
 
 
 def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
@@ -62,6 +62,8 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
         return graph.const(COMPARED[op][0 if above else 1])
     if op == "sign":
         return graph.const(1.0 if above else -1.0)
+    if op in WHOLE:  # one step apart
+        return node if above else graph.add(node, args[-1] if op == "rem" else graph.one)
     return args[0] if above == (op in ("abs", "max")) else graph.neg(args[0]) if op == "abs" else args[1]
 
 
@@ -72,12 +74,12 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
     return above, below
 
 
-def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Numbers whose signs are to be watched: of the rates, and those of stop events besides."""
+def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Numbers whose signs are to be watched: of the rates, and those of stop events besides; none that depends on `modes`, which have events of their own."""
     found: list[list[int]] = []
     for outputs, counts in ((rates, _differ), (events, _may_dip)):
-        of_outputs = switches(graph, outputs)
-        kept = [n for n, nodes in of_outputs.items() if any(graph.op[k] in _WHOLE for k, _ in nodes) or _counts(graph, n, nodes, outputs, counts, probes)]
+        of_outputs = {n: nodes for n, nodes in switches(graph, outputs).items() if not set(modes) & set(graph.reachable([n]))}
+        kept = [n for n, nodes in of_outputs.items() if any(graph.op[k] in WHOLE for k, _ in nodes) or _counts(graph, n, nodes, outputs, counts, probes)]
         needed = set(graph.reachable(kept))
         found.append([n for n in of_outputs if n in kept or any(k in needed for k, _ in of_outputs[n])])
     return tuple(found[0]), tuple(n for n in found[1] if n not in found[0])
@@ -99,6 +101,17 @@ def _differ(values, above, below, least) -> bool:
 def _may_dip(values, above, below, least) -> bool:
     """A value that is the lower one of its two branches on either side has a peak there, or goes on."""
     return not np.all(values <= np.minimum(above, below) + least)
+
+
+def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
+    """Return the numbers whose branches go on beyond where they vanish: both are finite wherever the outputs are."""
+    decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
+
+    def go_on(number: int) -> bool:
+        nodes = decided.get(number, [])
+        return all(np.all(np.isfinite(probes(of)) | ~finite) for of in branches(graph, nodes, outputs))
+
+    return tuple(n for n in numbers if go_on(n))
 
 
 def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:

@@ -146,7 +146,6 @@ class Diffrax(eqx.Module, Integrator):
             last_step=jnp.full_like(t_end, jnp.nan),
             pivot=jnp.full_like(t_end, jnp.inf),
             crossings=jnp.zeros_like(event_index),
-            together=jnp.full_like(t_end, jnp.inf),
             passed=NONE_PASSED,
         )
 

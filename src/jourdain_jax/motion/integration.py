@@ -195,7 +195,6 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         rejected=solved.rejected,
         last_step=solved.last_step,
         crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
-        together=solved.together,
         fallback=jnp.asarray(results.AS_ASKED, jnp.int32),
         moved_q=moved_q,
         moved_u=moved_u,

@@ -5,36 +5,37 @@ There lanes of a scalar program run side by side in blocks of `width`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, pushed_by_jax, with_rules
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.lowering.sides import with_sides
 from jourdain_jax.motion.arrays import motion as on_arrays
 from jourdain_jax.motion.arrays.functions import joined
 from jourdain_jax.motion.arrays.loop import Loop
-from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled, in_phases
+from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
 from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.functions import reason_against_derivatives
 from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.loop import OF_SAMPLES, Start, flow
-from jourdain_jax.motion.native.native_motion import driven, numbers_of
+from jourdain_jax.motion.native.native_motion import driven, numbers_of, others_of
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.graph import ARRAYS
 from jourdain_jax.scene.scene import Scene
 
 
@@ -73,13 +74,14 @@ class OwnSteps(Integrator):
             run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)
             reason = lambda: reason_against_derivatives(form, 2)  # noqa: E731
         rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
-        return _on_times(run if self.alongside else with_rules(run, rules), mover, setup, begun)
+        run = run if self.alongside else with_rules(run, rules)
+        return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
 
     def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
         """Return the loop on arrays, its arguments, and the number of lanes side by side."""
-        program, relations = setup.field.lowered, watched(setup.field, setup.inputs, bool(self.event_names))
+        program = setup.field.lowered
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
-        return *on_arrays.loop_of(self.solver, setup, begun, relations, {"most": self.most, "stopping": self.stopping}), at_once
+        return *on_arrays.loop_of(self.solver, setup, begun, self._events(setup)), at_once
 
     def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
         of, start, at_once = self._loop(setup, begun)
@@ -98,7 +100,11 @@ class OwnSteps(Integrator):
         return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
 
     def _form(self, setup: Setup) -> Form:
-        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names), self.most, self.stopping)
+        return native_motion.form_of(setup.field, setup.inputs, **self._events(setup))
+
+    def _events(self, setup: Setup) -> dict[str, Any]:
+        sides = setup.field.lowered.sides if setup.field.lowered else 0
+        return {"has_events": bool(self.event_names or sides), "most": self.most, "stopping": self.stopping}
 
     def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
         form, start = self._form(setup), native_motion.start_of(setup, begun)
@@ -172,13 +178,24 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
     )
 
 
-def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:
-    """The numbers whose signs are watched, as a function (args, tau, y) -> (numbers, *lanes), and how many are relations; None where none are, or too many."""
-    if field.lowered is None:
-        return None, 0
-    program, nodes = _relations(field.lowered, inputs, has_events)
-    events = program.events if has_events and program.event_relations else ()
-    return (partial(_values, program, (*nodes, *events)), len(nodes)) if 0 < len(nodes) <= MOST_WATCHED else (None, 0)
+def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
+    """Return the motion with a mode and an event for each relation (`lowering/sides.py`); functions of time are part of its program."""
+    field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
+    if reason_against_watching(setup) or not isinstance(field, ByProgram):
+        return setup, begun
+    has_events = bool(setup.integrator.event_names)
+    program, numbers = _relations(field.program, inputs, has_events)
+    if not numbers:
+        return setup, begun
+    if program is not field.program:
+        functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
+        fixed += tuple(jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel))
+        inputs = Inputs(tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)))
+    program = with_sides(program, has_events, native_motion.modes_among(inputs))
+    inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * program.sides))
+    field = replace(field, program=program, stops=program.stops)
+    setup = setup._replace(field=field, inputs=inputs)
+    return setup, eqx.tree_at(lambda b: b.args, begun, (field, scene, inputs, fixed, origin))
 
 
 def reason_against_watching(setup: Setup) -> str:
@@ -187,18 +204,32 @@ def reason_against_watching(setup: Setup) -> str:
     """
     if setup.field.lowered is None:
         return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
-    count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
+    program, numbers = _relations(setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names))
+    if not numbers:
+        return ""
     if not setup.integrator.own:
-        return "solvers of diffrax do not" if count else ""
-    return f"they are {count}, more than {MOST_WATCHED}" if count > MOST_WATCHED else ""
+        return "solvers of diffrax do not"
+    if getattr(setup.integrator.solver, "even", False):
+        return "steps of one length do not"
+    if has_events and not setup.field.lowers_events:
+        return "an event has no scalar form"
+    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
+        return "the scene keeps parts as calls"
+    sampled = [n for n, channel in zip(program.traced.inputs.tolist(), others_of(setup.inputs), strict=True) if isinstance(channel, Sampled)]
+    if set(sampled) & set(program.graph.reachable(numbers)):
+        return "one depends on samples"
+    return f"they are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
 
 
-def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool) -> bool:
-    """Return whether rates may jump at a time that depends on the state, on numbers of inputs, or, where the `scene_varies`, on parameters."""
+def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
+    """Return whether rates may jump, in a way that derivatives leave out, at a time that depends on the state, on numbers of inputs, or, where the
+    `scene_varies`, on parameters; `watched`: steps watch relations.
+    """
     if field.lowered is None:
         return loads_may_jump(scene)
     program, _ = _relations(field.lowered, inputs, False)
-    if not program.jumps:
+    left_out = [n for n in program.jumps if not watched or n not in program.sided]
+    if not left_out:
         return False
     lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
@@ -206,7 +237,7 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     others = [any(jax.tree.leaves(channel)) for channel, is_lowered in zip(traced, lowered, strict=True) if not is_lowered]
     count = len(program.traced.q) + len(program.independent)
     varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
-    return any(depend_on(program.graph, program.jumps, compress(program.variables, varies)))
+    return any(depend_on(program.graph, left_out, compress(program.variables, varies)))
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
@@ -216,25 +247,6 @@ def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowe
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
-
-
-@eqx.filter_jit
-def _values(program: Lowered, nodes: tuple[int, ...], args, tau, y) -> Float[Array, "numbers *lanes"]:
-    _, _, inputs, fixed, origin = args
-    t, given = origin + tau, partial(_given, len(program.inputs))
-    values = eqx.filter_vmap(given, out_axes=-1)(inputs, t) if jnp.ndim(tau) else given(inputs, t)
-    numbers = len(values) - len(program.inputs)
-    state = jax.lax.stop_gradient(((*fixed, *values[:numbers]), t, tuple(y.q), tuple(y.v), values[numbers:]))
-    return program.values(nodes, *state)
-
-
-def _given(count: int, inputs: Inputs, t) -> Float[Array, "given"]:
-    """Return numbers of the functions of time, and values of the `count` inputs that are left to the program.
-    """
-    functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)] if count < len(inputs.channels) else []
-    numbers = [x for channel in functions for x in numbers_of(channel)]
-    values = [channel(t) for channel in inputs.channels if not (functions and isinstance(channel, FunctionOfTime))]
-    return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in (*numbers, *values)]) if numbers or values else jnp.zeros(0)
 
 
 TOGETHER = 8  # lanes, where the loop is one function

@@ -16,7 +16,7 @@ Where rates are f_1 before and f_2 after the time s(p) of a jump,
 
     dy/dp = (what JAX finds) + (f_1 - f_2) ds/dp
 
-and relations that a motion crossed are counted by its steps (`motion/integrators/crossings.py`).
+and relations that a motion crossed are counted by its steps (`lowering/sides.py`).
 """
 
 import warnings
@@ -112,7 +112,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
     if crossings is None or not np.any(crossings):
         return
     names = jax.tree.map(lambda x: x[0], motions.scene) if motions.q.ndim > 2 else motions.scene
-    if moving_jumps(field, names, motions.inputs, scene_varies):
+    if moving_jumps(field, names, motions.inputs, scene_varies, bool(np.all(crossings >= 0))):
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
             f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "

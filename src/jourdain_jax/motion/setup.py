@@ -72,7 +72,6 @@ class Solved(eqx.Module):
     last_step: PerLane  # s, that the step-size control would take next; NaN where it keeps that to itself
     pivot: PerLane  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
     crossings: Int[Array, "*lanes"]  # as in `Trajectory`
-    together: PerLane
     passed: Passed
 
 
@@ -85,7 +84,7 @@ class Integrator(abc.ABC):
     max_steps: int
     event_names: tuple[str, ...]
     solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
-    own: ClassVar[bool]  # whether steps watch relations (`crossings.py`), and states are projected onto the constraints
+    own: ClassVar[bool]  # whether steps end at relations, and states are projected onto the constraints
 
     @property
     @abc.abstractmethod

@@ -22,7 +22,7 @@ from jourdain_jax.motion.native.back import event_back, is_located, step_back
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.loop import Start
 from jourdain_jax.motion.native.record import Slot
-from jourdain_jax.motion.native.transitions import reset_back
+from jourdain_jax.motion.native.transitions import is_noted, reset_back
 
 SLOTS = (
     256  # tries of steps in a window, or fewer where memory is short: at least a sixteenth, as of checkpoints
@@ -129,12 +129,13 @@ def cotangents(
         here = jax.lax.dynamic_index_in_dim(window, last % slots, 0, keepdims=False)
         before = here[slot.saved].astype(jnp.int32)
         at, g, by_known = w.holding(here), w.holding(added(g, before, saved)), w.holding(by_known)
-        if form.transitions:
+        if form.goes_on:
             lanes_, left = Lanes(w, form, state), w.at(at, slot.left)
             switched = w.load(left) != 0.0
-            lanes_["passed"] = lanes_["passed"] - jnp.where(switched, 1.0, 0.0)
+            lanes_["passed"] = lanes_["passed"] - jnp.where(is_noted(w, form, w.load(left)), 1.0, 0.0)
             number = lanes_["passed"].astype(jnp.int32)
-            g_time = jnp.sum(jnp.where(numbers(form.transitions, g_t) == number, g_log, 0.0), axis=0)
+            own = (numbers(form.transitions, g_t) == number) & is_noted(w, form, w.load(left))
+            g_time = jnp.sum(jnp.where(own, g_log, 0.0), axis=0)
             w.if_any(switched, lambda: reset_back(w, form, known, state, left, w.holding(g_time[None]), g, by_known))
         if isinstance(of.method, Method):
             step_back(w, form, of.method, known, state, at, g, by_known)

@@ -34,8 +34,6 @@ class ArrayForm(Form):
     events: int = 0  # type: ignore[assignment]
     turning: int = 0  # type: ignore[assignment]
     squares: range = range(0)  # type: ignore[assignment]
-    relations: range = range(0)  # type: ignore[assignment]
-    watched: range = range(0)  # type: ignore[assignment]
     switched: range = range(0)  # type: ignore[assignment]
 
     @property
@@ -77,7 +75,6 @@ class Functions:
 
     w: ArrayWriter
     form: Form
-    watched: Callable | None  # (args, tau, y) -> numbers whose signs are
     rest: tuple  # of the arguments of rates, without arrays
     shared: tuple[Sequence, ...]  # these arrays, then tangents of them
     asked: tuple[int, ...]  # of which of them cotangents are asked
@@ -184,11 +181,6 @@ class Functions:
     def event_tangents(self, state: Pointer, t, y: Pointer, dc: Pointer) -> None:
         """Store the tangents of the values of stop events."""
         self._store(pushed(self._events, self._parts(state, t, y))[1:], dc, self.form.events)
-
-    def relations(self, state: Pointer, t, y: Pointer, values: Pointer) -> None:
-        """Store the numbers whose signs are watched."""
-        found = self.watched(self._args(self.shared[0]), t, self._state(self.w.load(y, self.y)))  # type: ignore[misc]
-        self._store([found], values, len(self.form.watched))
 
     # of events after which the motion continues (`motion/native/transitions.py`)
 

@@ -13,13 +13,13 @@ from jourdain_jax.motion.integrators.event_search import RUNNING, search_of
 from jourdain_jax.motion.integrators.explicit_steps import TSIT5, aimed, judged
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, even_step
 from jourdain_jax.motion.native.layout import Lanes, copied, each_row
-from jourdain_jax.motion.native.step import Trial, norm, project, reach_of, seen, stages, unseen, worst
+from jourdain_jax.motion.native.step import Trial, norm, project, seen, stages, unseen, worst
 from jourdain_jax.motion.trajectories import results
 
 
 def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
     """Try a step; put slopes at its start, middle and end into `k` where events or pivots need them."""
-    reach, y = reach_of(w, form, p, p["h"]), p.pointer
+    reach, y = p["h"], p.pointer
     if method.even:
         reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
     aim = aimed(w, p, p["goal"], reach, p["search_shift"] if form.has_events else None)

@@ -9,7 +9,7 @@ the rates,
 and of derivatives of higher order the tangents of these (`layout.py`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox.internal as eqxi
@@ -42,7 +42,6 @@ class Loop(NamedTuple):
 
     form: Form
     method: Method | ImplicitMethod
-    watched: Callable | None  # (args, tau, y) -> numbers whose signs are
     rest: tuple  # of the arguments of rates, without arrays
     most: int  # steps
 
@@ -70,7 +69,7 @@ class Loop(NamedTuple):
     def writer(self, start: Start, asked: Sequence[int] = ()) -> ArrayWriter:
         """Return a writer with the functions that a step calls."""
         w = ArrayWriter(start.goals[0])
-        w.functions = Functions(w, self.form, self.watched, self.rest, start.known, tuple(asked), self.method)
+        w.functions = Functions(w, self.form, self.rest, start.known, tuple(asked), self.method)
         return w
 
     def rows_in(self, w: ArrayWriter, going: Going, fixed: dict) -> Pointer:

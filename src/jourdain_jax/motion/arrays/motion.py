@@ -29,21 +29,13 @@ def loop_of(
     method: Method | ImplicitMethod,
     setup: Setup,
     begun: Begun,
-    relations: tuple[Callable | None, int],
-    transitions: dict[str, Any],
+    of_events: dict[str, Any],
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion.
 
-    `relations`: a function for the numbers whose signs are watched, and how many of them are relations.
-    `transitions`: what the form says of them.
+    `of_events`: what the form says of events.
     """
-    goals, knots, field, y0, names = (
-        setup.goals(setup.ts),
-        setup.knots,
-        setup.field,
-        begun.y0,
-        setup.integrator.event_names,
-    )
+    goals, knots, field, y0 = setup.goals(setup.ts), setup.knots, setup.field, begun.y0
     args, most, eps = (
         integrands.within(goals[0], begun.args),
         setup.most_steps(knots),
@@ -51,25 +43,22 @@ def loop_of(
     )
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
-    watched, several = relations
     modes = modes_at_start(setup.inputs)
     form = ArrayForm(
         None,
         field.with_work,
         field.projects,
         True,
-        bool(names),
-        len(seen.pivots) if seen else 0,
+        pivots=len(seen.pivots) if seen else 0,
         coordinates=len(y0.q),
         speeds=len(y0.v),
-        events=count(integrands.events) if names else 0,
+        events=count(integrands.events) if of_events["has_events"] else 0,
         turning=seen.directions.size if seen else 0,
         squares=range(2 * field.near_rank_loss),
-        relations=range(several),
         switched=range(len(modes)),
-        stops=field.stops if names else (),
-        **transitions,
-        watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
+        stops=field.stops if of_events["has_events"] else (),
+        sides=field.lowered.sides if field.lowered else 0,
+        **of_events,
         compensated=most * eps
         > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
     )
@@ -77,7 +66,7 @@ def loop_of(
     numbers = jax.lax.stop_gradient(
         (() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0]))
     )
-    return Loop(form, method, watched, rest, most), Start(*numbers, y=(y0.rows,), known=(known,), modes=modes)
+    return Loop(form, method, rest, most), Start(*numbers, y=(y0.rows,), known=(known,), modes=modes)
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:

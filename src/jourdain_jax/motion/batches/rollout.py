@@ -80,13 +80,6 @@ class Rollout(Printed, eqx.Module):
         """Numbers of the samples that lost their privileged speeds and were repeated with the full state."""
         return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
 
-    @property
-    def crossed_together(self) -> np.ndarray:
-        """Numbers of the samples with a step that crossed two or more relations, between which an effect may
-        be missed.
-        """
-        return np.flatnonzero(np.isfinite(self.lanes.together))
-
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
         """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
         `levels` (0 to 1), shape (levels, times).
@@ -139,8 +132,6 @@ class Rollout(Printed, eqx.Module):
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
-        if self.crossed_together.size:
-            lines.append(f"  {len(self.crossed_together)} crossed two or more relations in one step, which may miss an effect between them: give `max_step`")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)

@@ -33,8 +33,9 @@ import operator
 from functools import reduce
 from typing import Any, NamedTuple
 
+from jourdain_jax.motion.integrators.sides import leaving, on_their_way
 from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
-from jourdain_jax.motion.native.transitions import Happened, goes_on, is_left, pass_event
+from jourdain_jax.motion.native.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
@@ -256,8 +257,9 @@ def monitored(
 
     def armed(found: list[list[Number]]) -> list[list[Number]]:
         """Exclude events that have not been left since they happened, and ignored ones."""
-        if not form.transitions:
+        if not form.goes_on:
             return found
+        found = leaving(w, form, p, found)
         over = [w.literal(stops and not form.stopping, w.truth) for stops in form.stops]
         disarmed = [(off > 0.0) | passed for off, passed in zip(p.every("disarmed"), over, strict=True)]
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
@@ -266,7 +268,7 @@ def monitored(
         """Reverse the sign of events that have not been left: one that rises above zero within a step and
         falls again happens again.
         """
-        if not form.transitions:
+        if not form.goes_on:
             return found
         off = p.every("disarmed")
         return [[w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)] for pair in zip(found, armed(found), strict=True)]
@@ -278,9 +280,11 @@ def monitored(
     locating = w.equal(p["code"], LOCATING)
     # a motion that starts beyond an event has no motion at all; a state that is lost is no event
     sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
-    fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.transitions else 0.0) & sound
+    fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.goes_on else 0.0) & sound
     share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
+    if form.goes_on:
+        sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
     half = w.room()
     w.store(0.5, half)
@@ -320,7 +324,7 @@ def monitored(
         "taken": w.where(stays, 0.0, new["taken"]),
     }
     ends = found
-    if form.transitions:
+    if form.goes_on:
         goes = goes_on(w, form, changed["event"]) & (found | over)
         # an event a rounding beyond the end of its step happens there: what is saved there is the state after it
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
@@ -330,15 +334,18 @@ def monitored(
         left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
         p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
         rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
-        flat = over | is_flat(w, rate, slope)  # what happens at a start has no derivative
-        passing = Happened(changed["event"], changed["t"], flat, goes, noise, found)
-        stuck, at_once = w.room(), over & any_of(sinks) & (p["passed"] > 0.0)
+        side = is_side(w, form, changed["event"])  # one may vanish where another one has
+        flat = ~side & (over | is_flat(w, rate, slope))
+        quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
+        passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
+        stuck, at_once = w.room(), over & any_of(sinks) & (p["begun"] > 0.0)
         w.store(0.0, stuck)
         w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
-        passed = p["passed"] + w.where(goes, 1.0, 0.0)
+        passed = p["passed"] + w.where(goes & ~side, 1.0, 0.0)
         too_many = at_once | (w.load(stuck) > 0.0) | (passed > float(form.transitions))
-        why = w.where(w.load(stuck) > 1.0, w.load(stuck) + float(results.IMPACT_GAINS_ENERGY - 2), results.TOO_MANY_TRANSITIONS)
+        why = w.where(w.load(stuck) > 0.0, w.load(stuck), float(results.TOO_MANY_TRANSITIONS))
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
+        changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:

@@ -36,7 +36,7 @@ from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_la
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
 from jourdain_jax.motion.native.samples import pass_knot
 from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, squares_of, weighted
-from jourdain_jax.motion.native.transitions import reset_back, write_reset_back
+from jourdain_jax.motion.native.transitions import is_noted, reset_back, write_reset_back
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import taken_in, write_handler
@@ -58,7 +58,7 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
     _write_step_back(w, form, method, len(asked))
     if form.has_events:
         _write_event_back(w, form, len(asked))
-    if form.transitions:
+    if form.goes_on:
         write_reset_back(w, form, asked)
         _write_transition_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
@@ -227,7 +227,7 @@ def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
     """`reset_back(job, state, who, left, g, by_known)`: as the function of this name, with cotangents of the transition's time from the job."""
     with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
-        w.store(w.load(left), numbers)
+        w.store(w.where(is_noted(w, form, w.load(left)), w.load(left), 0.0), numbers)
         each_row(w, 1 + len(form.moving), g_t, lambda i: 0.0)
         with w.counted(0, w.lanes) as lane:
             number = w.load(who, lane, "i64")

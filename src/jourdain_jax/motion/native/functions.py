@@ -144,13 +144,6 @@ def _write_along(w: MachineWriter, form: Form) -> None:
                 w.store(x, y, form.y + first + i)
 
 
-def write_relations(w: MachineWriter, form: Form) -> None:
-    """`relations(state, tau, y, values)`: the numbers whose signs are watched, of the state `y`."""
-    with w.procedure("relations", "state tau:real y values") as (state, tau, y, values):
-        for i, x in written_in_turn(w, form.program.graph, form.watched, known_values(w, form, state, tau, y)):
-            w.store(as_real(w, x), values, i)
-
-
 @lru_cache(maxsize=64)
 def event_program(form: Form) -> Outputs:
     """Stop events with their rates, whose states are the rates of the state; `Unsupported` where an operation has no derivative on the graph.

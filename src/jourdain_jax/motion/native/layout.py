@@ -5,8 +5,7 @@ A lane is handed over with all rows of `Form.given`, its progress at the start a
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
 derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
 second order those along e_1, e_2, and both. `taken` is by how far the last step has gone; of
-a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected. `last` are the numbers
-whose signs are watched, and by the time `crossing_by` one of them is known to change (`motion/integrators/crossings.py`).
+a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected.
 
 Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and
 where the next knot is at which a step must end (`knot`; `samples.py`).
@@ -23,11 +22,10 @@ from itertools import pairwise
 from typing import Any
 
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
 
-PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot", "crossings", "together")
+PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot", "crossings")
 SAMPLES = ("table", "samples", "knot")
 CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max_steps", "origin")
 
@@ -50,6 +48,7 @@ class Form:
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
     most: int = 0  # transitions of a motion
     stopping: bool = True  # whether events that end a motion do
+    sides: int = 0  # how many of the last modes and events are of relations
 
     @property
     def rates(self) -> list[int]:
@@ -58,15 +57,14 @@ class Form:
         return [*program.qdot, *program.ydot, *([program.power] if self.with_work else [])]
 
     @property
-    def relations(self) -> tuple[int, ...]:
-        """Return the numbers whose signs are monitored; none if there are too many."""
-        found = self.program.watched(self.has_events)
-        return found if len(found) <= MOST_WATCHED else ()
+    def modes(self) -> int:
+        """Return the number of modes of the scene."""
+        return len(self.switched) - self.sides
 
     @property
-    def watched(self) -> tuple[int, ...]:
-        """These, and the values of stop events that relations decide."""
-        return (*self.relations, *(self.program.events if self.relations and self.has_events and self.program.event_relations else ()))
+    def stated(self) -> int:
+        """Numbers of events that the scene states."""
+        return self.events - self.sides
 
     @property
     def monitored(self) -> list[int]:
@@ -106,7 +104,7 @@ class Form:
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
-        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events, *self.watched]
+        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
         """Return nodes of fixed values, of time, of the state without work, and of the inputs."""
@@ -120,9 +118,14 @@ class Form:
         return len(self.program.qdot)
 
     @property
+    def goes_on(self) -> bool:
+        """Whether a motion goes on after some events."""
+        return self.has_events and not all(self.stops)
+
+    @property
     def transitions(self) -> int:
-        """The most transitions of a motion; none where all events end it."""
-        return self.most if self.has_events and not all(self.stops) else 0
+        """The most transitions of a motion that are noted; none where all events that the scene states end it."""
+        return self.most if self.goes_on and not all(self.stops[: self.stated]) else 0
 
     @property
     def rows_of_transition(self) -> dict[str, range]:
@@ -167,9 +170,9 @@ class Form:
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
-        watched = len(self.watched)
         most, modes = self.transitions, len(self.switched)
-        log = {"passed": 1, "log_event": most, "log_mode": most * modes, "log_lost": most, "log_t": most * (1 + len(self.moving))} if most else {}
+        log = {"passed": 1, "log_event": most, "log_mode": most * self.modes, "log_lost": most, "log_t": most * (1 + len(self.moving))}
+        log = log if self.goes_on else {}
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **log, **dict.fromkeys(CONTROL, 1), "mode": modes}
         counts |= {
             **self.known,
@@ -180,9 +183,8 @@ class Form:
             **(search if self.events else {}),
             **dict.fromkeys(SAMPLES if self.sampled else (), 1),
         }
-        counts |= {"last": watched, "crossing_by": 1} if watched else {}
         counts |= dict.fromkeys(("rest", "next_rest"), self.y) if self.compensated else {}
-        counts |= {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if most else {}
+        counts |= {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if self.goes_on else {}
         return _in_a_row(counts)
 
     @property

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import check_derivatives, write_events, write_projection, write_rates, write_relations
+from jourdain_jax.motion.native.functions import check_derivatives, write_events, write_projection, write_rates
 from jourdain_jax.motion.native.layout import (
     CONTROL,
     PROGRESS,
@@ -68,10 +68,8 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
         write_projection(w, form)
     if form.has_events:
         write_events(w, form)
-    if form.transitions:
+    if form.goes_on:
         write_reset(w, form)
-    if form.relations:
-        write_relations(w, form)
     write_step(w, form, method)
 
 
@@ -247,7 +245,7 @@ class Start(NamedTuple):
         """Return the rows of a lane at the start."""
         rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros_like(self.goals[0]), jnp.ones_like(self.goals[0])
-        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one]
+        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero]
         progress += [zero] * (form.rows[CONTROL[0]].start - form.integrated - len(progress))
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have

@@ -30,8 +30,8 @@ from jourdain_jax.build.trace import Variables
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.relations import jumps, switches
+from jourdain_jax.lowering.lowered import NODES, Lowered
+from jourdain_jax.lowering.relations import jumps, sided, switches
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled, TimeProgram
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
@@ -49,11 +49,6 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
-# Parts of a program that are nodes; `power` is another one.
-_NODES = (
-    *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
-    *("projected_q", "projected_u", "relations", "event_relations", "jumps"),
-)
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
 
 
@@ -79,14 +74,16 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
                 new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
     except (Unsupported, ValueError) as error:
         return f"an input is a function of time without scalar form ({error})"
-    nodes = {name: getattr(program, name) for name in _NODES}
+    nodes = {name: getattr(program, name) for name in NODES}
     of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
     by_functions = switches(graph, of_functions)
-    jumping = jumps(graph, by_functions, of_functions, _random(graph, [*by_functions, *of_functions]))
+    probes = _random(graph, [*by_functions, *of_functions])
+    go_on = sided(graph, by_functions, of_functions, probes)
     new = graph.copied([program.power, *(n for part in nodes.values() for n in part)], program.graph, new)
     on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
     on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
-    on_it["jumps"] += tuple(jumping)
+    on_it["sided"] += go_on
+    on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
     stays = [i for i, function in enumerate(functions) if function is None]
     u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
     q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
@@ -256,17 +253,17 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
     it.
     """
     assert isinstance(field, ByProgram)
-    sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
+    sampled = tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Sampled))
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
     switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
-    of_events: dict[str, Any] = {"stops": program.stops, "most": most, "stopping": stopping} if goes_on else {}
+    of_events: dict[str, Any] = {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides} if goes_on else {}
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled, switched=switched, **of_events)
 
 
 def modes_among(inputs: Inputs) -> tuple[int, ...]:
     """Return which of the inputs that are no functions of time are modes."""
-    return tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Mode))
+    return tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Mode))
 
 
 def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
@@ -293,7 +290,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
     """Return the state at a time t, as a function of it, of t, and of a zero time d, by which it is moved
     along its rates.
     """
-    others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(_rates(form))
+    others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(_rates(form))
 
     def moved_by(y, t, d):
         known = known_of(args)
@@ -331,14 +328,14 @@ def known_of(args: tuple) -> list:
     """
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
-    return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in _others(inputs))]
+    return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in others_of(inputs))]
 
 
 def with_known(inputs: Inputs, known: Sequence) -> Inputs:
     """Return inputs with replacements of their numbers, in the order of `known_of` and without fixed ones."""
     each = iter(known)
     new = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in parts_from(channel, each)]
-    new += [x for channel, x in zip(_others(inputs), each, strict=True) if isinstance(channel, Constant)]
+    new += [x for channel, x in zip(others_of(inputs), each, strict=True) if isinstance(channel, Constant)]
 
     def places(x: Inputs) -> list:
         both: list[tuple[Any, Callable]] = list(zip(x.channels, inputs.channels, strict=True))
@@ -348,7 +345,7 @@ def with_known(inputs: Inputs, known: Sequence) -> Inputs:
     return eqx.tree_at(places, inputs, new, is_leaf=lambda x: x is None) if new else inputs
 
 
-def _others(inputs: Inputs) -> list[Callable]:
+def others_of(inputs: Inputs) -> list[Callable]:
     """The channels that are no functions of time."""
     return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
@@ -372,7 +369,7 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
 
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """Return the result of a loop as a `Solved`."""
-    h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest[:9]
+    h, code, accepted, rejected, event, pivot, crossings, count = found.rest[:8]
     (states,), (end,), (t,), (log,) = found[:4]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
@@ -380,8 +377,8 @@ def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     most = form.transitions
     passed = NONE_PASSED
     if most:
-        number, more = found.rest[9], found.rest[10:]
+        number, more = found.rest[8], found.rest[9:]
         times = jnp.where(jnp.arange(most) < number, log, jnp.inf)
-        modes = jnp.reshape(more[2 * most :], (len(form.switched), most)) if form.switched else jnp.zeros((0, most))
+        modes = jnp.reshape(more[2 * most :], (form.modes, most)) if form.modes else jnp.zeros((0, most))
         passed = Passed(times, more[:most].astype(jnp.int32), more[most : 2 * most], modes)
-    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, together, passed)
+    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, passed)

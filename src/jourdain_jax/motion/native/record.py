@@ -190,7 +190,7 @@ def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Ro
     w.store(w.load(rooms.saved), here, slot.saved)
     w.run("step", rooms.state, w.at(here, slot.y))
     w.store(lanes["taken"], here, slot.taken)
-    if form.transitions:
+    if form.goes_on:
         copied(w, len(form.rows["left"]), w.at(rooms.state, form.rows["left"].start), w.at(here, slot.left))
     w.run("note", job, rooms.state, rooms.who, rooms.saved)
     w.store(w.load(rooms.tries, type="i64") + 1, rooms.tries)
@@ -218,7 +218,7 @@ def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms:
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
     w.store(before, rooms.saved)
-    if form.transitions:
+    if form.goes_on:
         with w.when(w.any(w.load(here, slot.left).differs(0.0))):
             w.run("reset_back", job, rooms.state, rooms.who, w.at(here, slot.left), rooms.g, rooms.by_known)
     with w.when(w.any(w.load(here, slot.taken).differs(0.0))):

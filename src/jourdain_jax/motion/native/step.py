@@ -4,8 +4,8 @@
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
 This is the one source of a step. It asks a writer for arithmetic, memory, branches and loops: `MachineWriter` (`layout.py`) writes what it asks as machine
-code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Relations whose signs are watched (`motion/integrators/crossings.py`), stop
-events and the search for one (`motion/integrators/event_search.py`) are by the formulas there.
+code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Events, those of relations among them (`lowering/sides.py`),
+and the search for one are by the formulas of `motion/integrators/event_search.py`.
 
 A step ends at every time requested and at every knot of the inputs; the step size found before such a shortened step is remembered. The state advances by
 the difference of the times at the ends of a step, as they are after rounding.
@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.integrators.crossings import first_signs, note_signs, reach, watched
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, any_of, monitored
 from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
+from jourdain_jax.motion.integrators.sides import first_sides
 from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, copied, each_row
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
@@ -61,8 +61,7 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form, state)
         if isinstance(method, TaylorSteps):
-            if form.relations:
-                first_signs(w, form, lanes)
+            first_sides(w, form, lanes)
             take(w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k))
         else:
             step(w, form, method, lanes, k, tried_by_stages)
@@ -70,14 +69,13 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
 
 def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable) -> None:
     """Try one step of all lanes under way, judged by `tried`."""
-    if form.relations:
-        first_signs(w, form, p)
+    first_sides(w, form, p)
     take(w, form, method, p, k, tried(w, form, method, p, k))
 
 
 def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number) -> Trial:
     """Return a step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
-    aim = aimed(w, p, p["goal"], reach_of(w, form, p, p["h"]), p["search_shift"] if form.has_events else None)
+    aim = aimed(w, p, p["goal"], p["h"], p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     y1, error = w.room(form.integrated), w.room(form.y)
     w.in_step(p["t"], step)
@@ -107,11 +105,6 @@ def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Call
     w.each(range(form.y), sums)
 
 
-def reach_of(w: StepWriter, form: Form, p: Lanes, h: Number) -> Number:
-    """Return the step `h`, or as far as relations let one go."""
-    return w.smaller(h, reach(w, p)) if form.relations else h
-
-
 def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k: Number) -> Trial:
     """Return a step by Taylor series, which goes over the times to save at; puts the coefficients into `k`,
     and after them the slope at the end of the step.
@@ -124,7 +117,7 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
         for j, x in enumerate(series):
             w.store(x, k, j * count + row)
     length = w.smaller(radius(w, form, p, rows), p["longest"])
-    size = reach_of(w, form, p, w.smaller(length, p["bound"]))
+    size = w.smaller(length, p["bound"])
     rest = w.magnitude(last_goal - t)
     lands = ~locating & (size >= 0.999 * rest)
     size = w.where(lands, rest, size)
@@ -159,14 +152,10 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
     """Update the lanes after a tried step; `k`: derivatives at the stages, at the start first."""
     y, count = p.pointer, form.integrated
-    if form.transitions:
+    if form.goes_on:
         p["left"] = w.number(0.0)
     aim, y1, accept, next_h, smallest = trial[:5]
     t1, locating = aim.t_1, aim.locating
-    fits = accept & (~locating) if not trial.even else w.literal(0, w.truth)
-    crossed = watched(w, form, p, t1, aim.h, y1, fits) if form.relations else None
-    if crossed is not None:
-        accept, next_h = accept & ~crossed.refused, w.where(crossed.refused, w.where(crossed.falls, crossed.to_event, p["h"]), next_h)
     new = taken(w, p, aim, accept, next_h)
     new["taken"] = w.where(accept, aim.h, 0.0)  # by how far the state has gone on
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
@@ -176,13 +165,10 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
     if trial.fails is not None:
         new["code"] = w.where(trial.fails, trial.code, new["code"])
     counts = accept & ~locating & w.equal(new["code"], RUNNING) & w.equal(new["t"], t1)
-    stays = counts | (locating & w.equal(new["code"], results.EVENT))
     if smallest is not None:
         pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, new["code"])}
     moving = locating | w.equal(p["code"], RUNNING)
-    if crossed is not None:
-        note_signs(w, p, crossed, t1, moving, stays)
     copied(w, count, y1, y, moving)
     if form.compensated:  # what was left off by a step that counts
         rest, left = (w.at(y, form.rows[name].start) for name in ("rest", "next_rest"))

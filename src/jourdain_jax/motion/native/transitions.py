@@ -20,10 +20,13 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.native.functions import Outputs, given_values, known_values
 from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, copied, each_row
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph
+
+RESTS = 1e-3  # of the absolute tolerance of states: far less than errors of steps, and more than round-off
 
 
 class Reset(NamedTuple):
@@ -143,6 +146,21 @@ def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
     return found
 
 
+def is_side(w: StepWriter, form: Form, event: Number) -> Number:
+    """Return whether an event is that of a relation."""
+    return event > form.stated - 0.5 if form.sides else w.literal(0, w.truth)
+
+
+def is_noted(w: StepWriter, form: Form, left: Number) -> Number:
+    """Return whether what a try `left` is a transition that is noted: those of relations are not."""
+    return w.differs(left, 0.0) & ~is_side(w, form, w.magnitude(left) - 1.0)
+
+
+def slowest(w: StepWriter, p: Lanes) -> Number:
+    """Return by how much a number changes in the whole motion that counts as one that rests."""
+    return w.larger(RESTS * p["atol"], w.eps)
+
+
 def is_left(w: StepWriter, c: Number, rate: Number, noise: Number) -> Number:
     """Return whether a value is positive beyond round-off."""
     return c > noise * w.magnitude(rate)
@@ -154,6 +172,7 @@ class Happened(NamedTuple):
     event: Number
     t: Number
     flat: Number  # whether its value has no slope
+    quiet: Number  # whether it is that of a relation whose number is as good as at rest: it moves nothing
     here: Number  # in which lanes
     noise: Number  # the time in which a value rises by round-off
     found: Number  # whether it was searched for
@@ -162,16 +181,18 @@ class Happened(NamedTuple):
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
     """Store the state after an event in `y1`; record the event, and the state before.
 
-    `stuck` becomes 1 where the event's value rises afterwards, but so slowly that round-off hides it, and 1 - m where a mode is m < 0: no motion follows.
+    `stuck` becomes the code of a motion that does not go on: where the event's value rises afterwards, but so slowly that round-off
+    hides it; where a mode is negative; where a relation would turn back at once.
     """
-    event, t, flat, switches, noise, found = happened
+    event, t, flat, quiet, switches, noise, found = happened
+    side = is_side(w, form, event)
     rows, of, count = form.rows, form.rows_of_transition, form.integrated
     sizes = of["t"].stop, count, len(form.monitored), form.events, form.events, form.events
     after, k, pivots, before, values, slopes = (w.room(max(n, 1)) for n in sizes)
     w.run("events", p.pointer, t, y1, y1, before, slopes)
     w.run("reset", p.pointer, t, y1, event, after)
     left = w.at(p.pointer, rows["left"].start)
-    w.store(w.where(switches, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left)
+    w.store(w.where(switches & ~quiet, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left)
     w.store(w.where(switches, t, w.load(left, 1)), left, 1)
     copied(w, count, y1, w.at(left, 2), switches)
     modes = w.at(p.pointer, rows["mode"].start)
@@ -180,16 +201,16 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     copied(w, form.y, after, y1, switches)
 
     def tangent(i: Number) -> Number:
-        return w.where(switches, w.where(flat, math.nan, w.load(after, i)), w.load(y1, i))
+        return w.where(switches & ~quiet, w.where(flat, math.nan, w.load(after, i)), w.load(y1, i))
 
     each_row(w, range(form.y, count), y1, tangent)
     number, most = p["passed"], form.transitions
-    noted = [(event, "log_event", 0)] + [(w.load(modes, i), "log_mode", i) for i in range(len(form.switched))]
+    noted = [(event, "log_event", 0)] + [(w.load(modes, i), "log_mode", i) for i in range(form.modes)]
     times = [t, *(w.load(after, row) for row in of["t"][1:])]
     noted += [(w.load(after, of["lost"].start), "log_lost", 0)]
     noted += [(times[0], "log_t", 0)] + [(w.where(flat, math.nan, dt), "log_t", i) for i, dt in enumerate(times[1:], 1)]
-    for value, name, part in noted:
-        w.put_at(w.at(p.pointer, rows[name].start + part * most), most, number, value, switches)
+    for value, name, part in noted if most else ():
+        w.put_at(w.at(p.pointer, rows[name].start + part * most), most, number, value, switches & ~side)
     w.run("rates", p.pointer, t, y1, k, pivots)
     w.run("events", p.pointer, t, y1, k, values, slopes)
     disarmed = []
@@ -197,19 +218,20 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        slow = this & found & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))  # a bounce: the value itself does not jump
-        w.store(w.where(slow, 1.0, w.load(stuck)), stuck)
+        slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))  # a bounce: the value itself does not jump
+        w.store(w.where(slow, float(results.TOO_MANY_TRANSITIONS), w.load(stuck)), stuck)
         left_now = switches & is_left(w, c, rate, noise)
         disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
     p.put("disarmed", disarmed)
-    for i in range(len(form.switched)):
+    for i in range(form.modes):
         mode = w.load(modes, i)
-        w.store(w.where(switches & (mode < 0.0), w.number(1.0) - mode, w.load(stuck)), stuck)
-    if form.relations:
-        now = w.room(len(form.watched))
-        w.run("relations", p.pointer, t, y1, now)
-        p.put("last", [w.where(switches, w.load(now, i), old) for i, old in enumerate(p.every("last"))])
-        p["crossing_by"] = w.where(switches, p["direction"] * math.inf, p["crossing_by"])
+        w.store(w.where(switches & (mode < 0.0), float(results.IMPACT_GAINS_ENERGY - 1) - mode, w.load(stuck)), stuck)
+    for i in range(form.sides):
+        k, mode = form.stated + i, form.modes + i
+        this, rate = switches & w.equal(event, float(k)), w.load(slopes, k) * p["direction"]
+        rests = w.magnitude(rate * p["last_goal"]) <= slowest(w, p)
+        w.store(w.where(this & rests, 0.0, w.load(modes, mode)), modes, mode)
+        w.store(w.where(this & ~rests & (rate < 0.0), float(results.STICKS), w.load(stuck)), stuck)
 
 
 def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:

@@ -172,11 +172,6 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
             "rounded times; count time from zero, or take float64"
         )
-    if np.isfinite(float(trajectory.together)):
-        warned.append(
-            "two or more relations (`<`, `where`, `sign`, `abs`, `floor`, ...) changed in the one step that ends at "
-            f"t = {float(trajectory.together):.6g} s: an effect between them may be missed; give a smaller `max_step`, or a shorter span"
-        )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
 

@@ -84,8 +84,7 @@ class Record(eqx.Module):
     accepted: Count  # steps
     rejected: Count
     last_step: Scalar  # s, that the step-size control would take next; NaN where it keeps that to itself
-    crossings: Count  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: not watched
-    together: Scalar  # s, the end of the first step in which two or more of them did; infinite: none
+    crossings: Count  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: steps do not end there
     fallback: Count  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
     moved_q: Scalar  # how far the start was moved onto the constraints
     moved_u: Scalar

@@ -1,7 +1,7 @@
 """Saving and loading motions as NumPy's `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `together`, `fallback`, `inputs` (times, inputs;
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `fallback`, `inputs` (times, inputs;
 sampled at `ts`), `phases.NAME` for every array of `motion.phases` (absent where there is one phase, without modes), and `parameter:NAME` for every field that
 is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
@@ -349,9 +349,8 @@ def _check_finite(path, arrays: dict) -> None:
         good = np.isfinite(arrays[name])
         if not np.all(good.reshape(*whole.shape, -1)[whole]):
             raise refused(path, f"has numbers in `{name}` that are not finite, though the motion did not fail")
-    for name in ("ts", "together"):
-        if np.any(np.isnan(arrays[name])):
-            raise refused(path, f"has times in `{name}` that are NaN")
+    if np.any(np.isnan(arrays["ts"])):
+        raise refused(path, "has times in `ts` that are NaN")
     reached = np.all(np.isfinite(arrays["q"]), axis=-1)
     if np.any(whole & ~_go_one_way(arrays, reached)):
         raise refused(path, "has times in `ts` that are not ordered towards the end of the motion")

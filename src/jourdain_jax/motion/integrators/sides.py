@@ -1,0 +1,53 @@
+"""Sides of relations (`lowering/sides.py`) at a start, and where a number leaves zero."""
+
+from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
+from jourdain_jax.motion.native.transitions import slowest
+
+
+def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
+    """Take the sides of relations at the start of a motion, in lanes that have tried no step.
+
+    Where a number vanishes its side is that on which it is after d = eps^(1/4) span, by the midpoint rule.
+    """
+    if not form.sides:
+        return
+    fresh, t, first = w.equal(p["accepted"] + p["rejected"], 0.0), p["t"], form.stated
+    d = w.eps**0.25 * p["last_goal"]
+
+    def begin() -> None:
+        f, y, pivots = w.room(form.integrated), w.room(form.integrated), w.room(max(len(form.monitored), 1))
+        values, ahead, rates = (w.room(form.events) for _ in range(3))
+        w.run("rates", p.pointer, t, p.pointer, f, pivots)
+        w.run("events", p.pointer, t, p.pointer, f, values, rates)
+        each_row(w, form.integrated, y, lambda i: w.fma(0.5 * d, w.load(f, i), w.load(p.pointer, i)))
+        w.run("rates", p.pointer, t + 0.5 * d, y, f, pivots)
+        each_row(w, form.integrated, y, lambda i: w.fma(d, w.load(f, i), w.load(p.pointer, i)))
+        w.run("events", p.pointer, t + d, y, f, ahead, rates)
+        for k, row in enumerate(list(form.rows["mode"])[form.modes :], first):
+            x, later = w.load(values, k), w.load(ahead, k)
+            # noise beside what it changes by
+            x = w.where(w.magnitude(x) > w.eps**0.35 * w.magnitude(later - x), x, later)
+            side = w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0))
+            w.store(w.where(fresh, side, w.load(p.pointer, row)), p.pointer, row)
+
+    w.if_any(fresh, begin)
+
+
+def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> list[list[Number]]:
+    """Return values and rates of events, of relations at rest the way left until their numbers leave zero."""
+    c, rate = (list(part) for part in found)
+    for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
+        rests, x = w.equal(side, 0.0), c[k]
+        c[k] = w.where(rests, slowest(w, p) - w.magnitude(x), x)
+        rate[k] = w.where(rests & (x > 0.0), -rate[k], rate[k])
+    return [c, rate]
+
+
+def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
+    """Return which values sink after an event, and the values, without those that still rise from zero.
+
+    A time asked for may follow an event within round-off.
+    """
+    rising = [~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
+    c_1 = [w.where(rises & ~(b > 0.0), 1.0, b) for b, rises in zip(c_1, rising, strict=True)]
+    return [x & ~rises for x, rises in zip(sinks, rising, strict=True)], c_1

@@ -1,0 +1,242 @@
+"""Steps end at relations of loads and events, and derivatives of both orders go through: closed forms."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import result_codes as results
+from machine_code import BACKENDS
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jourdain_jax as jj
+
+SPAN = 2.0
+
+
+class Bead(jj.Scene):
+    """A bead of 1 kg on a line with the force `law(scene, t, x, v)`, and events of the motion."""
+
+    a: float = jj.parameter(0.7)
+    k: float = jj.parameter(0.5)
+    law: Callable = eqx.field(static=True, default=lambda s, t, x, v: 0 * x)
+    event: Callable | None = eqx.field(static=True, default=None)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, [q.x, 0.0, 0.0])}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate)),)
+
+    def events(self, motion):
+        return {} if self.event is None else {"event": self.event(self, motion)}
+
+
+def end(scene, start=None, **options):
+    options = {"ts": [SPAN], "rtol": 1e-12, "atol": 1e-12} | options
+    return jj.simulate(scene, {"x": 0.0, "x_rate": 1.0} | (start or {}), **options)
+
+
+def sets_in(a, k, v):
+    """x(2) where -k acts from x = a on."""
+    s = SPAN - a / v
+    return a + v * s - k * s * s / 2
+
+
+def sets_in_at_time(a, k, v):
+    s = SPAN - a
+    return v * SPAN - k * s * s / 2
+
+
+def dead_zone(a, k, v):
+    """x(2) behind a spring of stiffness k that begins at x = a."""
+    s, w = SPAN - a / v, jnp.sqrt(k)
+    return a + v / w * jnp.sin(w * s)
+
+
+def slides(a, k, v):
+    """x(2) of a bead that friction k brakes, and a force 2 k pushes back: v changes its sign at v/(3 k)."""
+    stop = v / (3 * k)
+    return v * stop / 2 - k * (SPAN - stop) ** 2 / 2
+
+
+def pushed_by_two(a, k, v):
+    """x(2) where -k acts from x = a on, and as much again from t = a + 0.4 on."""
+    s, r = SPAN - a / v, SPAN - a - 0.4
+    return a + v * s - k * s * s / 2 - k * r * r / 2
+
+
+def two_at_once(a, k, v):
+    s = SPAN - a / v
+    return a + v * s - k * s * s
+
+
+def saws(a, k, v):
+    """x(2) under the force k floor(2 x/a), where v and k let it pass two whole numbers."""
+    first = a / (2 * v)
+    at = jnp.sqrt(v * v + k * a)
+    second = first + (at - v) / k
+    s = SPAN - second
+    return a + at * s + k * s * s
+
+
+LAWS = {
+    "sets in at a place": (lambda s, t, x, v: jnp.where(x > s.a, -s.k, 0.0), sets_in),
+    "sets in at a time": (lambda s, t, x, v: jnp.where(t > s.a, -s.k, 0.0), sets_in_at_time),
+    "dead zone": (lambda s, t, x, v: -s.k * jnp.maximum(x - s.a, 0.0), dead_zone),
+    "dead zone by two": (lambda s, t, x, v: -s.k * (x - jnp.clip(x, -s.a, s.a)), dead_zone),
+    "dead zone by |x|": (lambda s, t, x, v: -s.k * (jnp.abs(x - s.a) + x - s.a) / 2, dead_zone),
+    "friction away from rest": (lambda s, t, x, v: -s.k * jnp.sign(v) - 2 * s.k, slides),
+    "a place and a time": (
+        lambda s, t, x, v: -s.k * ((x > s.a) + jnp.where(t - s.a > 0.4, 1.0, 0.0)),
+        pushed_by_two,
+    ),
+    "two at once": (
+        lambda s, t, x, v: jnp.where(x > s.a, -s.k, 0.0) + jnp.where(x * x > s.a * s.a, -s.k, 0.0),
+        two_at_once,
+    ),
+    "floor": (lambda s, t, x, v: s.k * jnp.floor(2 * x / s.a), saws),
+}
+AT = jnp.array([0.7, 0.5, 1.1])
+SAWED = jnp.array([1.9, 0.3, 1.1])  # 2 s end before the third step
+
+
+def case(kind, backend="native"):
+    """Return x(2) of a motion and as a closed form, functions of (a, k, v), and their argument."""
+    law, exact = LAWS[kind]
+
+    def x(p):
+        return end(Bead(law=law, a=p[0], k=p[1]), {"x_rate": p[2]}, backend=backend).q_end[0]
+
+    return x, lambda p: exact(*p), SAWED if kind == "floor" else AT
+
+
+@pytest.mark.parametrize("kind", LAWS)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_values_and_slopes_are_those_of_closed_forms(kind, backend):
+    x, exact, at = case(kind, backend)
+    value, slope = jax.value_and_grad(x)(at)
+    assert_allclose(value, exact(at), rtol=0, atol=1e-12)
+    assert_allclose(slope, jax.grad(exact)(at), rtol=0, atol=1e-11)
+    assert_allclose(jax.jacfwd(x)(at), jax.grad(exact)(at), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", LAWS)
+@pytest.mark.parametrize(
+    "second", [jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))], ids=["reverse", "forward"]
+)
+def test_second_derivatives_are_those_of_closed_forms(kind, second):
+    x, exact, at = case(kind)
+    assert_allclose(second(x)(at), jax.hessian(exact)(at), rtol=0, atol=1e-9)
+
+
+def test_on_arrays_slopes_are_the_same():
+    x, exact, at = case("sets in at a place", "xla")
+    along = lambda a: x(at.at[0].set(a))  # noqa: E731
+    assert_allclose(jax.jacfwd(along)(at[0]), jax.grad(exact)(at)[0], rtol=0, atol=1e-12)
+
+
+def test_lanes_are_in_modes_of_their_own():
+    law, exact = LAWS["sets in at a place"]
+    a = np.linspace(-0.5, 3.0, 30)
+    found = jj.rollout(
+        Bead(law=law), {"x_rate": 1.1}, parameters={"a": a}, ts=[SPAN], rtol=1e-12, atol=1e-12, progress=False
+    ).lanes
+    met = (a > 0) & (a < 2.2)
+    free, held = 2.2, 2.2 - 0.5 * SPAN**2 / 2
+    assert_allclose(
+        found.q_end[:, 0], np.where(met, exact(a, 0.5, 1.1), np.where(a > 1, free, held)), atol=1e-12
+    )
+    assert_array_equal(found.crossings, met)
+
+
+def test_a_step_ends_at_a_relation_at_little_cost():
+    found = end(Bead(law=LAWS["sets in at a place"][0]), rtol=1e-8, atol=1e-8)
+    assert int(found.accepted) + int(found.rejected) <= 40
+
+
+STARTS = {
+    "passes": ({"x": 0.7, "x_rate": 1.0}, 0.7 + 2.0 - 0.5 * 2),
+    "passes down": ({"x": 0.7, "x_rate": -1.0}, -1.3),
+    "beside": ({"x": 0.7 - 1e-9, "x_rate": 1.0}, 0.7 + 2.0 - 0.5 * 2),
+}
+
+
+@pytest.mark.parametrize("kind", STARTS)
+def test_a_motion_that_begins_at_a_relation_takes_the_side_to_which_it_goes(kind):
+    start, exact = STARTS[kind]
+    assert_allclose(end(Bead(law=LAWS["sets in at a place"][0]), start).q_end[0], exact, atol=3e-9)
+
+
+def test_what_rests_at_a_relation_rests_whatever_round_off_says():
+    drag = Bead(law=lambda s, t, x, v: -v * jnp.abs(v) - jnp.sin(x) + jnp.where(x > 0, -x, 0.0))
+    still = end(drag, {"x": 0.0, "x_rate": 0.0})
+    assert (still.result, still.crossings, float(still.q_end[0])) == (results.SUCCESS, 0, 0.0)
+    brakes = end(Bead(law=lambda s, t, x, v: jnp.where(v > 0, -s.k, 0.0)), ts=[4.0])  # and stays there
+    assert brakes.result == results.SUCCESS
+    assert_allclose([brakes.q_end[0], brakes.u_end[0]], [1.0, 0.0], atol=1e-12)
+    goes_on = end(
+        Bead(law=lambda s, t, x, v: jnp.where(v > 0, -s.k, 0.0) + jnp.where(t > 3, 1.0, 0.0)), ts=[4.0]
+    )
+    assert_allclose([goes_on.q_end[0], goes_on.u_end[0]], [1.25, 0.5], atol=1e-7)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0])
+def test_dry_friction_at_rest_is_said_to_stick(start):
+    found = end(Bead(law=lambda s, t, x, v: 0.3 - s.k * jnp.sign(v)), {"x_rate": start}, ts=[10.0])
+    assert found.result == results.STICKS
+    assert "friction=" in found.message
+    assert "the force along `x_rate`" in found.message
+    assert_allclose(found.t_end, 5 * start, atol=1e-6)
+    assert (
+        end(Bead(law=lambda s, t, x, v: 0.7 - s.k * jnp.sign(v)), {"x_rate": start}).result == results.SUCCESS
+    )
+
+
+def test_relations_within_events_and_inputs():
+    stops = Bead(event=lambda s, motion: jnp.where(motion.q.x > s.a, s.a + s.k - motion.q.x, 1.0))
+    t = lambda a: end(stops.replace(a=a), {"x_rate": 2.0}).t_end  # noqa: E731
+    assert_allclose([t(0.7), jax.grad(t)(0.7)], [0.6, 0.5], atol=1e-12)
+    bounces = Bead(
+        law=LAWS["sets in at a place"][0],
+        event=lambda s, motion: jj.Event(s.a + 0.2 - motion.q.x, jump={"x_rate": -motion.u.x_rate}),
+    )
+
+    def back(a):
+        """The force stops where the bead comes back."""
+        v = jnp.sqrt(1 - 2 * 0.5 * 0.2)
+        return a - (SPAN - a - 2 * (1 - v) / 0.5)
+
+    x = lambda a: end(bounces.replace(a=a)).q_end[0]  # noqa: E731
+    assert_allclose(
+        [x(0.7), jax.jacfwd(x)(0.7), jax.grad(x)(0.7)],
+        [back(0.7), jax.grad(back)(0.7), jax.grad(back)(0.7)],
+        atol=1e-11,
+    )
+
+
+class Driven(Bead):
+    inputs = jj.inputs("push")
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_numbers_of_inputs_move_the_times_of_their_relations(backend):
+    def x(a):
+        return end(Driven(), inputs={"push": lambda t: jnp.where(t > a, -0.5, 0.0)}, backend=backend).q_end[0]
+
+    assert_allclose(
+        [x(0.7), jax.jacfwd(x)(0.7), jax.grad(x)(0.7)], [2 - 0.25 * 1.3**2, 0.5 * 1.3, 0.5 * 1.3], atol=1e-12
+    )
+
+
+def test_guards_have_no_sides():
+    scene = Bead(
+        law=lambda s, t, x, v: -jnp.where(jnp.abs(x) > 1e-9, jnp.sin(x) / jnp.where(x == 0, 1.0, x), 1.0)
+    )
+    assert end(scene).crossings == 0
