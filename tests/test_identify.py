@@ -253,7 +253,7 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
     assert "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are too large" in warning
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=jj.huber()).warnings
-    assert "the residuals are smaller than the sigmas foretell" in warning
+    assert "the residuals are smaller than the sigmas predict" in warning
 
 
 @pytest.mark.filterwarnings("error")

@@ -31,7 +31,9 @@ Members = Int[np.ndarray, "members"]  # their numbers
 
 
 class ByMember:
-    """Base of dataclasses of arrays with an axis of members in front, and of parts that consist of such; None where a part is missing."""
+    """Base of dataclasses of arrays with a leading axis of members, and of parts with such arrays; None for
+    missing parts.
+    """
 
     def _parts(self) -> list:
         return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]

@@ -101,7 +101,7 @@ def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns
 
 
 def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return where f, of each member, is lowest between a and b, by golden section: the interval shrinks to
+    """Return the minimiser of f between a and b, for each member, by golden section: the interval shrinks to
     7e-5.
     """
     golden = (np.sqrt(5) - 1) / 2

@@ -44,7 +44,7 @@ Nodes = Int[np.ndarray, "_ _"]
 
 
 class Places(NamedTuple):
-    """Where parts of v are, and of the columns of D; the geometric rows are the first of g."""
+    """Locations of the parts of v, and of the columns of D; the geometric constraints come first in g."""
 
     qdot: np.ndarray
     udot: np.ndarray
@@ -171,8 +171,8 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
-    """Return how a scene's instants are computed, where these speeds are to be constant or independent;
-    `masses`: whether their mass matrix is needed.
+    """Return the program for a scene's instants, with these speeds constant or independent; `masses`: whether
+    their mass matrix is needed.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)

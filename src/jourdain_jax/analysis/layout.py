@@ -243,7 +243,9 @@ Kind = Literal["scene", "inertia", "start", "sensor"]  # a parameter, of a body'
 
 @dataclass(frozen=True)
 class Place:
-    """Where the entries of a parameter, of an initial value, or of a number of a sensor or actuator, are in a vector of such."""
+    """Locations of the entries of a parameter, an initial value, or a number of a sensor or actuator, in a
+    vector of unknowns.
+    """
 
     name: str  # of a sensor's or actuator's: "gyro.gain"
     shape: tuple[int, ...]
@@ -275,7 +277,7 @@ class Layout:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """How many are shared, and how many each run has."""
+        """Numbers of shared unknowns, and of those of each run."""
         return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
 
     @property

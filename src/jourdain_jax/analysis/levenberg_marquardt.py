@@ -41,7 +41,7 @@ class Linearised(ByMember):
 
 @dataclass(frozen=True)
 class Control:
-    """When to stop."""
+    """Criteria for stopping."""
 
     tolerance: float
     most_steps: int
@@ -52,7 +52,7 @@ class Control:
 
 @dataclass
 class Minimum(ByMember):
-    """Where the minimisation of each member ended, or is on its way."""
+    """The end, or the present state, of the minimisation of each member."""
 
     theta: ByUnknown
     at: Linearised
@@ -100,7 +100,7 @@ class Minimum(ByMember):
         return self if len(self.theta) == 1 else self.of([int(np.argmin(self.at.cost))])
 
     def agreeing(self, apart: float) -> int:
-        """Return how many members converged to a value at most so far `apart` from the lowest one."""
+        """Return the number of members that converged to a value at most `apart` from the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":

@@ -29,7 +29,7 @@ from jourdain_jax.analysis.unknowns import Places, Unknowns
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """How a fit was found by multiple shooting."""
+    """A fit by multiple shooting: its pieces, and how well they join."""
 
     pieces: tuple[int, ...]  # of each run
     continuity: Float[np.ndarray, ""]  # the largest jump from one piece to the next, in tolerances of the options, atol + rtol |x|

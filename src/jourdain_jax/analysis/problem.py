@@ -318,7 +318,7 @@ class Problem:
 
     @property
     def samples(self) -> int:
-        """How many samples there are of channels whose sigma is known, in one repeat."""
+        """Number of samples of channels with known sigma, in one repeat."""
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 

@@ -213,7 +213,7 @@ def informed(problem: Problem, found: Minimum, most: int) -> Informed:
 
 @dataclass(frozen=True, repr=False)
 class Profile(Printed):
-    """The rise of the sum of squares along one unknown, and the 95 % interval that follows from it."""
+    """The rise of the sum of squares along one unknown, and the resulting 95 % interval."""
 
     name: str
     unit: str

@@ -242,8 +242,8 @@ class Group:
                 yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """Return how many lanes at a time, with positions of their members and runs; these are filled up with
-        copies of the last.
+        """Yield the number of lanes at a time, with positions of their members and runs, padded with copies
+        of the last.
         """
         count = members * len(self.runs)
         # of many lanes those that are left last run eight at a time: these cost less than another program for fewer

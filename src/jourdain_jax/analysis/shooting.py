@@ -104,7 +104,7 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
 
 
 def numbers_of_filters(run: Experiment) -> int:
-    """Return how many numbers the low-passes of the sensors of a run that was `checked` have."""
+    """Return the number of states of the low-passes of the sensors of a `checked` run."""
     return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 

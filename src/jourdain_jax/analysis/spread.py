@@ -52,7 +52,7 @@ ADVICE = "`Fit.profiles` gives intervals that hold"
 
 @dataclass(frozen=True)
 class Rise:
-    """How far F may rise within an interval."""
+    """The permitted rise of F within an interval."""
 
     errors: ByUnknown  # standard errors that F alone foretells
     of_rise: ByUnknown  # f

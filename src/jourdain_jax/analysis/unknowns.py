@@ -55,7 +55,7 @@ class Unknowns:
 
     @property
     def prior_rows(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """M W of the unknowns that are estimated; all that are shared are."""
+        """Return M W of the estimated unknowns (all shared ones)."""
         rows, shared = np.diag(self.prior_weight[self.estimated]), len(self.whitening)
         rows[:shared] = self.whitening @ rows[:shared]
         return rows

@@ -186,7 +186,7 @@ class _AtStates:
         return Probes(self.graph, named_values(self.scene, self.t[which], q, u, self.inputs[which]))
 
     def probed(self, u_other) -> Probed:
-        """Return all that is looked at."""
+        """Return all probed quantities."""
         nodes = self.nodes
         return Probed(
             q=self.real(self.q),

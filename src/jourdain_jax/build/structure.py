@@ -189,8 +189,8 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def trust(scene: Scene) -> float:
-    """Return how far typical lengths count: a thousandth where parameters are traced, for the numbers that
-    stand in may be of another order.
+    """Return the reliability of typical lengths: a thousandth for traced parameters, whose replacements may
+    be of another order.
     """
     return 1e-3 if is_traced(scene) else 1.0
 

@@ -58,7 +58,7 @@ class OtherDeviceError(RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """A linear function of arrays that depends on others, `at` which it is taken."""
+    """A linear map between arrays, which depends on the arrays `at` which it is evaluated."""
 
     apply: Callable[[Sequence, Sequence], list]  # (at, arrays)
     shapes: Sequence[jax.ShapeDtypeStruct]  # of its values

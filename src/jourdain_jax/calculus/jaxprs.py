@@ -48,8 +48,8 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 
 
 def parts_of_scan(equation) -> tuple[int, int]:
-    """Return how many inputs of a scan are constants, and how many it carries: these have the same axes in
-    its body as outside, all others one less.
+    """Return the numbers of constant and of carried inputs of a scan: these have equal axes inside and
+    outside its body, all others one less.
 
     The parameters that report it are not the same in all versions of JAX.
     """

@@ -36,7 +36,7 @@ def jumps(
 
 
 def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return how much entries differ, in their sizes."""
+    """Return differences of entries, relative to their sizes."""
     with np.errstate(invalid="ignore", over="ignore"):
         difference = np.abs(b - a) / size
     return np.where(np.isfinite(difference), difference, 0.0)

@@ -55,7 +55,7 @@ def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
 
 
 def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Count:
-    """Return how many singular values exceed `cutoff` times the largest (default: the cut-off of their
+    """Return the number of singular values above `cutoff` times the largest (default: the cut-off of their
     dtype).
     """
     if sigma.shape[0] == 0:

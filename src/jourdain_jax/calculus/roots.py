@@ -36,7 +36,7 @@ Unknowns = Float[Array, "unknowns"]
 
 
 class Root(eqx.Module):
-    """Where an iteration ended, and whether that is a root."""
+    """The end of an iteration, and whether it is a root."""
 
     x: Unknowns
     converged: Flag

@@ -18,7 +18,7 @@ from jourdain_jax.calculus.roots import shortest
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Where matrices of rows have entries that are not zero by structure; values of these have a leading axis of states."""
+    """Structurally nonzero entries of matrices of rows; their values have a leading axis of states."""
 
     rows: np.ndarray  # of each entry
     columns: np.ndarray

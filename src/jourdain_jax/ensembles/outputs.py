@@ -39,7 +39,9 @@ def _check_name(output: Output, name, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class End(Output):
-    """The value of the coordinate or speed `name` where the motion ended: at its last time, or at an event. `unit`: text that is kept with it."""
+    """The value of the coordinate or speed `name` at the end of the motion: its last time, or an event.
+    `unit`: text stored with it.
+    """
 
     name: str
     unit: str = ""
@@ -155,7 +157,7 @@ class Happened(OfEvent):
 
 @dataclass(frozen=True)
 class Quantity(Output):
-    """A number that `function` makes of a `Trajectory` by operations of JAX, with its `unit` as a text.
+    """A number computed by `function` from a `Trajectory` by operations of JAX, with its `unit` as a text.
 
     jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """

@@ -52,7 +52,7 @@ class Lane(Printed):
 
 
 class StudyResult(Printed):
-    """What came out of a study, read from its folder.
+    """Results of a study, read from its folder.
 
     `store.path` is the folder; it opens with `xarray.open_zarr` too. Numbers cover the chunks that are done: `complete` says whether all are.
     `left_out`: numbers of chunks whose receipt is damaged or of another study, so that they do not count; `study.run` computes them again.
@@ -75,7 +75,7 @@ class StudyResult(Printed):
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """Names of what varies: parameters, and start values with `_at_start`."""
+        """Names of varying quantities: parameters, and start values with `_at_start`."""
         return tuple(self.store.study["varied"])
 
     @property
@@ -85,16 +85,18 @@ class StudyResult(Printed):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Lanes per result code, by its name; those that no lane has are left out."""
+        """Samples per result code, by its name, without unused codes."""
         return {name: int(count) for name, count in zip(CODES, self._tally.codes, strict=True) if count}
 
     @property
     def failed(self) -> np.ndarray:
-        """Numbers of the lanes that reached neither their end nor an event."""
+        """Numbers of the samples that reached neither their end nor an event."""
         return self._tally.failed
 
     def lane(self, number: int) -> Lane:
-        """The lane `number`: its parameters and start, what is kept of it, and `.simulate()`; IndexError where there is none."""
+        """Return sample `number`: its parameters and start, its stored results, and `.simulate()`; IndexError
+        if there is none.
+        """
         if not 0 <= number < len(self):
             raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}")
         if self.task is None:
@@ -115,19 +117,20 @@ class StudyResult(Printed):
         return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 
     def mean(self, output: str) -> float:
-        """Mean of an `output` over the lanes that have it."""
+        """Return the mean of an `output` over the samples that have it."""
         return float(self.statistics.mean[self._place(output)])
 
     def deviation(self, output: str) -> float:
-        """Standard deviation of an `output` over the lanes that have it."""
+        """Return the standard deviation of an `output` over the samples that have it."""
         return float(self.statistics.deviation[self._place(output)])
 
     def covariance(self, first: str, second: str) -> float:
-        """Covariance of the outputs `first` and `second` over the lanes that have both."""
+        """Return the covariance of the outputs `first` and `second` over the samples that have both."""
         return float(self.statistics.covariance[self._place(first), self._place(second)])
 
     def quantile(self, output: str, level: float) -> tuple[float, float]:
-        """Two numbers between which the quantile `level` (0 to 1) of an `output` lies: the cell of the histogram that holds it."""
+        """Return two bounds of the quantile `level` (0 to 1) of an `output`: the edges of its histogram cell.
+        """
         if not 0 <= level <= 1:
             raise ValueError(f"`level` is {level}, expected a number from 0 to 1")
         self._place(output)
@@ -245,7 +248,8 @@ class StudyResult(Printed):
 
 
 def load_study(path: str | os.PathLike) -> StudyResult:
-    """What is in the folder `path` of a study, finished or not, without its scene: `study.run` with the same arguments gives `.lane(k).simulate()` too.
+    """Open the results in the folder `path` of a study, finished or not, without its scene: `study.run` with
+    equal arguments also gives `.lane(k).simulate()`.
 
     A warning names chunks that are damaged: their lanes do not count (`left_out`). Raises ValueError where the folder holds no study, one of a format that this
     version does not know, or one whose description is damaged.
@@ -258,7 +262,8 @@ def load_study(path: str | os.PathLike) -> StudyResult:
 
 
 def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) -> StudyResult:
-    """Bring chunks from the folders `shares`, which hold shares of one study (`study.run(..., shard=(k, n))`), into the folder `path`, itself one of them.
+    """Copy chunks from the folders `shares`, which hold shares of one study (`study.run(..., shard=(k, n))`),
+    into the folder `path`, itself one of them.
 
     Chunks that are damaged are left out; what is missing afterwards is computed by `study.run` as always. Raises ValueError where a folder holds another study.
     """

@@ -46,7 +46,7 @@ class TaskFields(MotionFields, total=False):
 
 @dataclass(frozen=True, repr=False)
 class Study(Printed):
-    """Many motions of one scene, whose parameters or start values vary.
+    """Many motions of one scene with varying parameters or start values.
 
     - `scene`; `vary`: parameter -> how it varies; `start`: coordinate or speed -> how it varies, or one number for all lanes (the rest is solved for, as by
       `jj.start`; default: the scene's example). How: a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of a grid, or
@@ -152,7 +152,8 @@ class Study(Printed):
         command: str = "",
         **what: Unpack[TaskFields],
     ) -> StudyResult:
-        """Run what is missing of the study in the folder `path`, which is made where there is none, and open it.
+        """Compute the missing part of the study in the folder `path`, which is created if necessary, and open
+        it.
 
         The same call on the same folder goes on where an earlier one ended, in whatever way it ended. Results are bit-equal over `chunk`, order and
         interruptions.
@@ -195,7 +196,8 @@ class Study(Printed):
         return StudyResult(store, task)
 
     def mean_gradients(self, *, parameters: Sequence[str] = (), **what: Unpack[TaskFields]) -> MeanGradients:
-        """Derivatives of the means of all outputs with respect to the numbers of the distributions, and to the `parameters` that all lanes share.
+        """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
+        and to shared `parameters`.
 
         They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
         end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. This process computes it; nothing is

@@ -126,7 +126,9 @@ def inertias(scene: Scene, t, q) -> Inertias:
 
 
 def inertias_of(pose: Pose | Motion) -> Inertias:
-    """Masses and inertias of all bodies, from known poses; of an inertia its symmetric part, which is all that `w . I w` knows."""
+    """Return masses and inertias of all bodies, from known poses; inertias are symmetrised, since `w . I w`
+    depends only on that part.
+    """
     bodies = [body.body for body in pose.bodies.values()]
     zero = jnp.zeros((3, 3), pose.q.array.dtype)
     inertia = jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies])

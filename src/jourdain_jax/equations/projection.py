@@ -26,7 +26,7 @@ MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8
 
 
 class RowFunctions(NamedTuple):
-    """How rows, their slopes and the mass matrix of a scene are evaluated."""
+    """Evaluation of a scene's constraints, their derivatives and the mass matrix."""
 
     closures: Callable  # (scene, t, q) -> g, G
     rows: Callable  # (scene, t, q, u, inputs) -> phi, A

@@ -193,7 +193,7 @@ class ContactResponse(eqx.Module):
 
 @eqx.filter_jit  # traced once
 def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
-    """Return how contacts that switch respond to their forces at the state of a motion.
+    """Return the response of switching contacts to their forces at the state of a motion.
 
     M (impulses, free) = (A', Q - h) + A_p' (multipliers, so that A_p impulses = 0 and A_p free = -drift_p)       A_p: rows that always hold
     """

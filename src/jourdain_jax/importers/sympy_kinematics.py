@@ -24,7 +24,7 @@ _SAME = 1e-6  # of two velocities, relative
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a body is: expressions in all coordinates, the time and constants."""
+    """The pose of a body: expressions in all coordinates, the time and constants."""
 
     name: str
     mass: Any

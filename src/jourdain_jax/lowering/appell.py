@@ -30,7 +30,7 @@ from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 @dataclass(frozen=True)
 class Strategy:
-    """How the equations are built; all give the same values."""
+    """A strategy for building the equations; all give equal values."""
 
     explicit: bool = True
     most_terms: int = 0  # of a normal form; 0: none are made

@@ -15,7 +15,9 @@ from jourdain_jax.program.polynomial import NormalForms
 
 
 class KeptRows:
-    """How they are kept. `massless`: M may be singular; pivots of privileged speeds are judged at `probes` and, where needed, `far`."""
+    """The way in which constraints are kept. `massless`: M may be singular; pivots of privileged speeds are
+    judged at `probes` and, if necessary, `far`.
+    """
 
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
         self.graph, self.probes, self.far, self.independent = graph, probes, far, structure.independent
@@ -24,7 +26,7 @@ class KeptRows:
 
     @property
     def description(self) -> str:
-        """How the rows are kept, in words."""
+        """Description of how the constraints are kept."""
         if self.by_partition:
             return "all speeds in the state, their accelerations by privileged ones"
         return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")

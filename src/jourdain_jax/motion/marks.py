@@ -13,7 +13,7 @@ def nan_is_a_mark():
 
 
 def with_nan_as_a_mark(f: F) -> F:
-    """`f` run without a look for NaN."""
+    """Return `f`, run without checks for NaN."""
 
     @wraps(f)
     def run(*arguments, **named):

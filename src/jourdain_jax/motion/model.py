@@ -385,7 +385,7 @@ def _check(scene: Scene, structure: Structure, state, backend) -> None:
 
 
 def _cutoff(structure: Structure) -> float | None:
-    """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
+    """Return a wider cut-off if usually well conditioned constraints lose rank; None: round-off."""
     return passing_cutoff(real_type()) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 

@@ -64,7 +64,7 @@ def lanes_retried(
 
 
 def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
-    """Return how each lane is run again, with all earlier changes of its run; AS_ASKED: it is not."""
+    """Return the next retry of each sample, with all earlier changes of its run; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
     found, codes, fallback = np.full(lanes.result.shape, results.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
     for tried in np.unique(fallback).tolist():

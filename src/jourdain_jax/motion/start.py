@@ -132,8 +132,8 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
 
 
 def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple[tuple, bool]:
-    """Return what is left to the rows where values of names are given, or are guesses about which to look, as a `Guess` has it; and whether given values may
-    contradict each other.
+    """Return marks of coordinates and speeds left to the constraints, for given values and guesses as in
+    `Guess`; and whether given values may contradict each other.
 
     Privileged speeds that are not given stay at zero, unless a dependent speed is given. Rows may not find coordinates outside of the domain that are neither
     given nor guessed; but where the rows, affine in them, leave one place.

@@ -80,13 +80,12 @@ def features() -> dict[str, bool]:
 
 
 def lanes() -> int:
-    """Return how many doubles a vector register holds."""
+    """Return the number of doubles in a vector register."""
     return next((count for name, count in _LANES if features().get(name)), 2)
 
 
 def registers() -> int:
-    """Return how many values may be kept in vector registers; four of these are left to the working of
-    instructions.
+    """Return the number of values that may be kept in vector registers; four are reserved for instructions.
     """
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
@@ -134,7 +133,7 @@ def object_code(text: str, effort: int) -> bytes:
 
 
 def address(code: bytes, name: str) -> int:
-    """Return where a function of some machine code is, once it is in memory."""
+    """Return the address of a compiled function in memory."""
     with _lock:
         # an engine takes its target machine with it
         machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
@@ -150,7 +149,7 @@ _DIGEST = 32  # bytes
 
 
 def folder() -> Path | None:
-    """Return where code is kept; None where `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
+    """Return the cache folder; None if `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
     stated = os.environ.get("JOURDAIN_JAX_CACHE", "")
     if stated == "0":
         return None

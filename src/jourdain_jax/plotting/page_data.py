@@ -16,7 +16,7 @@ from jourdain_jax.scene.visuals import Visual
 
 @dataclass(frozen=True)
 class Display:
-    """How `show` shows motions."""
+    """Settings of `show`."""
 
     title: str
     follow: bool | None = None
@@ -36,7 +36,7 @@ class Numbers:
     count: int = 0
 
     def add(self, array) -> tuple[int, int]:
-        """Return where the array is kept, flat."""
+        """Store a flat array; return its place."""
         flat = np.asarray(array, np.float32).ravel()
         self.parts.append(flat)
         self.count += flat.size
@@ -138,9 +138,7 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """Return how many whole turns a body makes between saved times, beside the shortest way from one attitude
-    to the next: of a wheel that spins fast.
-    """
+    """Return whole turns of a body between saved times, besides the shortest rotation, for fast wheels."""
     if len(ts) < 2:
         return np.zeros(1)
     a, b = quaternions[:-1], quaternions[1:]

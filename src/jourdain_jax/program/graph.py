@@ -369,7 +369,9 @@ class Graph:
         return reciprocal and uses[node] == 1 and node not in outputs
 
     def operations(self, outputs: Iterable[int]) -> int:
-        """How many operations on varying quantities the outputs need; expressions of parameters alone do not count."""
+        """Return the number of operations on varying quantities for the outputs; expressions of parameters
+        only do not count.
+        """
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:

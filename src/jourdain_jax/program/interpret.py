@@ -35,7 +35,7 @@ Value: TypeAlias = Nodes | np.ndarray
 
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
-    """Outputs of a closed jaxpr at the given arguments."""
+    """Return outputs of a closed jaxpr at the given arguments."""
     return evaluated(closed, arguments, lambda equation, inputs: apply(graph, equation, inputs), lambda x, aval: np.asarray(x))
 
 

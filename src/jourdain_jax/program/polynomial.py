@@ -225,7 +225,7 @@ class NormalForms:
         return found
 
     def _first_square(self, monomial: Monomial) -> int | None:
-        """Return where an atom comes twice whose square is another polynomial."""
+        """Return the place of a squared atom whose square is another polynomial."""
         before = None
         for at, atom in enumerate(monomial):
             if atom == before and atom in self._squares:

@@ -12,7 +12,7 @@ from jourdain_jax.program.graph import Graph
 
 @dataclass(frozen=True)
 class Language:
-    """How expressions and statements are written."""
+    """Syntax of expressions and statements."""
 
     name: str  # the field of an operation that says how it is written
     library: str

@@ -73,7 +73,7 @@ Shape = Ball | Wheel | Ellipsoid
 
 
 class Touch(eqx.Module):
-    """Where a body is nearest to a ground."""
+    """The nearest point of a body to a ground."""
 
     point: Vector3  # m, inertial frame, of the body
     plane: Plane  # tangent to the ground

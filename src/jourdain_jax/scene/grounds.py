@@ -24,7 +24,7 @@ Tangents = Float[Array, "2 3"]
 
 
 class RigidMotion(TypedDict, total=False):
-    """How a ground lies and moves; all zero where nothing is said."""
+    """Pose and motion of a ground; zero by default."""
 
     origin: Vector  # m
     velocity: Vector  # m/s, of the material point at the origin
@@ -32,7 +32,7 @@ class RigidMotion(TypedDict, total=False):
 
 
 class _Ground(eqx.Module):
-    """Where a ground lies, and how it moves."""
+    """Pose and motion of a ground."""
 
     origin: Vector3  # m
     velocity: Vector3  # m/s, of the point at the origin

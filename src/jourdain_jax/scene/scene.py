@@ -295,7 +295,7 @@ class HeldFunction(eqx.Module):
         self.read = names_read(*filter(is_function, (function,)))
 
     def __call__(self, *args, **kwargs):
-        """Return what the function returns."""
+        """Return the function's result."""
         return self.function(*args, **kwargs)
 
 

@@ -26,7 +26,7 @@ class Faces:
 
 
 class Look(TypedDict, total=False):
-    """Where a shape is, and how it is painted; see `Visual`."""
+    """Place and colour of a shape; see `Visual`."""
 
     at: Vector  # m
     turn: Matrix3

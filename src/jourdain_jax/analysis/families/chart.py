@@ -94,8 +94,8 @@ def stability_chart(
 
 @partial(compiled, options=RUN_SELDOM)
 def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
-    """Return the point of a scene with this value, all that the program takes there, and the pseudo-inverse
-    of the equations' slopes.
+    """Return the point of a scene with this value, the arguments of the program there, and the pseudo-inverse
+    of the equations' derivatives.
     """
     scene = scene.replace(**{first: x})
     X, inverse, *found = followed_to(special, scene)

@@ -135,7 +135,7 @@ class CriticalPoint(Printed, eqx.Module):
 
     @property
     def speed(self) -> Float[Array, "*batch"]:
-        """How fast the point (x, y) of the scene moves, m/s."""
+        """Speed of the point (x, y) of the scene, m/s."""
         return jnp.hypot(self.state["x_rate"], self.state["y_rate"])
 
     @property
@@ -172,7 +172,7 @@ class _Program:
 
     @cached_property
     def of(self) -> Sloped:
-        """Values of the equations with slopes by z, a, b and S."""
+        """Return values of the equations with derivatives, from z, a, b and S."""
         return Sloped(*self._sloped)
 
 

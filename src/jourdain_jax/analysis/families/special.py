@@ -38,8 +38,8 @@ class Test:
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Return where a test with the values f at three neighbours, the second at zero, nearly vanishes by a
-    parabola through them; None where it changes its sign.
+    """Return the location where a test with the values f at three neighbours, the second at zero, nearly
+    vanishes, by a parabola; None at a change of sign.
     """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:

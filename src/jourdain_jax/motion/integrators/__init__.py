@@ -1,1 +1,3 @@
-"""How a motion is integrated: our loop over steps and its adjoint, explicit and implicit methods, events, knots of the inputs."""
+"""Integration of a motion: our loop over steps and its adjoint, explicit and implicit methods, events, knots
+of the inputs.
+"""

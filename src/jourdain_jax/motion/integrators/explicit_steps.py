@@ -43,7 +43,7 @@ class Method:
 
     @property
     def needed(self) -> int:
-        """How many stages a step takes: without a last one that nothing else needs."""
+        """The number of stages of a step, without an unused last one."""
         at_y_1 = np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0
         return len(self.c) - int(at_y_1 and self.b_error[-1] == 0)
 

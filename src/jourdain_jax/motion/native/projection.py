@@ -244,7 +244,9 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
 
 
 def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
-    """As `equations/scaling.speed_scale`, of an entry on the diagonal of the mass matrix."""
+    """Return the scale of a speed, as in `equations/scaling.speed_scale`, from an entry on the diagonal of
+    the mass matrix.
+    """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 

@@ -125,7 +125,7 @@ class Watched(NamedTuple):
 
 
 class VectorField(eqx.Module):
-    """How a scene's state is packed, unpacked, differentiated in time and projected. All choices are static.
+    """Packing, unpacking, rates and projection of a scene's state. All choices are static.
 
     `fixed`: the scene's part of the rates, computed once per motion; `inputs`: their values at the time, for `rates` and `rates_and_pivots` from `now`.
     """
@@ -168,7 +168,9 @@ class VectorField(eqx.Module):
 
     @property
     def needs_pivot(self) -> bool:
-        """Whether a small pivot, or one that changes sign, ends a motion: a state that is all there continues, with a warning."""
+        """Whether a small pivot, or one that changes sign, ends a motion; a full state continues, with a
+        warning.
+        """
         return True
 
     @property
