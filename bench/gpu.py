@@ -76,12 +76,12 @@ def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
     """Every call of machine code in `f` of so many spread lanes on the CPU, with its arguments and results."""
     calls: list[tuple] = []
 
-    def lowered(ctx, *values, handler, lanes, threads, shapes, kernel):
+    def lowered(ctx, *values, handler, lanes, threads, operands, **how):
         results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ctx.avals_out]
-        how = {"handler": handler, "lanes": lanes, "threads": threads, "shapes": shapes, "kernel": kernel}
+        how |= {"handler": handler, "lanes": lanes, "threads": threads, "operands": operands}
 
         def call(*values):
-            found = jax.ffi.ffi_call(handler(lanes, threads), results)(*values)
+            found = jax.ffi.ffi_call(handler(lanes, threads), results)(*operands.side_by_side(*values))
             jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), values, found)
             return found
 

@@ -94,6 +94,32 @@ def _end(speed, model=jj.models.ChaplyginSleigh()):  # noqa: B008
     return jj.simulate(model, {"x_rate": speed, "heading_rate": 0.3}, ts=[0.1]).q_end
 
 
+def test_lanes_come_last_and_what_they_share_is_given_once():
+    with gpu_twin.in_place_of_a_gpu():
+        text = (
+            jax.jit(jax.vmap(jax.grad(lambda speed: _end(speed)[0])))
+            .lower(np.linspace(0.4, 0.6, 7))
+            .as_text()
+        )
+    calls = [*re.findall(r"operand_layouts = (.*), result_layouts = (.*)} : \((.*)\) -> \((.*)\)\n", text)]
+    forth, back = (next(call for call in calls if call[2].count(",") == count) for count in (2, 4))
+    # starts of 7 lanes, what they share, times; states of 2 times and ends
+    assert re.fullmatch(r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<2xf64>", forth[2])
+    assert forth[:2] == (
+        "[dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>, dense<0> : tensor<1xindex>]",
+        "[dense<[0, 2, 1]> : tensor<3xindex>, dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>]",
+    )
+    assert re.fullmatch(
+        r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<7x2x\d+xf64>, tensor<7x\d+xf64>, tensor<2xf64>",
+        back[2],
+    )
+
+
+def test_no_lanes_are_no_call_that_fails():
+    with gpu_twin.in_place_of_a_gpu():
+        assert jax.jit(jax.vmap(_end))(np.zeros(0)).shape[0] == 0
+
+
 def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
     run = lambda: jax.jit(jax.vmap(_end))(np.linspace(0.4, 0.6, 3))  # noqa: E731
     expected = run()
@@ -140,11 +166,20 @@ def test_a_model_says_on_which_devices_it_is_integrated():
             assert said in str(jj.build(jj.models.ChaplyginSleigh()))
 
 
-@pytest.mark.parametrize("sampler", ["random", "sobol", "saltelli"])
+@pytest.mark.parametrize("sampler", ["random", "latin-hypercube", "sobol", "saltelli"])
 def test_samples_drawn_on_a_device_have_the_bits_of_the_host(sampler):
-    design = jj.Design({"a": jj.Normal(2.0, 0.7), "b": jj.Uniform(-1.0, 3.3)}, sampler=sampler, samples=40_000, seed=2**62 + 11)
-    found = design._at(np.arange(7, 40_000), on_device=True)
-    for name, column in design.values(7, 40_000).items():
+    kinds = {
+        "a": jj.Normal(2.0, 0.7),
+        "b": jj.Uniform(-1.0, 3.3),
+        "c": jj.LogNormal(2.0, 0.4),
+        "d": jj.LogUniform(0.01, 30.0),
+    }
+    correlation = None if sampler == "saltelli" else {("a", "b"): 0.6, ("b", "c"): -0.3, ("a", "d"): 0.5}
+    # XLA for CPUs, as these tests ask for it, refuses loops over many numbers, by which the hypercube is walked
+    count = 402 if sampler == "latin-hypercube" else 40_002
+    design = jj.Design(kinds, sampler=sampler, samples=count, seed=2**62 + 11, correlation=correlation)
+    found = design._at(np.arange(7, count), on_device=True)
+    for name, column in design.values(7, count).items():
         assert isinstance(found[name], jax.Array)
         np.testing.assert_array_equal(found[name], column)
 
@@ -165,8 +200,9 @@ one, speeds = jax.vmap(jax.value_and_grad(end)), np.linspace(0.4, 0.6, 6)
 expected = jax.jit(one)(speeds)
 mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
 with gpu_twin.in_place_of_a_gpu() as launched:
-    found = jax.jit(jax.shard_map(one, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))(speeds)
-    second = jax.jit(one)(jax.device_put(speeds, jax.devices()[1]))
+    shared = jax.jit(jax.shard_map(one, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))
+    found = jax.block_until_ready(shared(speeds))
+    second = jax.block_until_ready(jax.jit(one)(jax.device_put(speeds, jax.devices()[1])))
     assert len(found[0].devices()) == 2 and second[0].devices() == {jax.devices()[1]} and 3 in launched.values()
 np.testing.assert_array_equal(found, expected)
 np.testing.assert_array_equal(second, expected)

@@ -37,7 +37,7 @@ from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.integrators import event_search
 from jourdain_jax.motion.integrators.explicit_steps import method_of
 from jourdain_jax.motion.native import native_motion, step
-from jourdain_jax.motion.native.loop import Start
+from jourdain_jax.motion.native.start import Start
 from jourdain_jax.motion.setup import Solved
 from jourdain_jax.motion.vector_fields.field import Integrated
 from jourdain_jax.program.evaluate import Probes
@@ -372,7 +372,7 @@ MUTANTS = [
     Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", projected_steps_stay_on_a_circle, "circle"),
     Mutant("no step ends at a knot", Loop, "saving", "jnp.minimum(goal * direction, jnp.min(ahead, axis=0))", "goal * direction", steps_end_at_knots, "knot"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", an_event_within_a_step_ends_the_motion, "passed over"),
-    Mutant("the first step without a bound", Start, "rows", "jnp.minimum(jnp.abs(first), longest)", "jnp.abs(first)", LONGEST, "the longest step"),
+    Mutant("the first step without a bound", Start, "numbers", "jnp.minimum(jnp.abs(first), longest)", "jnp.abs(first)", LONGEST, "the longest step"),
     Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "reach_of_noise(w, span) * rate", "rate", LEAVES, "leaves"),

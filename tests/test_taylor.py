@@ -39,7 +39,7 @@ def coefficients(graph: Graph, s, outputs, at, known=None) -> np.ndarray:
         nodes = [graph.mul(graph.const(k), x[k]) for k in range(1, ORDER + 1) for x in series]
         start = dict.fromkeys(moved, w.number(0.0)) | {s: w.load(arguments[0].data)}
         for i, x in enumerate(written(w, graph, nodes, given | start)):
-            w.store(x, found[0], i)
+            w.store(x, found[0].data, i)
 
     clock = graph.input("clock", True)
     ffi.write_handler(w, 1, 1, block)

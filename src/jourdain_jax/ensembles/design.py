@@ -6,21 +6,20 @@ of normal ones is the one stated.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
-from jourdain_jax.ensembles.distributions import Distribution, Levels, Normal, Uniform
+from jourdain_jax.ensembles.distributions import Distribution, Levels
+from jourdain_jax.ensembles.rounded_functions import correlated
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
 from jourdain_jax.scene.names import check_names, nearest
 from jourdain_jax.scene.printing import Printed
 
-special = module_on_first_use("scipy.special")
 GRID, TABLE = "grid", "table"
 MOST_SAMPLES = 2**53  # whole numbers that are floats
 MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
@@ -148,9 +147,9 @@ class Design(Printed):
         return self._at(np.arange(first, last))
 
     def _at(self, index, on_device: bool = False) -> dict:
-        """The values of samples with these numbers, in order; where it may be `on_device`, arrays of JAX.
+        """The values of samples with these numbers, in order.
 
-        That is so where all is made of words and functions with the bits of the host: normal and even quantities that are not correlated.
+        What is drawn `on_device` are arrays of JAX with the bits of the host; grids and tables draw nothing.
         """
         if self.sampler == TABLE:
             return {name: column[index] for name, column in self.variables.items()}
@@ -158,25 +157,23 @@ class Design(Printed):
             shape = [len(levels.levels) for levels in self.variables.values()]
             places = np.unravel_index(index, shape)
             return {name: np.asarray(levels.levels)[place] for (name, levels), place in zip(self.variables.items(), places, strict=True)}
-        draw, values = SAMPLERS[self.sampler], Distribution.values
-        alike = self.sampler != "latin-hypercube" and all(isinstance(x, Normal | Uniform) for x in self.variables.values())
-        if on_device and alike and self._factor is None:
-            index, draw, values = jnp.asarray(index), jax.jit(draw, static_argnums=(0, 2, 3)), jax.jit(values, static_argnums=0)
-        u = self._drawn(index, draw)
+        u, values = self._drawn(jnp.asarray(index) if on_device else index), Distribution.values
+        if on_device:
+            values = jax.jit(values, static_argnums=0)
         return {name: values(distribution, u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
 
     def probabilities(self, first: int, last: int) -> np.ndarray:
         """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN for grids, tables."""
         if self.sampler in (TABLE, GRID):
             return np.full((last - first, len(self.variables)), np.nan)
-        return self._drawn(np.arange(first, last), SAMPLERS[self.sampler])
+        return self._drawn(np.arange(first, last))
 
-    def _drawn(self, index, draw: Callable):
+    def _drawn(self, index):
+        draw, correlate = SAMPLERS[self.sampler], correlated
+        if isinstance(index, jax.Array):
+            draw, correlate = jax.jit(draw, static_argnums=(0, 2, 3)), jax.jit(correlate)
         u = draw(int(self.seed), index, len(self.variables), len(self))
-        if self._factor is None:
-            return u
-        # row by row: a product of matrices may round differently with the number of rows
-        return special.ndtr(np.einsum("ij,kj->ki", self._factor, special.ndtri(u)))
+        return u if self._factor is None else correlate(self._factor, u)
 
     def _text(self) -> str:
         lines = [f"Design: {len(self)} samples, {self.sampler}" + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")]

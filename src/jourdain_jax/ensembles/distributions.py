@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jourdain_jax.calculus.reals import checked_known
-from jourdain_jax.ensembles.rounded_functions import normal_quantile, product
+from jourdain_jax.ensembles.rounded_functions import exponential, normal_quantile, product
 
 
 class Distribution:
@@ -84,7 +84,7 @@ class LogNormal(Distribution):
 
     @staticmethod
     def _inverse(u, median, sigma):
-        return median * np.exp(sigma * normal_quantile(u))
+        return median * exponential(product(sigma, normal_quantile(u), u), u)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class LogUniform(Distribution):
 
     @staticmethod
     def _inverse(u, low, high):
-        return low * (high / low) ** u
+        return low * exponential(product(np.log(high / low), u, u), u)
 
 
 @dataclass(frozen=True)

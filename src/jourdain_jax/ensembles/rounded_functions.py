@@ -1,8 +1,9 @@
 """Functions of doubles that have the same bits in NumPy on the host and by JAX on a device: one text, each operation of which is rounded by itself.
 
 Sums, quotients and roots are rounded alike everywhere. Of a product that is added to something a compiler makes one operation with one rounding, on some
-machines: `product` keeps it apart. The inverse of the normal distribution is that of Cephes, as in SciPy, with the logarithm of fdlibm (errors below one unit
-in the last place) and one pair of polynomials for all of a tail (right to 3e-15 for u > 1e-16, to 1e-13 for u > 1e-22).
+machines: `product` keeps it apart. The normal distribution and its inverse are those of Cephes, as in SciPy,
+with the exponential and the logarithm of fdlibm (errors of one unit in the last place and below), and one pair of
+polynomials for all of a tail of the inverse (right to 3e-15 for u > 1e-16, to 1e-13 for u > 1e-22).
 """
 
 import jax
@@ -13,6 +14,10 @@ _LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # in t
 _LOG = (
     1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01, 2.222219843214978396e-01, 2.857142874366239149e-01,
     3.999999999940941908e-01, 6.666666666666735130e-01,
+)  # fmt: skip
+_EXP = (
+    4.13813679705723846039e-08, -1.65339022054652515390e-06, 6.61375632143793436117e-05,
+    -2.77777777770155933842e-03, 1.66666666666666019037e-01,
 )  # fmt: skip
 _TAIL, _ROOT = 0.13533528323661269189, 2.50662827463100050242  # exp(-2), sqrt(2 pi)
 _MIDDLE = (
@@ -27,19 +32,46 @@ _OUTER = (
      -1.42182922854787788574e-1, -3.80806407691578277194e-2, -9.33259480895457427372e-4),
 )  # fmt: skip
 
+_ERROR = (
+    (9.60497373987051638749e0, 9.00260197203842689217e1, 2.23200534594684319226e3, 7.00332514112805075473e3,
+     5.55923013010394962768e4),
+    (1.0, 3.35617141647503099647e1, 5.21357949780152679795e2, 4.59432382970980127987e3, 2.26290000613890934246e4,
+     4.92673942608635921086e4),
+)  # fmt: skip
+_FAR = (
+    (2.46196981473530512524e-10, 5.64189564831068821977e-1, 7.46321056442269912687e0, 4.86371970985681366614e1,
+     1.96520832956077098242e2, 5.26445194995477358631e2, 9.34528527171957607540e2, 1.02755188689515710272e3,
+     5.57535335369399327526e2),
+    (1.0, 1.32281951154744992508e1, 8.67072140885989742329e1, 3.54937778887819891062e2, 9.75708501743205489753e2,
+     1.82390916687909736289e3, 2.24633760818710981792e3, 1.65666309194161350182e3, 5.57535340817727675546e2),
+)  # fmt: skip
+_FARTHER = (
+    (5.64189583547755073984e-1, 1.27536670759978104416e0, 5.01905042251180477414e0, 6.16021097993053585195e0,
+     7.40974269950448939160e0, 2.97886665372100240670e0),
+    (1.0, 2.26052863220117276590e0, 9.39603524938001434673e0, 1.20489539808096656605e1, 1.70814450747565897222e1,
+     9.60896809063285878198e0, 3.36907645100081516050e0),
+)  # fmt: skip
+
 
 def library(x):
     """The library of the array `x`: NumPy, or JAX's."""
     return jnp if isinstance(x, jax.Array) else np
 
 
-def product(a, b, u):
-    """a b, rounded by itself. `u`: an argument of the program, above zero, of which a compiler does not know that: its sign, 0, goes into that of a b."""
-    found = a * b
-    if not isinstance(found, jax.Array):
-        return found
+def apart(x, u):
+    """Return x, which a compiler leaves as it is.
+
+    `u`: an argument of the program, above zero, of which it does not know that: its sign, 0, goes into that of x.
+    """
+    if not isinstance(u, jax.Array):
+        return x
     bits = jax.lax.bitcast_convert_type
-    return bits(bits(found, jnp.uint64) ^ (bits(u, jnp.uint64) >> 63), found.dtype)
+    return bits(bits(jnp.asarray(x), jnp.uint64) ^ (bits(u, jnp.uint64) >> 63), u.dtype)
+
+
+def product(a, b, u):
+    """Return a b, rounded by itself; `u` as in `apart`."""
+    return apart(a * b, u)
 
 
 def _polynomial(coefficients, x, u):
@@ -59,6 +91,49 @@ def _logarithm(x, u):
     z, half = s * s, product(0.5 * f, f, u)
     rest = product(s, half + product(z, _polynomial(_LOG, z, u), u), u) + product(k, _LN2_REST, u)
     return product(k, _LN2, u) - ((half - rest) - f)
+
+
+def exponential(x, u):
+    """Return e^x; of complex numbers on the host alone."""
+    if np.iscomplexobj(x):
+        return exponential(x.real, u) * np.exp(1j * x.imag)
+    xp = library(x)
+    x = xp.clip(x, -800.0, 800.0)
+    k = xp.rint(x * (1.0 / float(np.log(2.0))))
+    high, low = x - product(k, _LN2, u), product(k, _LN2_REST, u)
+    r = high - low
+    rr = r * r
+    c = r - product(rr, _polynomial(_EXP, rr, u), u)
+    return xp.ldexp(1.0 - ((low - r * c / (2.0 - c)) - high), k.astype(int))
+
+
+def normal_probability(x, u):
+    """Return the probability that a standard normal number lies below x; `u` as in `apart`, of the shape of x."""
+    xp = library(x)
+    z = xp.abs(x) * 0.5**0.5
+    near = xp.minimum(z, 1.0)
+    zz = near * near
+    top, bottom = (_polynomial(of, zz, u) for of in _ERROR)
+    middle = 0.5 * near * top / bottom
+    far, farther = ([_polynomial(of, z, u) for of in each] for each in (_FAR, _FARTHER))
+    z = xp.where(z < 8.0, far[0] / far[1], farther[0] / farther[1]) * exponential(-(z * z), u)
+    tail = xp.where(xp.abs(x) * 0.5**0.5 < 1.0, 0.5 - middle, 0.5 * z)
+    return xp.where(x > 0.0, 1.0 - tail, tail)
+
+
+def correlated(factor, u):
+    """Return the probabilities of correlated numbers from those of independent ones, samples by variables.
+
+    Normal numbers of these probabilities are multiplied by the rows of `factor`, one after another: a product of
+    matrices may round otherwise.
+    """
+    xp, z, rows = library(u), normal_quantile(u), []
+    for row in range(u.shape[1]):
+        total = product(factor[row, 0], z[:, 0], u[:, 0])
+        for k in range(1, row + 1):
+            total = total + product(factor[row, k], z[:, k], u[:, 0])
+        rows.append(normal_probability(total, u[:, 0]))
+    return xp.stack(rows, axis=1)
 
 
 def _outer_quantile(y, u):

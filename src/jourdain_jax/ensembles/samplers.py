@@ -7,8 +7,8 @@ sobol            Sobol's sequence with Owen's linear scrambling and a digital sh
 saltelli         for Sobol' indices of d variables: points (A_j, B_j) of that sequence in 2 d dimensions; samples j (d + 2) + i are A_j,
                  then A_j with the entry of one variable from B_j, one after another, then B_j (Saltelli et al. 2010)
 
-Each is a function of an array of whole numbers k in order, of NumPy, and all but the hypercube of JAX on a device, too, with the same bits: what is computed
-are words.
+Each is a function of an array of whole numbers k in order, of NumPy, and of JAX on a device, too, with the same
+bits: what is computed are words.
 """
 
 from functools import lru_cache
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.ensembles.rounded_functions import library
+from jourdain_jax.ensembles.rounded_functions import apart, library
 
 qmc = module_on_first_use("scipy.stats.qmc")
 MOST_SOBOL = 2**30  # points of the sequence, of 30 bits
@@ -58,25 +58,38 @@ def random(seed: int, index, variables: int, samples: int):
     return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
 
 
-def permuted(seed: int, number: int, index: np.ndarray, count: int) -> np.ndarray:
+def permuted(seed: int, number: int, index, count: int):
     """Where the permutation `number` of 0 to count - 1 sends `index`."""
     half = np.uint64(max(1, (max(count - 1, 1).bit_length() + 1) // 2))
     mask = np.uint64((1 << int(half)) - 1)
     keys = _mixed(np.random.Philox(key=seed + (1 << 64)).advance(number * 2).random_raw(6) * _GOLDEN)
-    found, walking = index.astype(np.uint64), np.ones(index.shape, bool)
-    while walking.any():
-        left, right = found[walking] >> half, found[walking] & mask
+
+    def walked(place):
+        left, right = place >> half, place & mask
         for key in keys:
             left, right = right, left ^ (_mixed(right * _GOLDEN + key) & mask)
-        found[walking] = (left << half) | right
-        walking &= found >= count
+        return (left << half) | right
+
+    found, end = walked(index.astype(np.uint64)), np.uint64(count)
+    if isinstance(index, jax.Array):
+        found = jax.lax.while_loop(
+            lambda x: jnp.any(x >= end), lambda x: jnp.where(x >= end, walked(x), x), found
+        )
+    else:
+        while (outside := found >= end).any():
+            found[outside] = walked(found[outside])
     return found.astype(np.int64)
 
 
 def latin_hypercube(seed: int, index, variables: int, samples: int):
-    """The samples with these numbers of a Latin hypercube of `samples` strata, shape (len(index), variables); on the host alone."""
-    strata = np.stack([permuted(seed, number, index, samples) for number in range(variables)], axis=1)
-    return (strata + random(seed, index, variables, samples)) / samples
+    """The samples with these numbers of a hypercube of `samples` strata, shape (len(index), variables)."""
+    strata = library(index).stack(
+        [permuted(seed, number, index, samples) for number in range(variables)], axis=1
+    )
+    share = random(seed, index, variables, samples)
+    return (strata + share) / apart(
+        float(samples), share
+    )  # a compiler does not divide by a number that it knows
 
 
 @lru_cache(maxsize=16)

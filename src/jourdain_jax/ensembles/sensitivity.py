@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jourdain_jax.ensembles.design import special
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.scene.printing import Printed
+
+special = module_on_first_use("scipy.special")
 
 
 @dataclass(frozen=True, repr=False)

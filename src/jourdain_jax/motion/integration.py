@@ -14,6 +14,7 @@ scene: it went through a singular position, or over a feature, without notice. A
 although the start meets all of them; where phi_0 = 0 they never do.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -30,10 +31,10 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
-from jourdain_jax.motion.native import values
+from jourdain_jax.motion.native import native_motion, values
 from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.put_on_rows import State, projected
-from jourdain_jax.motion.setup import Begun, Passed, Setup, Solved, times_fit
+from jourdain_jax.motion.setup import Begun, Passed, Plain, Setup, Solved, times_fit
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.over_times import Phases
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -52,6 +53,8 @@ def _one_motion(setup: Setup) -> Trajectory:
     given = _in_contact(_with_machine_code(_prepared(setup)))
     setup, asked = _entered(given)
     begun, fitting = _begin(setup), setup.fitting()
+    if jax.default_backend() != "cpu" and not setup.reason_against_machine_code:
+        begun = replace(begun, plain=_plain(given))
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
 
@@ -80,10 +83,14 @@ def _with_machine_code(setup: Setup) -> Setup:
     return setup._replace(field=replace(field, native=True))
 
 
-def integrate_lanes(setups: Setup) -> Trajectory:
-    """Return the motions of all lanes: `own_steps.width` lanes at a time where the rates are a scalar
-    program, otherwise under `vmap`.
+def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
+    """Return the motions of all lanes: `own_steps.width` at a time by a scalar program, else under `vmap`.
+
+    `lane`: the setup of what varies. On a GPU numbers that do not vary have no lanes: kernels are given them once.
     """
+    setups = eqx.filter_vmap(lane)(*varied)
+    if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
+        return eqx.filter_vmap(lambda *own: _one_motion(lane(*own)))(*varied)
     given = eqx.filter_vmap(_in_contact)(_with_machine_code(_prepared(setups)))
     setups, asked = eqx.filter_vmap(_entered)(given)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
@@ -99,6 +106,21 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     leaves, treedef = jax.tree.flatten(numbers)
     each, asked = entered(*lanes_first(leaves))  # also of what all motions share
     return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
+
+
+def _plain(setup: Setup) -> Plain:
+    """Return the numbers of a setup before it is `_entered`: those that all motions share have no lanes."""
+    setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
+    own = setup.fitting()
+    times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
+    return Plain(
+        times,
+        tuple(
+            native_motion.known_of(
+                (setup.field, setup.scene, setup.inputs, setup.field.fixed(setup.scene), setup.t0)
+            )
+        ),
+    )
 
 
 def _in_contact(setup: Setup) -> Setup:

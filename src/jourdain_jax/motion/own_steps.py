@@ -29,8 +29,9 @@ from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Impl
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.functions import reason_against_derivatives
 from jourdain_jax.motion.native.layout import Form
-from jourdain_jax.motion.native.loop import OF_SAMPLES, Start, flow
+from jourdain_jax.motion.native.loop import OF_SAMPLES, flow
 from jourdain_jax.motion.native.native_motion import driven, numbers_of, others_of
+from jourdain_jax.motion.native.start import Start
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
@@ -155,8 +156,11 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
     goals, later = setup.goals(setup.ts), start - numbers(start)
     y0 = mover(begun.args)(begun.y0, start, -later)
-    setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
-    found = run(setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, numbers(start)))))
+    times = begun.plain.times if begun.plain else {name: getattr(setup, name) for name in ("ts", "t0", "t1")}
+    setup = setup._replace(**jax.tree.map(numbers, times))
+    found = run(
+        setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, setup.t0)))
+    )
     passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
     transitions = passed.times(numbers(start), setup.ts, number[:-1], direction)
     moved = mover((field, scene, in_phases(inputs, transitions, passed.modes, direction), fixed, start))

@@ -158,6 +158,13 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 
 
+class Plain(NamedTuple):
+    """Numbers of a motion as they were given: without derivatives, and what a batch shares has no lanes."""
+
+    times: dict  # as of a `Setup`
+    known: tuple  # `native_motion.known_of`
+
+
 class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
 
@@ -166,6 +173,7 @@ class Begun(eqx.Module):
     start: State
     args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated
+    plain: Plain | None = None  # where kernels of a GPU are given numbers once
 
 
 def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":

@@ -116,16 +116,19 @@ def product(w: Writer, x: Given, but: int) -> Value:
     return w.load(total, type="i64")
 
 
-def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
-    """Return a handler that calls `body` with all arguments, and pointers to the data of all results; on a
-    GPU the kernel that does so.
-    """
+def write_handler(
+    w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
+) -> None:
+    """Write a handler that calls `body` with all arguments and results; on a GPU the kernel that does so."""
     if w.device:
         return _write_kernel(w, arguments, results, body)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         answer_metadata(w, frame)
         arrays, returned = w.load(frame, ARGS, "ptr"), w.load(frame, RETS, "ptr")
-        body([given(w, w.load(arrays, k, "ptr")) for k in range(arguments)], [given(w, w.load(returned, k, "ptr")).data for k in range(results)])
+        body(
+            [given(w, w.load(arrays, k, "ptr")) for k in range(arguments)],
+            [given(w, w.load(returned, k, "ptr")) for k in range(results)],
+        )
         w.give(Value(w, "ptr", "null"))
 
 
@@ -143,13 +146,15 @@ def answer_metadata(w: Writer, frame: Value) -> None:
         w.give_where(asked, Value(w, "ptr", "null"))
 
 
-def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
+def _write_kernel(
+    w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
+) -> None:
     """`kernel(words)`, which every thread of a GPU runs; the last result is memory of the call's own."""
     with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
         words = Value(w, "ptr", "%words")
         each = [Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
         w.own = each[-1].data, last_size(w, each[-1])
-        body(each[:arguments], [x.data for x in each[arguments:-1]])
+        body(each[:arguments], each[arguments:-1])
         w.give()
 
 
@@ -241,16 +246,43 @@ def share(w: Writer, job: Value, count: Value) -> None:
             w.external("pthread_join", "i32", w.load(others, number, "i64"), nothing)
 
 
-def taken_in(w: Writer, count: int, numbers: Value, rows: Value, lane: Value) -> None:
-    """Copy so many contiguous numbers of a sample into its rows."""
-    with w.counted(0, count) as row:
-        w.store(w.load(numbers, row, "double"), rows, row * w.lanes + lane)
+class OfLane(NamedTuple):
+    """The numbers of one lane in an array of a batch: where the first one is, and how far the next is from it."""
+
+    first: Value
+    apart: Value | int
+
+    def place(self, number: Value | int) -> Value:
+        """Return where the number with this index is."""
+        return self.first.writer.at(self.first, number if self.apart == 1 else number * self.apart, "double")
+
+    def after(self, count: Value | int) -> "OfLane":
+        """Return the numbers after so many."""
+        return OfLane(self.place(count), self.apart)
 
 
-def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: Value) -> None:
-    """Copy so many rows of a sample into contiguous memory."""
+def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
+    """Return what an array holds of one of `count` lanes: so many numbers, lane after lane on a CPU.
+
+    On a GPU lanes come last: neighbouring threads, which begin and save together, touch neighbouring words.
+    """
+    return (
+        OfLane(w.at(array, lane, "double"), count)
+        if w.device
+        else OfLane(w.at(array, lane * numbers, "double"), 1)
+    )
+
+
+def taken_in(w: Writer, count: int, numbers: OfLane, rows: Value, lane: Value) -> None:
+    """Copy so many numbers of a lane into its rows."""
     with w.counted(0, count) as row:
-        w.store(w.load(rows, row * w.lanes + lane, "double"), numbers, row)
+        w.store(w.load(numbers.place(row), type="double"), rows, row * w.lanes + lane)
+
+
+def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane) -> None:
+    """Copy so many rows of a lane into its numbers."""
+    with w.counted(0, count) as row:
+        w.store(w.load(rows, row * w.lanes + lane, "double"), numbers.place(row))
 
 
 def write_rows(w: Writer, given: int, returned: int) -> None:
@@ -266,21 +298,27 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
             with w.counted(0, w.lanes) as lane:
                 number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
-                taken_in(w, given, w.at(rows, w.where(number < count, number, count - 1) * given, "double"), state, lane)
+                taken_in(
+                    w,
+                    given,
+                    of_lane(w, rows, count, given, w.where(number < count, number, count - 1)),
+                    state,
+                    lane,
+                )
             w.run("row", state, found)
             with w.counted(0, w.lanes) as lane:
                 number = w.load(who, lane, "i64")
                 with w.when(number < count):
-                    handed_out(w, returned, found, lane, w.at(results, number * returned, "double"))
+                    handed_out(w, returned, found, lane, of_lane(w, results, count, returned, number))
         w.give(Value(w, "ptr", "null"))
 
-    def body(arguments: list[Given], results: list[Value]) -> None:
+    def body(arguments: list[Given], results: list[Given]) -> None:
         job, count = w.room(4, "i64"), w.room(type="i64")
-        w.store(product(w, arguments[0], 1), count)
+        w.store(product(w, results[0], 1), count)
         start_counting(w, job, NEXT)
         w.store(w.load(count, type="i64"), job, COUNT)
         w.store(arguments[0].data, job, IN)
-        w.store(results[0], job, OUT)
+        w.store(results[0].data, job, OUT)
         share(w, job, w.load(count, type="i64"))
 
     write_handler(w, 1, 1, body)

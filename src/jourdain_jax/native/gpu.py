@@ -7,6 +7,7 @@ of the call's own: a counter of the lanes, and what threads need beyond their ow
 
 import ctypes
 import hashlib
+import math
 import threading
 from collections.abc import Sequence
 from functools import partial
@@ -124,14 +125,32 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
     return Kernel(number, _kernels[number], scratch)
 
 
-def lowered(ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel) -> list:
-    """The call of a kernel."""
-    lanes = int(np.prod(ctx.avals_in[-1].shape[:-1]))
+def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
+    """Return the axes of an array, that of neighbours in memory first: of `lanes`, its first ones, before all others."""
+    return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
+
+
+def lowered(
+    ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel, batch: tuple[int, ...], samples: int
+) -> list:
+    """Return the call of a kernel for a batch, whose lanes come last but in samples, the first of the arguments."""
+    lanes = math.prod(batch)
     slot, allowed = kernel.scratch
     # of all threads, and no more than an eighth of the device: so many slots
     slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
-    blocks = min(nvidia.blocks(lanes, kernel.loaded), slots)
-    each = min(MOST_SLOTS, slots // max(blocks, 1))
+    blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # no grid is without blocks
+    each = min(MOST_SLOTS, slots // blocks)
     scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,), dtype=np.dtype(np.float64), weak_type=False)
-    call = partial(jax.ffi.ffi_lowering(_handler()), blocks=np.int64(blocks), kernel=np.int64(kernel.number))
+    # an array without lanes has one axis, whose layout is the same either way
+    own = [aval.shape[: len(batch)] == batch and k >= samples for k, aval in enumerate(ctx.avals_in)]
+    layouts = {
+        "operand_layouts": [
+            _lanes_last(aval.ndim, len(batch) * has_lanes)
+            for aval, has_lanes in zip(ctx.avals_in, own, strict=True)
+        ],
+        "result_layouts": [*(_lanes_last(aval.ndim, len(batch)) for aval in ctx.avals_out), (0,)],
+    }
+    call = partial(
+        jax.ffi.ffi_lowering(_handler(), **layouts), blocks=np.int64(blocks), kernel=np.int64(kernel.number)
+    )
     return ffi.in_doubles(ctx, arguments, call, scratch)

@@ -20,8 +20,8 @@ from jourdain_jax.motion.integrators.event_search import MOST_STEPS
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.back import event_back, is_located, step_back
 from jourdain_jax.motion.native.layout import Lanes
-from jourdain_jax.motion.native.loop import Start
 from jourdain_jax.motion.native.record import Slot
+from jourdain_jax.motion.native.start import Start
 from jourdain_jax.motion.native.transitions import is_noted, reset_back
 
 SLOTS = (

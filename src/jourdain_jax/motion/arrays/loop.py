@@ -24,7 +24,7 @@ from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.native.layout import CONTROL, Form, Lanes
-from jourdain_jax.motion.native.loop import Found, Start
+from jourdain_jax.motion.native.start import Found, Start, constant_rows
 from jourdain_jax.motion.native.step import IDLE, step, tried_by_stages
 
 
@@ -48,16 +48,19 @@ class Loop(NamedTuple):
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
         """Return the start, and the rows that steps do not change."""
         t, form = start.goals[0], self.form
-        given = start._replace(known=()).rows(form)
+        given = constant_rows(form)
+        later = [row for row in range(form.integrated, form.rows["mode"].stop) if row not in given]
+        given |= dict(zip(later, start._replace(known=((),)).numbers(), strict=True))
+        given = {row: jnp.broadcast_to(jnp.asarray(x, t.dtype), t.shape) for row, x in given.items()}
         fixed = {row: given[row] for name in CONTROL for row in form.rows[name]}
         logged = {row for block in self.log for row in block}
         moving = {
-            row: given[row] if row < len(given) else jnp.zeros_like(t)
+            row: given.get(row, jnp.zeros_like(t))
             for row in range(form.integrated, form.all)
             if row not in fixed and row not in logged
         }
         log = [jnp.zeros((len(block), *t.shape), t.dtype) for block in self.log]
-        return Going(given[: form.integrated], moving, log, jnp.zeros(t.shape, jnp.int32)), fixed
+        return Going(jnp.concatenate(start.y), moving, log, jnp.zeros(t.shape, jnp.int32)), fixed
 
     @property
     def log(self) -> list[range]:

@@ -19,8 +19,9 @@ from jourdain_jax.motion.arrays.loop import Loop
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.native.loop import Found, Start, differentiated
+from jourdain_jax.motion.native.loop import differentiated
 from jourdain_jax.motion.native.native_motion import control_of, modes_at_start, moved
+from jourdain_jax.motion.native.start import Found, Start
 from jourdain_jax.motion.setup import Begun, Setup
 from jourdain_jax.motion.vector_fields.field import Integrated
 

@@ -240,7 +240,7 @@ def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOpt
         return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **span, options=options)
 
     with reference.stands_in():
-        return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
+        return integrate_lanes(lane, (varied, parameters))
 
 
 _compiled = for_programs(_lanes_in_lockstep)

@@ -32,14 +32,24 @@ from jourdain_jax.motion.integrators.event_search import RUNNING, chosen, slope_
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import write_pulled
 from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, set_goal
-from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
+from jourdain_jax.motion.native.loop import (
+    COUNT,
+    MOST_KERNELS,
+    TIMES,
+    begin_lane,
+    goal_of,
+    with_tangents,
+    write_functions,
+    write_job,
+)
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
 from jourdain_jax.motion.native.samples import pass_knot
+from jourdain_jax.motion.native.start import Start, constant_rows
 from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.motion.native.transitions import is_noted, reset_back, write_reset_back
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native.ffi import taken_in, write_handler
+from jourdain_jax.native.ffi import OfLane, of_lane, taken_in, write_handler
 from jourdain_jax.native.ir import Value
 
 
@@ -64,7 +74,12 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), memory, job)
         w.give(Value(w, "ptr", "null"))
-    write_handler(w, 4 + arguments_of_samples(form), 1, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(
+        w,
+        4 + arguments_of_samples(form) + w.device,
+        1,
+        lambda arguments, results: write_job(w, form, arguments, results),
+    )
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
@@ -84,7 +99,7 @@ def _write_note(w: MachineWriter, form: Form) -> None:
                 leave(~(lanes.of("code", lane).equals(RUNNING) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
                 before, goals = w.converted("fptosi", w.load(saved, lane, "double"), "i64"), w.load(job, GOALS, "ptr")
                 if form.sampled:
-                    at_knot = lanes.of("t", lane).differs(w.load(goals, number * times + before, "double"))
+                    at_knot = lanes.of("t", lane).differs(goal_of(w, job, goals, number, before))
                     with w.when(at_knot):
                         pass_knot(w, lanes, lane)
                     reached = before + w.where(at_knot, w.literal(0, "i64"), 1)
@@ -94,7 +109,7 @@ def _write_note(w: MachineWriter, form: Form) -> None:
                 with w.when(reached >= times):
                     lanes.set("code", lane, results.SUCCESS)
                 with w.when(reached < times):
-                    set_goal(w, lanes, lane, w.load(goals, number * times + reached, "double"))
+                    set_goal(w, lanes, lane, goal_of(w, job, goals, number, reached))
 
 
 def _write_added(w: MachineWriter, form: Form) -> None:
@@ -108,8 +123,11 @@ def _write_added(w: MachineWriter, form: Form) -> None:
             number, times = w.load(who, lane, "i64"), w.load(job, TIMES, "i64")
             with w.when(number >= 0):
                 a, b = (w.converted("fptosi", w.load(x, lane, "double"), "i64") for x in (firsts, ends))
+                states = of_lane(
+                    w, w.load(job, TO_STATES, "ptr"), w.load(job, COUNT, "i64"), times * count, number
+                )
                 with w.counted(a, b) as k, w.counted(0, count) as row:
-                    more = w.load(w.load(job, TO_STATES, "ptr"), (number * times + k) * count + row, "double")
+                    more = w.load(states.place(k * count + row), type="double")
                     place = w.at(g, row * w.lanes + lane, "double")
                     w.store(w.load(place, type="double") + more, place)
 
@@ -218,8 +236,8 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
             g_t = w.room(1 + len(form.moving))
             with w.counted(0, w.lanes) as lane:
                 number = w.load(who, lane, "i64")
-                end = w.at(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + form.integrated, "double")
-                taken_in(w, 1 + len(form.moving), end, g_t, lane)
+                end = _cotangents_of_end(w, form, job, w.where(number >= 0, number, 0))
+                taken_in(w, 1 + len(form.moving), end.after(form.integrated), g_t, lane)
             event_back(w, form, asked, state, located, g_t, g, by_known)
 
 
@@ -235,11 +253,19 @@ def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
                 passed = lanes.of("passed", lane) - 1.0
                 lanes.set("passed", lane, passed)
                 with w.when(passed < float(form.transitions)):
-                    first = number * form.ends + (form.integrated + 1 + len(form.moving)) + w.converted("fptosi", passed, "i64")
+                    end, first = (
+                        _cotangents_of_end(w, form, job, number),
+                        w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving)),
+                    )
                     for part in range(1 + len(form.moving)):
-                        g_of = w.load(w.load(job, TO_ENDS, "ptr"), first + part * form.transitions, "double")
+                        g_of = w.load(end.place(first + part * form.transitions), type="double")
                         w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))
         reset_back(w, form, asked, state, left, g_t, g, by_known)
+
+
+def _cotangents_of_end(w: MachineWriter, form: Form, job: Value, lane: Value) -> OfLane:
+    """Return the cotangents of the end of a lane and of the times of its transitions."""
+    return of_lane(w, w.load(job, TO_ENDS, "ptr"), w.load(job, COUNT, "i64"), form.ends, lane)
 
 
 def is_located(w: StepWriter, lanes: Lanes) -> Number:
@@ -300,7 +326,12 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
     count = form.integrated + len(asked)
-    run_rows = called(lambda w: write_back(w, form, method, asked, memory), lambda *_: ((count,),), arguments_of_samples(form))
+    run_rows = called(
+        lambda w: write_back(w, form, method, asked, memory),
+        lambda *_: ((count,),),
+        arguments_of_samples(form),
+        constant=constant_rows(form),
+    )
     return lambda *arguments: run_rows(*arguments)[0]
 
 
@@ -312,7 +343,7 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -
 
     @jax.custom_jvp
     def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):
-        return _pulled(kernel_back(form, method, asked, memory), form, start, g, ends)
+        return _pulled(kernel_back(form, method, asked, memory), start, g, ends)
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):
@@ -323,11 +354,11 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -
         parts = [x for a, b in pairwise((0, n, n + 1, len(ends))) for x in (dends[a:b], ends[a:b])]
         both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
         raised = replace(raised, time_moves=form.has_events and bool(form.sampled))  # an event needs to know how fast samples change
-        d = _pulled(kernel_back(raised, method, asked, memory), raised, more, *both)
+        d = _pulled(kernel_back(raised, method, asked, memory), more, *both)
         return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
 
     return own
 
 
-def _pulled(kernel: Callable, form: Form, start: Start, g, ends) -> Float[Array, "found"]:
-    return kernel(*start.of_samples, start.rows(form), g, ends, start.goals)
+def _pulled(kernel: Callable, start: Start, g, ends) -> Float[Array, "found"]:
+    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals)

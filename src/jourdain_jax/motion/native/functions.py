@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, stated
 from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
@@ -75,7 +75,7 @@ def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Va
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
-    given |= dict(zip(own.known, lanes.every("dknown"), strict=True)) if own.known else {}
+    given |= dict(zip(own.known, stated(w, lanes, "dknown"), strict=True)) if own.known else {}
     given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
     given |= dict(zip(own.slopes, looked_up(w, form, state, tau, True)[len(form.sampled) :], strict=True)) if own.slopes else {}
     return given
@@ -85,7 +85,7 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
     """Return values of all nodes that are given from outside."""
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
-    known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
+    known, fixed, t = stated(w, lanes, "known"), len(program.fixed), lanes["origin"] + tau
     found = dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False)) if form.sampled else {}
     found |= dict(zip(form.switched, lanes.every("mode"), strict=True))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]

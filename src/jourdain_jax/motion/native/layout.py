@@ -223,7 +223,17 @@ class MachineWriter(Writer):
         if_any(c, body)            what the body does counts where c holds in any lane; lanes are told apart by `where`
         over_stages(n, body, x)    x <- body(i, x)
         each(rows, body)           the body for every row, none of which needs what another one makes
+
+    `common`: which rows of a start are the same in all lanes of a GPU, and given once.
     """
+
+    common: Sequence[bool] = ()
+
+    def constant(self, pointer: Value, index: int) -> Value:
+        """Return a number that is the same in all threads of a GPU, in memory that nothing changes meanwhile."""
+        place = self.converted("addrspacecast", self.at(pointer, index), "ptr addrspace(1)").name
+        text = f"load {self.real}, ptr addrspace(1) {place}, align 8, !invariant.load !{{}}"
+        return self.instruction(self.real, text)
 
     def power(self, x: Value, exponent: float) -> Value:
         """x^exponent"""
@@ -339,6 +349,26 @@ def each_row(w: StepWriter, rows: range | int, into: Number, value: Callable[[in
 def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
     """Copy so many rows from another place, in lanes `where` this holds."""
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
+
+
+def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
+    """Return the vectors of all rows of this name, which steps do not change.
+
+    On a GPU what all lanes share is read where it was given.
+    """
+    rows = lanes.rows[name]
+    if not any(w.common[row] for row in rows if w.device):
+        return lanes.every(name)
+    common = w.load(lanes.pointer, lanes.form.all, "ptr")
+    return [
+        w.constant(common, sum(w.common[:row])) if w.common[row] else w.load(lanes.pointer, row)
+        for row in rows
+    ]
+
+
+def room_of_lanes(w: MachineWriter, form: Form) -> Value:
+    """Return memory for all rows; on a GPU, after them, for where that is what all lanes share."""
+    return w.room(form.all + w.device)
 
 
 def arguments_of_samples(form: Form) -> int:

@@ -14,36 +14,48 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import NamedTuple
+from itertools import groupby
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import check_derivatives, write_events, write_projection, write_rates
 from jourdain_jax.motion.native.layout import (
-    CONTROL,
-    PROGRESS,
     Form,
     Lanes,
     MachineWriter,
     arguments_of_samples,
+    room_of_lanes,
     set_goal,
 )
 from jourdain_jax.motion.native.samples import WORDS_OF_SAMPLES, begin_samples, pass_knot, store_samples, write_sampled_inputs
+from jourdain_jax.motion.native.start import Found, Start, constant_rows
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps, products
 from jourdain_jax.motion.native.transitions import write_reset
 from jourdain_jax.motion.native.values import called
-from jourdain_jax.native.ffi import Given, handed_out, last_size, next_lane, product, share, start_counting, taken_in, write_handler
+from jourdain_jax.native.ffi import (
+    Given,
+    OfLane,
+    handed_out,
+    last_size,
+    next_lane,
+    of_lane,
+    product,
+    share,
+    start_counting,
+    taken_in,
+    write_handler,
+)
 from jourdain_jax.native.ir import Value
 
-# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
-# samples, then pointers to the arrays
-COUNT, TIMES, NEXT, OWN, FIRST_OF_SAMPLES = range(5)
+# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's
+# own memory (`ffi.py`), on a GPU where that is what all lanes share, and how many rows of times there are (one, or one
+# of each lane), those of samples, then pointers to the arrays
+COUNT, TIMES, NEXT, OWN, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(7)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
@@ -56,7 +68,12 @@ def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> No
     if isinstance(method, TaylorSteps):
         _write_save_within(w, form, method)
     _write_loop(w, form, method)
-    write_handler(w, 2 + arguments_of_samples(form), 2, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(
+        w,
+        2 + arguments_of_samples(form) + w.device,
+        2,
+        lambda arguments, results: write_job(w, form, arguments, results),
+    )
 
 
 def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
@@ -73,20 +90,22 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
     write_step(w, form, method)
 
 
-def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Value]) -> None:
+def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
+    common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
     of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
-    arrays = [*(x.data for x in arguments), *results]
+    arrays = [x.data for x in (*arguments, *results)]
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
         w.store(pointer, job, FIRST_ARRAY + word)
     count = w.room(type="i64")
-    w.store(product(w, times, 1), count)
+    w.store(product(w, results[-1], 1), count)
     w.store(w.load(count, type="i64"), job, COUNT)
     w.store(last_size(w, times), job, TIMES)
     start_counting(w, job, NEXT)
-    if w.device:
-        w.store(w.own[1], job, OWN)
+    if common:
+        for word, value in ((OWN, w.own[1]), (COMMON, common.data), (ROWS_OF_TIMES, product(w, times, 1))):
+            w.store(value, job, word)
     if form.sampled:
         store_samples(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
     share(w, job, w.load(count, type="i64"))
@@ -101,7 +120,11 @@ def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> N
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
-    state, who, k = w.room(form.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.integrated * method.needed)
+    state, who, k = (
+        room_of_lanes(w, form),
+        w.room(2 * w.lanes + 1, "i64"),
+        w.room(form.integrated * method.needed),
+    )
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(0, form.all) as row:
         w.store(1.0, state, row)
@@ -126,10 +149,12 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
     """
     if form.sampled:
         begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
+    if w.device:
+        w.store(w.load(job, COMMON, "ptr"), lanes.pointer, form.all)
     with w.when(there):
-        given = form.given
-        taken_in(w, given, w.at(w.load(job, STARTS, "ptr"), number * given, "double"), lanes.pointer, lane)
-        set_goal(w, lanes, lane, w.load(goals, number * w.load(job, TIMES, "i64"), "double"))
+        for rows, numbers in _starts(w, form, job, number):
+            taken_in(w, len(rows), numbers, w.at(lanes.pointer, rows.start), lane)
+        set_goal(w, lanes, lane, goal_of(w, job, goals, number, 0))
     with w.when(~there):
         lanes.set("code", lane, IDLE)
     lanes.set("taken", lane, 0.0)
@@ -138,6 +163,34 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
         lanes.set("search_left", lane, 0.0)
     for row in (row for name in ("begun", "disarmed", "left") for row in form.rows.get(name, ())):
         w.store(w.literal(0.0, "double"), w.at(lanes.pointer, lane + row * w.lanes, "double"))
+
+
+def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
+    """Return rows of the start of a lane, and the numbers that these are given.
+
+    What all lanes of a GPU share, and steps do not change, stays where it is.
+    """
+    count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
+    found, shared = [], w.common if w.device else [False] * form.given
+    sources = {False: of_lane(w, w.load(job, STARTS, "ptr"), count, form.given, lane)}
+    if w.device:
+        sources[True] = OfLane(w.load(job, COMMON, "ptr"), 1)
+    for (is_shared, stays), run in groupby(
+        range(form.given), lambda row: (shared[row], shared[row] and row >= form.rows["known"].start)
+    ):
+        rows = [*run]
+        if not stays:
+            found.append((range(rows[0], rows[-1] + 1), sources[is_shared].after(places[is_shared])))
+        places[is_shared] += len(rows)
+    return found
+
+
+def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:
+    """Return the time of this number to which a lane goes."""
+    rows = w.load(job, ROWS_OF_TIMES if w.device else COUNT, "i64")
+    if w.device:
+        lane = w.where(lane < rows, lane, 0)
+    return w.load(of_lane(w, goals, rows, w.load(job, TIMES, "i64"), lane).place(number), type="double")
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
@@ -164,8 +217,8 @@ def _write_serve(w: MachineWriter, form: Form) -> None:
             runs = code.equals(RUNNING)
             leave(code.equals(IDLE) | code.equals(LOCATING) | (runs & t.differs(goal)))
             if form.sampled:
-                place = w.load(who, lane, "i64") * w.load(job, TIMES, "i64") + w.load(who, lane + w.lanes, "i64")
-                next_time = w.load(w.load(job, _GOALS, "ptr"), place, "double")
+                number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
+                next_time = goal_of(w, job, w.load(job, _GOALS, "ptr"), number, saved)
                 at_knot = runs & t.differs(next_time)
                 with w.when(at_knot):
                     pass_knot(w, lanes, lane)
@@ -199,104 +252,41 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
             w.store(w.where(due, 1.0, 0.0), flags)
             with w.counted(0, w.lanes) as lane, w.when(w.load(flags, lane, "double") > 0.0):
                 saved = w.load(who, lane + w.lanes, "i64")
-                place = w.load(who, lane, "i64") * times + saved
-                handed_out(w, every, y, lane, w.at(states, place * every, "double"))
+                number = w.load(who, lane, "i64")
+                handed_out(
+                    w,
+                    every,
+                    y,
+                    lane,
+                    of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
+                )
                 w.store(saved + 1, who, lane + w.lanes)
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
                 with w.when((saved + 1) < times):
-                    lanes.set("goal", lane, w.load(goals, place + 1, "double"))
+                    lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))
 
 
 def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
     """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
-    times = w.load(job, TIMES, "i64")
+    times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
     number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
     last = w.where(runs, saved + 1, times)
     with w.counted(saved, last) as k:
-        handed_out(w, form.integrated, lanes.pointer, lane, w.at(states, (number * times + k) * form.integrated, "double"))
+        handed_out(
+            w, every, lanes.pointer, lane, of_lane(w, states, count, times * every, number).after(k * every)
+        )
     w.store(last, who, lane + w.lanes)
     with w.when(last < times):
-        set_goal(w, lanes, lane, w.load(goals, number * times + last, "double"))
+        set_goal(w, lanes, lane, goal_of(w, job, goals, number, last))
     with w.when(last >= times):
-        end = w.at(ends, number * (form.returned + 1), "double")
+        end = of_lane(w, ends, count, form.returned + 1, number)
         handed_out(w, form.returned, lanes.pointer, lane, end)
-        w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end, form.returned)
+        w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end.place(form.returned))
         w.run("begin", job, lanes.pointer, who, lane)
 
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
-
-
-class Start(NamedTuple):
-    """Arguments of a loop for a motion; the state and the known numbers are followed by their tangents
-    (`Form`).
-    """
-
-    of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
-    control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
-    goals: Float[Array, "times *lanes"]  # since the start
-    origin: Float[Array, "*lanes"]  # the time of the start
-    y: tuple[Float[Array, "y *lanes"], ...]
-    known: tuple[tuple[Array, ...], ...]  # numbers; of a loop on arrays those in which the arguments of rates are stored, with their lanes first
-    modes: tuple[Float[Array, "*lanes"], ...] = ()
-
-    def rows(self, form: Form) -> Float[Array, "given *lanes"]:
-        """Return the rows of a lane at the start."""
-        rtol, atol, shortest, longest, first, most = self.control
-        zero, one = jnp.zeros_like(self.goals[0]), jnp.ones_like(self.goals[0])
-        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero]
-        progress += [zero] * (form.rows[CONTROL[0]].start - form.integrated - len(progress))
-        limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
-        known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
-        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack([*limits, *(mode * one for mode in self.modes)]), *known])
-
-
-class Found(NamedTuple):
-    """A motion as a loop returns it; each with its tangents."""
-
-    y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
-    end: tuple[Float[Array, "y *lanes"], ...]
-    t: tuple[Float[Array, "*lanes"], ...]  # of the end, since the start
-    log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
-    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, the number of goals that were reached one after the other, and of transitions
-    # their number, events, energies lost and modes
-
-    @staticmethod
-    def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
-        """Put a motion together from its states, its rows at the end, and the number of goals that were reached."""
-        rows, parts = form.rows, range(1 + len(form.moving))
-        every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
-
-        def named(name: str) -> Array:
-            return end[rows[name].start : rows[name].stop]
-
-        log: list[Array] = [jnp.zeros((0, *end.shape[1:]), end.dtype) for _ in parts]
-        more = []
-        if form.transitions:
-            log = jnp.split(named("log_t"), len(parts))
-            more = [named(name) for name in ("passed", "log_event", "log_lost", "log_mode") if rows[name]]
-        progress = end[rows[PROGRESS[1]].start : rows[PROGRESS[-1]].stop]
-        return Found(
-            tuple(states[:, part] for part in every),
-            tuple(end[part] for part in every),
-            tuple(end[row] for row in (rows["t"].start, *rows["dt"])),
-            tuple(log),
-            jnp.concatenate([progress, count, *more]),
-        )
-
-    def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return the result of `vmap`, without batch axes for shared parts, and marks of batched ones;
-        `given`: the parts of the start that have one.
-
-        A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
-        """
-        parts = range(len(self.y))
-        base = any(jax.tree.leaves(given._replace(y=(), known=())))
-        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in parts]
-        of_parts = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts)
-        lanes = Found(of_parts, of_parts, of_parts, of_parts, of_parts[0])
-        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], self, lanes), lanes
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -307,11 +297,13 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[St
     def shapes(*arguments):
         return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
 
-    run = called(lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form))
+    run = called(
+        lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form), constant=constant_rows(form)
+    )
 
     @jax.custom_batching.custom_vmap
     def motion(start: Start) -> Found:
-        states, end = run(*start.of_samples, start.rows(form), start.goals)
+        states, end = run(*start.of_samples, (*start.y, *start.numbers()), start.goals)
         return Found.of(form, states, end[:-1], end[-1:])
 
     @motion.def_vmap

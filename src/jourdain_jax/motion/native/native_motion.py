@@ -38,7 +38,7 @@ from jourdain_jax.motion.native import taylor
 from jourdain_jax.motion.native.back import flow_back
 from jourdain_jax.motion.native.functions import check_derivatives, event_program
 from jourdain_jax.motion.native.layout import Form
-from jourdain_jax.motion.native.loop import Found, Start
+from jourdain_jax.motion.native.start import Found, Start
 from jourdain_jax.motion.native.values import values_of_nodes
 from jourdain_jax.motion.setup import NONE_PASSED, Begun, Passed, Setup, Solved
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
@@ -306,9 +306,22 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 def start_of(setup: Setup, begun: Begun) -> Start:
     """Return the arguments of a kernel for a motion."""
     knots, goals = setup.knots, setup.goals(setup.ts)
-    known = tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(begun.args))  # what samples say is looked up
+    # what samples say is looked up
+    known, plain = (
+        tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
+        for part in (known_of(begun.args), begun.plain.known if begun.plain else ())
+    )
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
-    return Start(_samples(begun.args, goals, knots), control_of(setup, knots), goals, origin, (begun.y0.rows,), (known,), modes)
+    return Start(
+        _samples(begun.args, goals, knots),
+        control_of(setup, knots),
+        goals,
+        origin,
+        (begun.y0.rows,),
+        (known,),
+        modes,
+        plain,
+    )
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:

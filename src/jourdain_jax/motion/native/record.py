@@ -12,9 +12,9 @@ from typing import NamedTuple
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, copied, each_row
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, copied, each_row, room_of_lanes
 from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
-from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, taken_in
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, of_lane, taken_in
 from jourdain_jax.native.ir import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
@@ -51,8 +51,8 @@ class _Rooms(NamedTuple):
 
     @staticmethod
     def of(w: MachineWriter, form: Form, asked: int) -> "_Rooms":
-        rows = form.all, form.integrated, max(asked, 1)
-        state, g, by_known = (w.room(count) for count in rows)
+        state, rows = room_of_lanes(w, form), (form.integrated, max(asked, 1))
+        g, by_known = (w.room(count) for count in rows)
         return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
 
 
@@ -205,7 +205,9 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
-            taken_in(w, form.integrated, w.at(ends, number * form.ends, "double"), g, lane)
+            taken_in(
+                w, form.integrated, of_lane(w, ends, w.load(job, COUNT, "i64"), form.ends, number), g, lane
+            )
     # what was not reached repeats the last state
     all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
     w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
@@ -234,9 +236,9 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
-            place = w.at(found, number * each, "double")
-            handed_out(w, form.integrated, g, lane, place)
-            handed_out(w, asked, rooms.by_known, lane, w.at(place, form.integrated, "double"))
+            numbers = of_lane(w, found, w.load(job, COUNT, "i64"), each, number)
+            handed_out(w, form.integrated, g, lane, numbers)
+            handed_out(w, asked, rooms.by_known, lane, numbers.after(form.integrated))
 
 
 def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.functions import known_values, outputs_of
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, stated
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.math_functions import exponential, logarithm
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
@@ -249,7 +249,9 @@ def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[l
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
     _, clock, states, _ = form.split(own.variables)
-    given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown"), strict=True))
+    given = {n: x for n, x in known.items() if n not in states} | dict(
+        zip(own.known, stated(w, p, "dknown"), strict=True)
+    )
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
     nodes = [n for part in (own.values[: len(rates)], *own.tangents, own.values[len(rates) :]) for n in part]
     # on a graph that nothing has been derived on: the numbers of its nodes decide on the order

@@ -14,7 +14,7 @@ for which rows of the numbers that are needed are put together. Speeds of few op
 costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place of 1,070.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, lru_cache, partial
 from typing import NamedTuple
 
@@ -27,10 +27,11 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
-from jourdain_jax.calculus.markers import entries_of, with_lanes_first
+from jourdain_jax.calculus.markers import entries_of, lanes_of
 from jourdain_jax.calculus.reals import Flag, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
 from jourdain_jax.motion.native.layout import MachineWriter
+from jourdain_jax.motion.native.operands import Operands
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
@@ -40,11 +41,17 @@ from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
 
 
-def called(write: Callable[[MachineWriter], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
-    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the
-    arguments.
+def called(
+    write: Callable[[MachineWriter], None],
+    shapes: Callable,
+    of_samples: int = 0,
+    effort: int = 2,
+    constant: Mapping[int, float] | None = None,
+) -> Callable:
+    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
 
-    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. Where rows of a start
+    are `constant`, the next argument holds all others, as vectors of the state, and numbers.
     """
 
     @cache
@@ -54,45 +61,94 @@ def called(write: Callable[[MachineWriter], None], shapes: Callable, of_samples:
         return ffi.registered(w.text, effort)
 
     @cache
-    def kernel() -> gpu.Kernel:
+    def kernel(shared: tuple[bool, ...]) -> gpu.Kernel:
         w = MachineWriter(1, True, device=True)
+        w.common = shared
         write(w)
         return gpu.registered(w.text, w.scratch)
 
-    def call(lanes: int, threads: int, *arguments):
-        return tuple(_call_p.bind(*arguments, handler=handler, kernel=kernel, lanes=lanes, threads=threads, shapes=shapes))
+    def call(lanes: int, threads: int, batch: tuple[int, ...], ranks: tuple[int, ...], arguments: tuple):
+        others = len(arguments) - of_samples - (constant is not None)
+        operands = Operands(batch, ranks, of_samples, others, tuple((constant or {}).items()))
+        how = {
+            "handler": handler,
+            "kernel": kernel,
+            "lanes": lanes,
+            "threads": threads,
+            "shapes": shapes,
+            "operands": operands,
+        }
+        return tuple(_call_p.bind(*jax.tree.leaves(arguments), **how))
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
         # 2 places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
-        return call(2, 1, *arguments)
+        return call(2, 1, (), tuple(map(jnp.ndim, jax.tree.leaves(arguments))), arguments)
 
     @run.def_vmap
     def run_many(count, batched: list[bool], *arguments):
-        stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
-        every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
-        found = call(host.lanes(), host.threads(), *every)
+        ranks = tuple(
+            x.ndim - has_axis for x, has_axis in zip(*map(jax.tree.leaves, (arguments, batched)), strict=True)
+        )
+        found = call(host.lanes(), host.threads(), (count,), ranks, arguments)
         return found, (True,) * len(found)
 
     return run
 
 
-def _results(*arguments, shapes: Callable, **_) -> list:
-    return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
+def _results(*arguments, shapes: Callable, operands: Operands, **_) -> list:
+    return [
+        arguments[-1].update(shape=(*operands.batch, *shape), weak_type=False) for shape in shapes(*arguments)
+    ]
 
 
-def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
+def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
+    """Return the call with one axis of lanes more, the first one; operands that have none stay without."""
+    count, every = lanes_of(values, axes), []
+    for x, axis, rank in zip(values, axes, operands.ranks, strict=True):
+        has_lanes = x.ndim - (axis is not None) > rank
+        if axis is not None:
+            x = jnp.moveaxis(x, axis, 0)
+            x = x if has_lanes else jnp.expand_dims(x, tuple(range(1, 1 + len(operands.batch))))
+        every.append(jnp.broadcast_to(x, (count, *x.shape)) if axis is None and has_lanes else x)
+    found = _call_p.bind(*every, operands=operands._replace(batch=(count, *operands.batch)), **how)
+    return found, [0] * len(found)
+
+
+def _made(
+    ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
+) -> tuple[mlir.LoweringRuleContext, Sequence]:
+    """Return what a function makes of operands of a call, and the context of a call that is given that."""
+    avals = [
+        ctx.avals_in[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False)
+        for x in jax.eval_shape(make, *ctx.avals_in)
+    ]
+    return ctx.replace(avals_in=avals), mlir.lower_fun(make)(ctx.replace(primitive=None), *values)
+
+
+def on_cpu(
+    ctx: mlir.LoweringRuleContext,
+    *values,
+    handler: Callable,
+    lanes: int,
+    threads: int,
+    operands: Operands,
+    **_,
+):
     """Return the call in a program for the CPU."""
     _check_here(ctx)
+    ctx, arguments = _made(ctx, values, operands.side_by_side)
     return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
 
 
-def _on_nvidia(ctx: mlir.LoweringRuleContext, *arguments, kernel: Callable, **_):
+def _on_nvidia(ctx: mlir.LoweringRuleContext, *values, kernel: Callable, operands: Operands, **_):
     """Return the call in a program for an NVIDIA GPU."""
     _check_here(ctx)
     if reason := nvidia.reason_against():
         raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
-    return gpu.lowered(ctx, arguments, kernel())
+    own = kernel(operands.shared(ctx.avals_in))
+    ctx, arguments = _made(ctx, values, operands.given_once)
+    return gpu.lowered(ctx, arguments, own, operands.batch, operands.samples)
 
 
 def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
@@ -111,13 +167,13 @@ def _check_here(ctx: mlir.LoweringRuleContext) -> None:
 # The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
 _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
-_HOW = "handler", "kernel", "lanes", "threads", "shapes"
+_HOW = "handler", "kernel", "lanes", "threads", "shapes", "operands"
 _call_p.def_impl(jax.jit(lambda *arguments, **how: _call_p.bind(*arguments, **how), static_argnames=_HOW))
 _call_p.def_abstract_eval(_results)
 mlir.register_lowering(_call_p, _nowhere)
 mlir.register_lowering(_call_p, on_cpu, platform="cpu")
 mlir.register_lowering(_call_p, _on_nvidia, platform="cuda")
-batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
+batching.primitive_batchers[_call_p] = _more_lanes
 
 
 def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:

@@ -1,0 +1,78 @@
+"""How operands of a call of machine code become the arrays that it is given: on a CPU and on a GPU.
+
+Rows of a start come as vectors and numbers, some of which have lanes. On a CPU they are put together lane by lane; on a GPU
+those that all lanes share are an array of their own, without lanes, and the times to save at may have none, too.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+class Operands(NamedTuple):
+    """How operands of a call, of which some have lanes, become the arrays that machine code is given."""
+
+    batch: tuple[int, ...]  # numbers of lanes, one for each `vmap`
+    ranks: tuple[int, ...]  # of the operands, without lanes
+    samples: int  # how many come first
+    others: int  # how many come last, each an array; those in between are rows of a start
+    constant: tuple[tuple[int, float], ...]  # rows of a start that are no operands
+
+    def _laned(self, x: Array, rank: int) -> Array:
+        """Return the operand with all lanes; a number becomes a row."""
+        own = x.shape[x.ndim - rank :]
+        return jnp.broadcast_to(
+            x if rank else x[..., None], (*self.batch, *own) if rank else (*self.batch, 1)
+        )
+
+    def _rows(self, values: Sequence) -> list[tuple[Any, int, bool]]:
+        """Return each vector, number or constant of a start, how many rows, and whether all lanes share them."""
+        constant, row, found = dict(self.constant), 0, list[tuple[Any, int, bool]]()
+        operands = [*range(self.samples, len(values) - self.others)]
+        while operands or row in constant:
+            if row in constant:
+                found.append((constant[row], 1, True))
+            else:
+                x, rank = values[k := operands.pop(0)], self.ranks[k]
+                found.append((x, x.shape[-1] if rank else 1, x.ndim == rank == 0))
+            row += found[-1][1]
+        return found
+
+    def shared(self, values: Sequence) -> tuple[bool, ...]:
+        """Return which rows of a start all lanes share."""
+        return tuple(is_shared for _, count, is_shared in self._rows(values) for _ in range(count))
+
+    def _joined(self, rows: list, dtype, laned: bool) -> Array:
+        """Return rows as one array, with lanes or without."""
+        every = [jnp.asarray(x, dtype) for x, *_ in rows]
+        return jnp.concatenate(
+            [
+                self._laned(x, int(count > 1)) if laned else x[None]
+                for x, (_, count, _) in zip(every, rows, strict=True)
+            ],
+            axis=-1,
+        )
+
+    def side_by_side(self, *values: Array) -> list[Array]:
+        """Return the arrays of a CPU: lanes come first in all but samples, which lanes may share."""
+        rows, last = self._rows(values), len(values) - self.others
+        starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
+        return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
+
+    def given_once(self, *values: Array) -> list[Array]:
+        """Return the arrays of a GPU: rows of a start that lanes share come without lanes, after the others.
+
+        The last operand may have none, too.
+        """
+        rows, last = self._rows(values), len(values) - self.others
+        starts = [
+            self._joined([x for x in rows if x[2] is shared], values[-1].dtype, not shared)
+            for shared in (False, True)
+            if rows
+        ]
+        others = [*map(self._laned, values[last:], self.ranks[last:])]
+        if rows and values[-1].ndim == self.ranks[-1]:
+            others[-1] = values[-1]
+        return [*values[: self.samples], *starts, *others]

@@ -1,0 +1,94 @@
+"""What a loop over steps is given of a motion, and what it returns: as machine code and on arrays."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.motion.integrators.event_search import RUNNING
+from jourdain_jax.motion.native.layout import PROGRESS, Form
+
+
+def constant_rows(form: Form) -> dict[int, float]:
+    """Return the rows with which all motions begin alike, and their numbers."""
+    rows = form.rows
+    said = {"code": float(RUNNING), "event": -1.0, "pivot": math.inf}
+    begun = dict.fromkeys(range(form.integrated, form.returned), 0.0) | {
+        rows[name].start: x for name, x in said.items()
+    }
+    return {row: x for row, x in begun.items() if row not in rows["h"]}
+
+
+class Start(NamedTuple):
+    """A motion as a loop is given it; the state and what is known are followed by their tangents (`Form`)."""
+
+    of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
+    control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
+    goals: Float[Array, "times *lanes"]  # since the start
+    origin: Float[Array, "*lanes"]  # the time of the start
+    y: tuple[Float[Array, "y *lanes"], ...]
+    known: tuple[tuple[Array, ...], ...]  # numbers; of a loop on arrays those in which the arguments of rates are stored, with their lanes first
+    modes: tuple[Float[Array, "*lanes"], ...] = ()
+    plain: tuple[Array, ...] = ()  # `known` as it was given, for kernels of a GPU: witshared
+
+    def numbers(self) -> tuple[Float[Array, "*lanes"], ...]:
+        """Return the rows of a lane at the start, after the state, that are not `constant_rows`.
+
+        What of them has no lanes is the same in all.
+        """
+        rtol, atol, shortest, longest, first, most = self.control
+        limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
+        return (
+            jnp.minimum(jnp.abs(first), longest),
+            *limits,
+            *self.modes,
+            *(x for part in (self.plain or self.known[0], *self.known[1:]) for x in part),
+        )
+
+
+class Found(NamedTuple):
+    """A motion as a loop returns it; each with its tangents."""
+
+    y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
+    end: tuple[Float[Array, "y *lanes"], ...]
+    t: tuple[Float[Array, "*lanes"], ...]  # of the end, since the start
+    log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
+    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, the number of goals that were reached one after the other, and of transitions
+    # their number, events, energies lost and modes
+
+    @staticmethod
+    def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
+        """Put a motion together from its states, its rows at the end, and the number of goals that were reached."""
+        rows, parts = form.rows, range(1 + len(form.moving))
+        every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
+
+        def named(name: str) -> Array:
+            return end[rows[name].start : rows[name].stop]
+
+        log: list[Array] = [jnp.zeros((0, *end.shape[1:]), end.dtype) for _ in parts]
+        more = []
+        if form.transitions:
+            log = jnp.split(named("log_t"), len(parts))
+            more = [named(name) for name in ("passed", "log_event", "log_lost", "log_mode") if rows[name]]
+        progress = end[rows[PROGRESS[1]].start : rows[PROGRESS[-1]].stop]
+        return Found(
+            tuple(states[:, part] for part in every),
+            tuple(end[part] for part in every),
+            tuple(end[row] for row in (rows["t"].start, *rows["dt"])),
+            tuple(log),
+            jnp.concatenate([progress, count, *more]),
+        )
+
+    def shared(self, given: Start) -> tuple["Found", "Found"]:
+        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`: what of the start has.
+
+        A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
+        """
+        parts = range(len(self.y))
+        base = any(jax.tree.leaves(given._replace(y=(), known=())))
+        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in parts]
+        of_parts = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts)
+        lanes = Found(of_parts, of_parts, of_parts, of_parts, of_parts[0])
+        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], self, lanes), lanes
