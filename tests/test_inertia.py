@@ -265,3 +265,54 @@ def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, ba
     for scene, code in zip((wrong, sound), lanes.result, strict=True):
         found, q = compiled(scene, backend)
         assert (int(found), bool(jnp.isfinite(q).all())) == (code, code == results.SUCCESS)
+
+
+class Led(jj.Scene):
+    """A wheel whose height a geometric row leads, and a rod with a point on a plane of its own, right at the start."""
+
+    slope: float = jj.parameter(0.0)
+    lift: float = jj.parameter(0.0)
+    swing: float = jj.parameter(0.0)
+    stretch: float = jj.parameter(0.0)
+    coordinates = jj.coordinates("x z s roll turn")
+    domain = {"x": (-1.0, 1.0), "z": (0.0, 0.5), "s": (-1.0, 1.0)}
+    example = {"s": 0.0, "x": 0.0, "s_rate": 0.1, "x_rate": 0.1}
+
+    def bodies(self, t, q):
+        o = 0.0 * q.x
+        turned = jj.rot_y(q.turn) @ jnp.diag(jnp.stack([1 + self.stretch * q.s, 1 + o, 1 + o]))
+        return {
+            "wheel": jj.RigidBody(1.0, 0.3 * jnp.eye(3), [q.x, o, q.z + self.slope * q.x], jj.rot_y(q.roll)),
+            "rod": jj.RigidBody(1.0, 0.3 * jnp.eye(3), [q.s, o, o + 0.1], turned),
+        }
+
+    def geometric_constraints(self, pose):
+        return {"guide": pose.q.z - 0.1 - self.lift * pose.q.s}
+
+    def contacts(self, pose):
+        level = self.swing * pose.q.s * jnp.eye(3)[2]
+        tip = jj.Contact("rod", pose.q.s * jnp.eye(3)[0] + level, jj.Plane(level))
+        return {"rim": jj.wheel_contact(pose["wheel"], 0.1, 0.02), "tip": tip}
+
+
+LED = {
+    "slope": "a body off its ground: contact `rim`",
+    "lift": "a body off its ground: contact `rim`",
+    "swing": "a plane that moves in another way than is stated: the plane of contact `tip`",
+    "stretch": "an orientation that is no rotation: body `rod`",
+}
+
+
+@pytest.mark.parametrize("backend", ["auto", "dense"])
+def test_what_goes_wrong_on_the_way_along_geometric_rows_is_refused_alone_and_a_code_elsewhere(backend):
+    sound, each = Led(), 0.1 * jnp.eye(5)
+    parameters = {name: each[k] for k, name in enumerate(LED)}
+    lanes = jj.rollout(sound, sound.example, parameters=parameters, ts=[0.1], backend=backend)
+    assert lanes.result.tolist() == [*[results.BAD_PARAMETER] * len(LED), results.SUCCESS]
+    for k, (name, fault) in enumerate(LED.items()):
+        wrong = sound.replace(**{name: 0.1})
+        with pytest.raises(ValueError, match=fault.split("`")[1]):
+            jj.simulate(wrong, ts=[0.1], backend=backend)
+        assert fault in lanes.lane(k).message
+        assert int(compiled(wrong, backend)[0]) == results.BAD_PARAMETER
+    assert int(compiled(sound, backend)[0]) == results.SUCCESS

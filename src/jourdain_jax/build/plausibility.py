@@ -8,8 +8,8 @@ dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that s
 I_3 <= I_1 + I_2
 
 They are one table, `CHECKS`, of functions of numbers at some states. It is looked at where a scene is probed, where a fault is an error with its text. What
-has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the start, and what a start may hide also at random
-states of the domain (`also_elsewhere`).
+has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the start,
+which may hide what is wrong, and at random states of the domain, put on the geometric rows.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,6 @@ from jourdain_jax.build.assembling import random_states
 from jourdain_jax.calculus.reals import Flag, Scalar, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
-from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Wheel
 from jourdain_jax.scene.contacts import Contact
@@ -271,26 +270,26 @@ CHECKS = (
 )
 
 
-def also_elsewhere(scene: Scene) -> tuple[str, ...]:
-    """Return the kinds of numbers of which the state at the start says too little; those that hold on geometric rows alone, where there are none."""
-    return "ground", "plane", *(() if names_of_position_rows(scene) else ("gap", "own plane"))
+BY_ROWS = "gap", "own plane"  # kinds of numbers that geometric rows may keep right, or not
 
 
 def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return three random states t, q, u of the domain, as a scene is probed at; not on the geometric rows."""
+    """Return random states t, q, u of the domain, as a scene is probed at; not yet on the geometric rows."""
     return random_states(scene, 3, np.random.default_rng(0))
 
 
-def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return fault -> whether the scene has it at this state, or elsewhere; also under jit and vmap. NaN is no fault."""
-    states = jax.tree.map(lambda x, others: jnp.concatenate([x[None], others.astype(x.dtype)]), tuple(map(jnp.asarray, (t, q, u))), elsewhere(scene))
+def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
+    """Return fault -> whether the scene has it at this state, or `elsewhere`, with the coordinates of `others`.
+
+    Also under jit and vmap. NaN is no fault.
+    """
+    times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
+    pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
+    states = tuple(jnp.concatenate([x[None], more.astype(x.dtype)]) for x, more in pairs)
     # loads may be callbacks, which need not know batches
-    numbers, kinds = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states), also_elsewhere(scene)
-    seen = {(check, name): x if check.of in kinds else x[:1] for check in CHECKS if check.label for name, x in numbers[check.of].items()}
-    return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for (check, name), x in seen.items()}
-
-
-known_faults_at = eval_numpy(faults_at)
+    numbers = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states)
+    seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
+    return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:

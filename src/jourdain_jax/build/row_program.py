@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.plausibility import CHECKS, also_elsewhere, any_wrong, elsewhere
+from jourdain_jax.build.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
-from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -42,6 +41,7 @@ class RowProgram:
     A: dict[tuple[int, int], int]
     M: dict[tuple[int, int], int] | None  # lower triangle; None where it is too large to be written out
     right: int  # whether parameters and bodies are
+    others: tuple[int, ...]  # coordinates of other states, put on the geometric rows, on which that depends as well
 
 
 @once_per_class
@@ -50,7 +50,7 @@ def row_program(scene: Scene) -> RowProgram | None:
     scene = with_reference_parameters(scene)
     try:
         nodes = looked_at(scene)
-        right = _right(scene, nodes.traced)
+        right, others = _right(scene, nodes)
     except Unsupported:
         return None
     graph, traced = nodes.graph, nodes.traced
@@ -66,6 +66,7 @@ def row_program(scene: Scene) -> RowProgram | None:
         "A": _entries(nodes.rows, u),
         "M": _mass_matrix(nodes, u),
         "right": right,
+        "others": others,
     }
     needed = jax.tree.leaves(parts)
     if graph.calls(needed):
@@ -75,24 +76,32 @@ def row_program(scene: Scene) -> RowProgram | None:
     return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
 
 
-def _right(scene: Scene, traced: TracedScene) -> int:
-    """Return the node of a truth value: every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters decide.
+def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
+    """Return the node of a truth value, and the coordinates of other states on which it depends.
 
-    Numbers that no parameter decides are judged where the scene is probed.
+    Every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters decide. Numbers
+    that no parameter decides are judged where the scene is probed. Where geometric rows depend on parameters, these
+    decide coordinates.
     """
-    g, kinds = traced.graph, also_elsewhere(scene)
+    g, traced = looked.graph, looked.traced
+    states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0
+    on_rows = [[g.input(f"other_{k}_{i}", True) for i in range(count)] for k in range(len(states))]
     of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
+    held = traced.q.tolist() if any(depend_on(g, looked.closures, of_parameters)) else []
     varying = [traced.t, *traced.q.tolist(), *traced.u.tolist()]
-    others = [dict(zip(varying, map(g.const, [t, *q, *u]), strict=True)) for t, q, u in zip(*elsewhere(scene), strict=True)]
+    placed = [[g.const(t), *(own or map(g.const, q)), *map(g.const, u)] for (t, q, u), own in zip(states, on_rows, strict=True)]
+    others = [dict(zip(varying, state, strict=True)) for state in placed]
 
-    def at_states(kind: str, nodes: np.ndarray) -> np.ndarray:
+    def at_states(nodes: np.ndarray) -> np.ndarray:
         flat = nodes.ravel().tolist()
-        return np.array([flat, *(g.substituted(flat, other) for other in others if kind in kinds)]).reshape(-1, *nodes.shape)
+        return np.array([flat, *(g.substituted(flat, other) for other in others)]).reshape(-1, *nodes.shape)
 
     judged = dict.fromkeys(check.of for check in CHECKS if check.label)
     every = {kind: list(map(np.asarray, traced.particulars.numbers[kind].values())) for kind in judged}
-    kept = {kind: [x for x in of if any(depend_on(g, x.ravel().tolist(), of_parameters))] for kind, of in every.items()}
-    stacked = {kind: np.stack([at_states(kind, x) for x in of], 1) for kind, of in kept.items() if of}
+    deciding = {kind: [*of_parameters, *(held if kind in BY_ROWS else [])] for kind in judged}
+    matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))  # noqa: E731
+    kept = {kind: [x for x in of if matters(kind, x)] for kind, of in every.items()}
+    stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
     nodes = [*traced.parameters, *stacked.values()]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
 
@@ -102,7 +111,8 @@ def _right(scene: Scene, traced: TracedScene) -> int:
 
     closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
     (found,) = interpret(g, closed, [Nodes(x) for x in nodes])
-    return int(as_nodes(g, found))
+    node, given = int(as_nodes(g, found)), [n for state in on_rows for n in state]
+    return node, given if any(depend_on(g, [node], given)) else []
 
 
 def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int, int], int]:

@@ -178,7 +178,7 @@ def structure_of(scene: Scene) -> Structure:
     """
     structure = structure_whatever_its_faults(scene)
     # numbers that replace traced parameters prove nothing of bodies and grounds
-    if wrong := structure.kinks or (not is_traced(scene) and (structure.odd_grounds or structure.faults)):
+    if wrong := structure.kinks or (is_judged(scene) and (structure.odd_grounds or structure.faults)):
         raise ValueError(wrong[0])
     return structure
 
@@ -188,11 +188,16 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
     return _structure(as_scene(scene))
 
 
+def is_judged(scene: Scene) -> bool:
+    """Return whether the parameters of a scene are known, so that what is found at its probed states is its own."""
+    return not is_traced(scene)
+
+
 def trust(scene: Scene) -> float:
     """Return the reliability of typical lengths: a thousandth for traced parameters, whose replacements may
     be of another order.
     """
-    return 1e-3 if is_traced(scene) else 1.0
+    return 1.0 if is_judged(scene) else 1e-3
 
 
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:

@@ -33,7 +33,7 @@ from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.native import native_motion, values
 from jourdain_jax.motion.own_steps import reason_against_watching
-from jourdain_jax.motion.put_on_rows import State, projected
+from jourdain_jax.motion.put_on_rows import State, coordinates_elsewhere, projected
 from jourdain_jax.motion.setup import Begun, Passed, Plain, Setup, Solved, times_fit
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.over_times import Phases
@@ -260,10 +260,15 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
-    if program is None or unsupported(program.graph, [program.right]):
-        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, *at).values()]))
+    program = None if program is None or unsupported(program.graph, [program.right]) else program
+    unneeded = setup.judged or (program is not None and not program.others)
+    others = jnp.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
+    if program is None:
+        faults = faults_at(scene, *at, others)
+        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
     else:
-        right = values.is_right(program, scene, *at)
+        nowhere = jnp.full(len(program.others), jnp.nan)
+        right = values.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 

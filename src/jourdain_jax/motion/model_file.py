@@ -54,7 +54,7 @@ def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], di
 
 
 def _about(scene: Scene, content: bytes) -> dict:
-    versions = {"format": 1, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
+    versions = {"format": 2, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
     return versions | {"scene": digest((type(scene), scene)), "sha256": hashlib.sha256(content).hexdigest()}
 
 

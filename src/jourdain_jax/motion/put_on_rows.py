@@ -21,13 +21,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.assembling import coordinate_bounds
+from jourdain_jax.build.plausibility import elsewhere, faults_at
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.derivatives import differentiated_as
-from jourdain_jax.calculus.reals import rank_cutoff, real_type
+from jourdain_jax.calculus.reals import Flag, rank_cutoff, real_type
 from jourdain_jax.calculus.roots import first_root
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.scaling import row_scale
@@ -229,6 +231,31 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
     names = scene.coordinate_names, scene.speed_names
     state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(right, residual, jnp.inf), names, guess.astype(q.dtype))
     return state, arrived
+
+
+def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
+    """Return coordinates of the states `elsewhere`, on the geometric rows; NaN where none are found in the domain.
+
+    `native`: whether machine code may put them there.
+    """
+    t, q, u = jax.tree.map(lambda x: jnp.asarray(x, real_type()), elsewhere(scene))
+    if not names_of_position_rows(scene):
+        return q
+    here, usual = jax.lax.stop_gradient(scene), usual_sizes(scene, False, native)
+    every = jnp.ones(q.shape[1], bool)
+
+    def put(state):
+        t, q = state
+        near_q, g = put_positions(here, t, q, every, usual)
+        return jnp.where(_arrived(q, near_q, g, Guess(q, u[0], every, every, every, usual)), near_q, jnp.nan)
+
+    return jax.lax.map(put, (t, q))  # rows may be callbacks, which need not know batches
+
+
+@eval_numpy
+def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
+    """Return fault -> whether a scene of known numbers has it at this state, or elsewhere."""
+    return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
 def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:

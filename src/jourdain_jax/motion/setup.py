@@ -122,6 +122,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     longest: Float[Array | np.ndarray, "*lanes"] | float  # step, s
     integrator: Integrator
     usual: Usual | None  # sizes by which the start is projected; None where it is on its constraints
+    judged: bool  # whether parameters were known where the scene was probed, and so judged there, at many states
     reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.build.structure import is_judged
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, Numbers, as_array, described, is_traced, known_numbers, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
@@ -144,7 +145,9 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, model.decided)
+    judged = model.once("judged", lambda: is_judged(scene))
+    steps = tolerances, first_step, longest, integrator
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, *steps, usual, judged, model.decided)
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):

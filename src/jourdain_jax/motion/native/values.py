@@ -365,11 +365,12 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     return own.at_states.numbers(fixed, t, q, y, inputs)[-2:]
 
 
-def is_right(program: RowProgram, scene: Scene, t, q, u, inputs) -> Flag:
+def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
     """Return whether parameters are right, and the bodies and contacts that they make; as `parameter_faults`
     and `faults_at`.
     """
-    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs]
+    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs, others]
     parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
-    run = nodes_called(program.graph, [program.right], [*parameters, program.t, *program.q, *program.u, *program.inputs])
+    given = [*parameters, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    run = nodes_called(program.graph, [program.right], given)
     return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.plausibility import known_faults_at
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.markers import nan_where
 from jourdain_jax.calculus.reals import checked_real
@@ -18,7 +17,7 @@ from jourdain_jax.equations.listed import names_of_bodies
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, known_faults_at
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, lost_of, summary, warnings_of
