@@ -234,11 +234,12 @@ class Functions:
         states, times = self._reset_at(event, t, varying, fixed, list(modes))
         self._store(states, after, self.count)
         self.w.store(modes, after, Rows(of["mode"].start, len(modes)))
-        energy = integrands.energy(t, self._state(parts[0][0]), self._args(parts[0][1:]))
-        own, self.modes = self.modes, list(modes)
-        lost = energy - integrands.energy(t, self._state(states[0]), self._args(parts[0][1:]))
-        self.modes = own
-        self.w.store(lost, after, of["lost"].start)
+        if self.form.transitions:
+            energy = integrands.energy(t, self._state(parts[0][0]), self._args(parts[0][1:]))
+            own, self.modes = self.modes, list(modes)
+            lost = energy - integrands.energy(t, self._state(states[0]), self._args(parts[0][1:]))
+            self.modes = own
+            self.w.store(lost, after, of["lost"].start)
         self._store([x[None] for x in times], self.w.at(after, of["t"].start), 1)
 
     def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:

@@ -17,12 +17,18 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
     def begin() -> None:
         f, y, pivots = w.room(form.integrated), w.room(form.integrated), w.room(max(len(form.monitored), 1))
         values, ahead, rates = (w.room(form.events) for _ in range(3))
-        w.run("rates", p.pointer, t, p.pointer, f, pivots)
-        w.run("events", p.pointer, t, p.pointer, f, values, rates)
-        each_row(w, form.integrated, y, lambda i: w.fma(0.5 * d, w.load(f, i), w.load(p.pointer, i)))
-        w.run("rates", p.pointer, t + 0.5 * d, y, f, pivots)
-        each_row(w, form.integrated, y, lambda i: w.fma(d, w.load(f, i), w.load(p.pointer, i)))
-        w.run("events", p.pointer, t + d, y, f, ahead, rates)
+        shares = w.table([0.0, 0.5, 1.0])
+
+        def stage(i: Number, _: tuple) -> tuple:
+            time = w.fma(d, shares[i], t)
+            each_row(w, form.integrated, y, lambda row: w.fma(d * shares[i], w.load(f, row), w.load(p.pointer, row)))
+            w.run("rates", p.pointer, time, y, f, pivots)
+            w.run("events", p.pointer, time, y, f, ahead, rates)
+            each_row(w, form.events, values, lambda k: w.at_first(i, w.load(ahead, k), w.load(values, k)))
+            return ()
+
+        each_row(w, form.integrated, f, lambda row: 0.0)
+        w.over_stages(3, stage, ())
         for k, row in enumerate(list(form.rows["mode"])[form.modes :], first):
             x, later = w.load(values, k), w.load(ahead, k)
             # noise beside what it changes by

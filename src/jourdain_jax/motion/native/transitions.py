@@ -70,7 +70,7 @@ def reset_program(form: Form) -> Reset:
     c, after = chosen(of_events), [chosen(resets[i::each]) for i in range(each)]
     kept = dict(zip([*y, *modes], after[:-1], strict=True))
     energy = graph.add(T, V)
-    lost = graph.sub(energy, *graph.substituted([energy], kept))
+    lost = graph.sub(energy, *graph.substituted([energy], kept)) if form.transitions else graph.zero
     state, modes_after, times = after[: form.q_and_v], after[form.q_and_v : -1], [t]
     # each with its tangents, as many as are lifted so far
     work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
