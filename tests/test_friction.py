@@ -482,3 +482,99 @@ def test_a_kerb(speed, climbs):
     np.testing.assert_allclose(motion.phases.lost[0] / (0.7 * speed**2), 1 - (6 / 7) ** 2, rtol=1e-5)
     assert motion.phases.modes[:, 1].tolist() == [0, 1]
     assert bool(motion["x"][0] > 0) == climbs
+
+
+def test_an_elastic_bounce_runs_backwards():
+    """From the end with reversed speeds the ball comes back to where it began."""
+    smooth = Ball(bounce=1.0, friction=0.0)
+    there = jj.simulate(smooth, {"z": 0.3, "x_rate": 0.5, "z_rate": -0.2}, ts=[0.6], **FINE)
+    back = {name: there[name][0] for name in "xyz"} | {f"{name}_rate": -there[f"{name}_rate"][0] for name in "xyz"}
+    begun = jj.simulate(smooth, back, ts=[0.6], **FINE)
+    assert np.isfinite(there.phases.ts).sum() == 1
+    ends = [begun[name][0] for name in ("x", "z", "x_rate", "z_rate")]
+    np.testing.assert_allclose(ends, [0.0, 0.3, -0.5, 0.2], atol=1e-12)
+
+
+class Scooter(Ball):
+    """A rigid body on two balls in space; `order`: of its contacts."""
+
+    order: tuple[str, ...] = eqx.field(static=True, default=("front", "rear"))
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        inertia = jnp.diag(jnp.array([0.02, 0.05, 0.06])) * self.mass
+        place = jnp.stack([q.x, q.y, q.z])
+        return {"ball": jj.RigidBody(self.mass, inertia, place, jj.quaternion_to_matrix(q.attitude))}
+
+    def contacts(self, pose):
+        law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
+        centres = {"front": jnp.array([0.4, 0.0, 0.0]), "rear": jnp.array([-0.4, 0.0, 0.0])}
+        return {name: jj.ball_contact(pose["ball"], self.radius, centre=centres[name], **law) for name in self.order}
+
+
+SCOOTER = {"mass": 1.0, "radius": 0.1, "friction": 0.4, "bounce": 0.3}
+
+
+def test_bodies_dropped_on_two_contacts_in_space():
+    """Both contacts slip, stick and open together; where Newton's restitution would gain energy, a code says so."""
+    count = 60
+    draw = np.random.default_rng(0)
+    angle, height = draw.uniform(-0.25, 0.25, count), draw.uniform(0.0, 0.1, count)
+    attitude = np.stack([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=1)
+    speed, spin = draw.uniform(-1, 1, (2, count)), draw.uniform(-1, 1, (count, 3)) * [3, 1, 3]
+    start = {"z": 0.1 + 0.4 * np.abs(np.sin(angle)) + height, "attitude": attitude}
+    start |= {"x_rate": speed[0], "y_rate": speed[1], "attitude_omega": spin}
+    rollout = jj.rollout(Scooter(**SCOOTER), start, t1=1.5, rtol=1e-8, atol=1e-8)
+    reached = np.asarray(rollout.result) == 0
+    assert reached.sum() >= 0.9 * count
+    assert set(np.asarray(rollout.result)[~reached].tolist()) <= {19, 21}
+    for lane in np.flatnonzero(reached)[:20]:
+        balance = rollout.lane(int(lane)).energies().balance
+        np.testing.assert_allclose(balance, balance[0], atol=1e-6)
+
+
+def test_contacts_that_close_together_strike_together():
+    """Dropped flat on both, the body stays level and slips by the impulse of both, in either order of the contacts."""
+    start = {"z": 0.1 + 0.2, "y_rate": 2.5}
+    ends = []
+    for order in (("front", "rear"), ("rear", "front")):
+        motion = jj.simulate(Scooter(**SCOOTER, order=order), start, ts=[0.21], **FINE)
+        assert motion.phase("front")[0] == motion.phase("rear")[0] == 0
+        ends.append([motion[name][0] for name in ("z", "z_rate", "y_rate", "attitude_omega_x", "attitude_omega_y")])
+    fall = np.sqrt(2 * 0.2 / G)
+    rebound = 0.3 * G * fall
+    after = 0.21 - fall
+    height, speed = 0.1 + rebound * after - G * after**2 / 2, rebound - G * after
+    sideways = 2.5 - 0.4 * 1.3 * G * fall
+    turned = 0.4 * 1.3 * G * fall * 0.1 / 0.02
+    np.testing.assert_allclose(ends[0], [height, speed, sideways, -turned, 0.0], atol=1e-11)
+    ends[1][4] *= -1  # what is round-off here changes its sign as the body is turned round
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+class TippeTop(Ball):
+    """A ball whose mass centre is off its centre, along its axis of symmetry."""
+
+    def bodies(self, t, q):
+        inertia = jnp.diag(jnp.array([4.0, 4.0, 3.6])) * self.mass * self.radius**2 / 10
+        place = jnp.stack([q.x, q.y, q.z])
+        return {"ball": jj.RigidBody(self.mass, inertia, place, jj.quaternion_to_matrix(q.attitude))}
+
+    def contacts(self, pose):
+        law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
+        return {"cloth": jj.ball_contact(pose["ball"], self.radius, centre=jnp.array([0.0, 0.0, 0.004]), **law)}
+
+
+def test_jelletts_integral_of_a_tippe_top():
+    """L.(point of contact - mass centre) is constant while it flies, slips and rolls, and in impacts."""
+    top = TippeTop(mass=0.02, radius=0.02, friction=0.25, bounce=0.4)
+    attitude = np.array([np.cos(0.1), np.sin(0.1), 0.0, 0.0])
+    start = {"z": 0.02 - 0.004 * np.cos(0.2) + 0.001, "attitude": attitude, "attitude_omega": (0.0, 3.0, 150.0)}
+    motion = jj.simulate(top, start, ts=np.linspace(0.0, 1.0, 41), max_transitions=300, **FINE)
+    integral = []
+    for q, u in zip(motion.q, motion.u, strict=True):
+        R = np.asarray(jj.quaternion_to_matrix(q[3:7]))
+        momentum = R @ (np.diag([4.0, 4.0, 3.6]) * 0.02 * 0.02**2 / 10) @ u[3:6]
+        integral.append(momentum @ (R @ np.array([0.0, 0.0, 0.004]) - np.array([0.0, 0.0, 0.02])))
+    np.testing.assert_allclose(integral, integral[0], rtol=1e-10)
+    assert np.isfinite(motion.phases.ts).sum() > 3

@@ -1,4 +1,4 @@
-"""Coulomb's law at one contact, the forces of all, and impulses, by small systems that unroll to scalars.
+"""Coulomb's law at all contacts, their forces, and impulses, by small systems that unroll to scalars.
 
 Accelerations of the gap and of slip are `G L + b` with the forces L, and so are changes of speeds with
 impulses: one law serves both.
@@ -7,54 +7,39 @@ impulses: one law serves both.
     sticks:   (G L + b)_t = 0, |L_t| <= mu L_n
     slips:    L_t = -mu L_n e,  (G L + b)_t along e
 
-Rows of a contact: normal, then the two tangents of the ground. The direction e of slip that begins is the
-root of `e x (G L + b)_t = 0`, found by a fixed number of Newton's steps, so that its derivatives of any order
-are right.
+Rows of a contact: normal, then the two tangents of the ground.
 Source of the limit directions: M. Antali and G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar
 
-NEWTON_STEPS = 6
+SWEEPS, STEPS = 4, 5  # of Gauss-Seidel for each contact, of Newton's method for one and one more for each other
 SLOW = 5e-6  # m/s: below, the direction of slip turns as it does at this speed
 ROUND_OFF = 1e-9  # of responses
 LEAST_SLIP = 1e-8  # m/s: round-off, of speeds that impulses change
 LEAST_PIVOT = 1e-12  # beside the entry that it is what is left of
 
 
-class Law(NamedTuple):
-    """What Coulomb's law makes of one contact."""
-
-    sticking: Float[Array, "3"]  # forces with which it sticks
-    slipping: Float[Array, "3"]  # forces with which it slips, or begins to; no numbers where it cannot
-    sticks: Flag
-    opens: Flag  # whether it would have to pull
-    direction: Float[Array, "2"]  # of slip
-    exists: Flag  # whether it has an answer
-
-
 def solved(
     K: Sequence[Float[Array, "n"]],
     right: Sequence[Float[Array, "columns"]],
-    sizes: Sequence[Scalar] | None = None,
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
     An unknown whose pivot vanishes is zero, as the force across a plane in which all bodies move.
-
-    `sizes`: beside which it vanishes; default: the entries of the diagonal.
     """
     count, inverses = len(K), []
     rows = [jnp.concatenate([a, b]) for a, b in zip(K, right, strict=True)]
     for p in range(count):
         pivot = rows[p][p]
-        there = jnp.abs(pivot) > LEAST_PIVOT * jnp.abs(K[p][p] if sizes is None else sizes[p])
+        there = jnp.abs(pivot) > LEAST_PIVOT * jnp.abs(K[p][p])
         inverses.append(jnp.where(there, 1 / jnp.where(there, pivot, 1.0), 0.0))
         for r in range(p + 1, count):
             rows[r] = rows[r] - (rows[r][p] * inverses[p]) * rows[p]
@@ -75,84 +60,151 @@ class Modes(NamedTuple):
     direction: Float[Array, "contacts 2"]
 
 
+def system(
+    G: Float[Array, "rows rows"], modes: Modes, friction: Float[Array, "contacts"]
+) -> tuple[Float[Array, "rows rows"], Float[Array, "rows"]]:
+    """Return K and s of `K L = -s b`, the laws of all contacts in their modes.
+
+    s_n (G L + b)_n + (1 - s_n) L_n = 0,   s_t (G L + b)_t + (1 - s_t) (L_t + mu L_n e) = 0
+    """
+    s = jnp.stack([modes.closed, modes.rolls, modes.rolls], axis=1).ravel()
+    along = friction[:, None] * modes.direction
+    blocks = [jnp.eye(3, dtype=G.dtype).at[1:, 0].set(own) for own in along]
+    return s[:, None] * G + (1 - s)[:, None] * jax.scipy.linalg.block_diag(*blocks), s
+
+
+def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
+    """Return `K^-1 right` of a `system`.
+
+    Tangents come first: then every pivot is positive, unless a slipping contact has no solution (Painleve).
+    """
+    count = len(K) // 3
+    order = [3 * i + k for i in range(count) for k in (1, 2)] + [3 * i for i in range(count)]
+    rows = [K[row][jnp.array(order)] for row in order]
+    found = dict(zip(order, solved(rows, [right[row] for row in order]), strict=True))
+    return jnp.stack([found[row] for row in range(len(K))])
+
+
 def responses(
     G: Float[Array, "rows rows"],
     b: Float[Array, "rows columns"],
     modes: Modes,
     friction: Float[Array, "contacts"],
 ) -> Float[Array, "rows columns"]:
-    """Return the forces at all contacts in their modes for each of several b.
+    """Return the forces at all contacts in their modes for each of several b, by `system`."""
+    K, s = system(G, modes, friction)
+    return forces(K, -s[:, None] * b)
 
-    s_n (G L + b)_n + (1 - s_n) L_n = 0,   s_t (G L + b)_t + (1 - s_t) (L_t + mu L_n e) = 0
 
-    Tangents come first: then every pivot is positive, unless a slipping contact has no solution (Painleve).
+class Law(NamedTuple):
+    """Contacts at which Coulomb's law is to hold; `G P + b` are their speeds, or accelerations."""
+
+    G: Float[Array, "rows rows"]
+    b: Float[Array, "rows"]
+    target: Float[Array, "contacts"]  # least normal response
+    friction: Float[Array, "contacts"]  # mu of slip
+    static: Float[Array, "contacts"]  # mu of sticking
+    touches: Bool[Array, "contacts"]  # others have no force
+    slides: Bool[Array, "contacts"]  # in the direction e, whatever the response
+    begins: Bool[Array, "contacts"]  # to slip: closed, in a direction to be found
+    e: Float[Array, "contacts 2"]
+
+
+class Solution(NamedTuple):
+    """Forces of all contacts, their modes, and whether these satisfy the law at each."""
+
+    P: Float[Array, "contacts 3"]
+    modes: Modes
+    holds: Bool[Array, "contacts"]
+
+
+def coulomb(law: Law) -> Solution:
+    """Return forces that satisfy Coulomb's law at all contacts at once, with w = G P + b.
+
+    w_n >= target and P_n >= 0, one of them with equality;
+    w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
+
+    Sweeps of projected Gauss-Seidel come first. Then Newton's method solves the equations of the modes,
+    directions included, and decides the modes before each step: by the signs of
+
+        N = P_n - (w_n - target)/G_nn,   |T| - mu_s N with T = P_t - w_t/tr G_tt
+
+    Derivatives are those of these equations. Shares of redundant contacts stay as the sweeps find them.
+    Source: P. Alart and A. Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
     """
-    count = len(friction)
-    order = [3 * i + k for i in range(count) for k in (1, 2)] + [3 * i for i in range(count)]
-    unit = jnp.eye(len(G), dtype=G.dtype)
-    K, right = [], []
-    for row in order:
-        i, k = divmod(row, 3)
-        s = modes.rolls[i] if k else modes.closed[i]
-        other = unit[row] + friction[i] * modes.direction[i, k - 1] * unit[3 * i] if k else unit[row]
-        K.append((s * G[row] + (1 - s) * other)[jnp.array(order)])
-        right.append(-s * b[row])
-    found = dict(zip(order, solved(K, right), strict=True))
-    return jnp.stack([found[row] for row in range(len(G))])
+    G, b, count = law.G, law.b, len(law.target)
+    normal, tangential = _scales(G)
+    P = jnp.zeros((count, 3), b.dtype)
+    for turn in range(count * count * SWEEPS):
+        j = turn % count
+        w = G[3 * j : 3 * j + 3] @ P.ravel() + b[3 * j : 3 * j + 3]
+        N = jnp.where(law.touches[j], jnp.maximum(P[j, 0] - (w[0] - law.target[j]) * normal[j], 0.0), 0.0)
+        T = P[j, 1:] - (w[1:] + G[3 * j + 1 : 3 * j + 3, 3 * j] * (N - P[j, 0])) * tangential[j]
+        bound, square = law.static[j] * N, T @ T
+        over = square > bound * bound
+        T = jnp.where(over, bound / jnp.sqrt(jnp.where(over, square, 1.0)), 1.0) * T
+        P = P.at[j].set(jnp.append(N, jnp.where(law.slides[j], -law.friction[j] * N * law.e[j], T)))
+    modes = _modes(law, P)
+    for _ in range(STEPS + count - 1):
+        P, e = _improved(law, P, modes)
+        found, modes = modes._replace(direction=e), _modes(law, P)
+    return Solution(P, found, holds(law, P, found))
 
 
-def coulomb(
-    G: Float[Array, "3 3"],
-    b: Float[Array, "3"],
-    target: Scalar,
-    friction: Scalar,
-    static: Scalar,
-    sizes: Float[Array, "3"],
-) -> Law:
-    """Return the law's solution for a closed contact; `target`: the normal part of its response `G L + b`.
+def _scales(G: Float[Array, "rows rows"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
+    """Return 1/G_nn and 1/tr G_tt of each contact, zero for zero."""
+    sizes = jnp.diagonal(G).reshape(-1, 3)
+    sizes = jnp.stack([sizes[:, 0], sizes[:, 1] + sizes[:, 2]])
+    return tuple(jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1.0), 0.0))
 
-    With g = G_tn, H = G_tt and c = target - b_n the direction of slip is a root of
 
-        F(e) = (G_nn - mu g.e) (e x b_t) + c (e x g) - c mu (e x H e),      F' along n = J e
+def _modes(law: Law, P: Float[Array, "contacts 3"]) -> Modes:
+    """Return the modes of contacts under these forces."""
+    normal, tangential = _scales(law.G)
+    w = (law.G @ P.ravel() + law.b).reshape(-1, 3)
+    N, T = P[:, 0] - (w[:, 0] - law.target) * normal, P[:, 1:] - w[:, 1:] * tangential[:, None]
+    closed = law.touches & ((N > 0) | law.begins)
+    sticks = closed & ~(law.slides | law.begins) & (jnp.sum(T * T, axis=1) <= (law.static * N) ** 2)
+    e = jnp.where(law.slides[:, None], law.e, -unit(T))
+    return Modes(jnp.where(closed, 1.0, 0.0), jnp.where(sticks, 1.0, 0.0), e)
 
-    `friction`, `static`: the coefficients mu of slip and of sticking. `sizes`: entries of the diagonal of G,
-    beside which a pivot vanishes.
+
+def _improved(
+    law: Law, P: Float[Array, "contacts 3"], modes: Modes
+) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
+    """Return forces and directions of slip after one step of Newton's method.
+
+    Unknowns are P and the angles of the directions e that are to be found: n.w_t = 0 there, n = J e.
     """
-    c, free = target - b[0], b[1:]
-    sticking = jnp.concatenate(solved(list(G), [c[None], -b[1:2], -b[2:3]], list(sizes)))
-    bound, across = static * sticking[0], sticking[1:] @ sticking[1:]
-    loaded = across > 0
-    against = jnp.where(loaded, -sticking[1:], jnp.array([1.0, 0.0])) / jnp.sqrt(
-        jnp.where(loaded, across, 1.0)
-    )
-    g, H = G[0, 1:], G[1:, 1:]
+    (K, s), e = system(law.G, modes, law.friction), modes.direction
+    n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
+    free = (modes.closed > 0) & (modes.rolls == 0) & ~law.slides
+    wanted = law.b - jnp.zeros_like(P).at[:, 0].set(law.target).ravel()
+    turning = jnp.where(free, -law.friction * P[:, 0], 0.0)[:, None] * n
+    columns = jax.scipy.linalg.block_diag(*jnp.pad(turning, ((0, 0), (1, 0)))[:, :, None])
+    change = forces(K, jnp.concatenate([-(K @ P.ravel() + s * wanted)[:, None], columns], axis=1))
+    first, by_turn = P.ravel() + change[:, 0], change[:, 1:]
+    w = (law.G @ first + law.b).reshape(-1, 3)[:, 1:]
+    aside = jnp.einsum("jk,jkc->jc", n, (law.G @ by_turn).reshape(len(P), 3, -1)[:, 1:])
+    along, across = jnp.sum(e * w, axis=1), jnp.sum(n * w, axis=1)
+    slopes = jnp.where(free[:, None], aside - jnp.diag(along), jnp.eye(len(P)))
+    angles = jnp.concatenate(solved(list(slopes), list(jnp.where(free, -across, 0.0)[:, None])))
+    return (first + by_turn @ angles).reshape(-1, 3), unit(e + angles[:, None] * n)
 
-    def slipping(e: Float[Array, "2"]) -> tuple[Float[Array, "3"], Float[Array, "2"], Flag]:
-        """Forces, direction, and whether it is one of slip, for the root near e."""
-        for _ in range(NEWTON_STEPS):
-            n = jnp.stack([-e[1], e[0]])
-            D, He, Hn = G[0, 0] - friction * (g @ e), H @ e, H @ n
-            value = D * (n @ free) + c * (n @ g - friction * (n @ He))  # e x v = n.v
-            slope = (
-                -friction * (g @ n) * (n @ free) - D * (e @ free) - c * (e @ g + friction * (n @ Hn - e @ He))
-            )
-            e = e - jnp.where(slope == 0, 0.0, value / jnp.where(slope == 0, 1.0, slope)) * n
-            e = e / jnp.sqrt(e @ e)
-        D = G[0, 0] - friction * (g @ e)
-        normal = c / D
-        forces = jnp.concatenate([normal[None], -friction * normal * e])
-        response = free + G[1:] @ forces
-        most = ROUND_OFF * (jnp.sum(jnp.abs(free)) + jnp.sum(sizes[1:]) * jnp.sum(jnp.abs(forces)))
-        aside = e[0] * response[1] - e[1] * response[0]
-        return forces, e, (D > 0) & (e @ response > -most) & (jnp.abs(aside) < most)
 
-    (forces, e, lawful), (other, turned, instead) = slipping(against), slipping(-against)
-    forces, e = (
-        jnp.where(lawful, forces, jnp.where(instead, other, jnp.nan)),
-        jnp.where(lawful | ~instead, e, turned),
-    )
-    sticks = (bound >= 0) & (across <= bound * bound)
-    return Law(sticking, forces, sticks, c < 0, e, sticks | lawful | instead)
+def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, "contacts"]:
+    """Return at which contacts these forces satisfy the law, but for round-off."""
+    normal, tangential = _scales(law.G)
+    w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction
+    least = ROUND_OFF * jnp.sum(jnp.abs(law.b))
+    excess, slip, N = w[:, 0] - law.target, w[:, 1:], P[:, 0]
+    held = jnp.sum(P[:, 1:] ** 2, axis=1) <= (law.static * N) ** 2 * (1 + ROUND_OFF) + (least * tangential) ** 2
+    aside = jnp.abs(e[:, 0] * slip[:, 1] - e[:, 1] * slip[:, 0])
+    slips = law.slides | ((jnp.sum(e * slip, axis=1) >= -least) & (aside <= least))
+    sticks = held & (jnp.sum(slip * slip, axis=1) <= least**2)
+    bears = (-least * normal <= N) & (jnp.abs(excess) <= least)
+    closed = bears & jnp.where(modes.rolls > 0, sticks, slips)
+    return ~law.touches | jnp.where(modes.closed > 0, closed, excess >= -least)
 
 
 def unit(x: Float[Array, "*contacts 2"]) -> Float[Array, "*contacts 2"]:
@@ -180,13 +232,11 @@ def impulse(
     w: Float[Array, "3"],
     restitution: Scalar,
     friction: Scalar,
-    sizes: Float[Array, "3"],
 ) -> Impulse:
     """Return the impulse at a contact that strikes with the speeds w; `restitution`: e.
 
-    moreau:  w_n+ = -e w_n, Coulomb's law on the slip afterwards
-    others:  dw/ds = G (1, -mu e_t) along the normal impulse s, e_t along w_t; once slip has stopped, the
-             contact sticks, or slips along the limit direction
+    dw/ds = G (1, -mu e_t) along the normal impulse s, e_t along w_t; once slip has stopped, the contact
+    sticks, or slips along the limit direction
 
     newton:     until w_n+ = -e w_n
     poisson:    until s = (1 + e) s_c              c: the compression, which ends at w_n = 0
@@ -195,14 +245,8 @@ def impulse(
     The speeds w change linearly along each of two pieces. P is NaN where slip would turn during the first.
     Source: W. J. Stronge, Impact Mechanics (2000).
     """
-    if kind == "moreau":
-        law = coulomb(G, w, -restitution * w[0], friction, friction, sizes)
-        slips = ~law.sticks & moves(w + G @ law.slipping, LEAST_SLIP)
-        return Impulse(jnp.where(slips, law.slipping, law.sticking), slips, law.exists)
-    at_rest = coulomb(
-        G, jnp.array([-1.0, 0.0, 0.0]), jnp.zeros_like(friction), friction, friction, sizes
-    )  # for w_n to rise by one
-    by_stop = jnp.where(at_rest.sticks, at_rest.sticking, at_rest.slipping)
+    at_rest = coulomb(_one(G, friction))  # for w_n to rise by one
+    by_stop, sticks = at_rest.P[0], at_rest.modes.rolls[0] > 0
     then = 1 / by_stop[0]  # slope of w_n once slip has stopped
     moving = moves(w, LEAST_SLIP)
     e = jnp.where(moving, unit(w[1:]), 0.0)
@@ -244,5 +288,11 @@ def impulse(
     goes_on = total > stops
     P = sliding * slides + jnp.where(goes_on, (total - sliding) * then * by_stop, 0.0)
     turned = jnp.where(moving, jnp.abs(e[0] * rates[2] - e[1] * rates[1]) * sliding, 0.0)
-    slips = (~goes_on | ~at_rest.sticks) & moves(w + G @ P, LEAST_SLIP)
-    return Impulse(jnp.where(turned < LEAST_SLIP, P, jnp.nan), slips, at_rest.exists | ~goes_on)
+    slips = (~goes_on | ~sticks) & moves(w + G @ P, LEAST_SLIP)
+    return Impulse(jnp.where(turned < LEAST_SLIP, P, jnp.nan), slips, at_rest.holds[0] | ~goes_on)
+
+
+def _one(G: Float[Array, "3 3"], friction: Scalar) -> Law:
+    """Return the law of one contact at rest whose normal speed is to rise by one."""
+    b, one, no = jnp.zeros(3, G.dtype).at[0].set(-1.0), jnp.ones(1, G.dtype), jnp.zeros(1, bool)
+    return Law(G, b, 0 * one, friction * one, friction * one, ~no, no, no, jnp.zeros((1, 2), G.dtype))

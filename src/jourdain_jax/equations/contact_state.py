@@ -39,13 +39,10 @@ class At:
             [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
         )
         self.friction = friction_of(scene, motion)
-        self.static = jnp.stack(
-            [
-                contact.friction.static
-                for contact in switching_contacts(scene, motion.pose()).values()
-                if contact.friction
-            ]
-        )
+        contacts = switching_contacts(scene, motion.pose()).values()
+        self.static = jnp.stack([contact.friction.static for contact in contacts if contact.friction])
+        self.restitution = jnp.stack([jnp.asarray(contact.restitution) for contact in contacts])
+        self.impacts = [contact.impact for contact in contacts]
         self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
@@ -58,13 +55,11 @@ class At:
     def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
         """Return the response of contact i while the others are in `modes` (default: the present ones)."""
         modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
-        if len(self.number) == 1:
-            return Alone(self.found.G, b, jnp.zeros((3, 4), b.dtype), jnp.diagonal(self.found.G))
         others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
         right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
         borne = responses(self.found.G, right, others, self.friction)
         total = (right + self.found.G @ borne)[mine]
-        return Alone(total[:, :3], total[:, 3], borne, jnp.diagonal(self.found.G)[mine])
+        return Alone(total[:, :3], total[:, 3], borne)
 
 
 class Alone(NamedTuple):
@@ -73,11 +68,10 @@ class Alone(NamedTuple):
     G: Float[Array, "3 3"]
     b: Float[Array, "3"]
     borne: Float[Array, "rows 4"]  # forces of all for those of this one, and without
-    sizes: Float[Array, "3"]  # of the diagonal of G, were all others open
 
-    def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "rows"]:
+    def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "contacts 3"]:
         """Return the forces of all contacts where contact i has its `own`."""
-        return (self.borne[:, :3] @ own + self.borne[:, 3]).at[3 * i : 3 * i + 3].set(own)
+        return (self.borne[:, :3] @ own + self.borne[:, 3]).reshape(-1, 3).at[i].set(own)
 
 
 def switched(scene: Scene, motion: Motion, numbers: Float[Array, "contacts"], q, u) -> Motion:

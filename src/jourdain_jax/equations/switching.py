@@ -29,13 +29,14 @@ from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
 from jourdain_jax.equations.contact_laws import SLOW, moves, solved, unit
 from jourdain_jax.equations.contact_rows import switching_contacts
 from jourdain_jax.equations.contact_state import At, switched
-from jourdain_jax.equations.impacts import LEAST_REBOUND, After
+from jourdain_jax.equations.impacts import LEAST_REBOUND, After, Changes
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.switching import CREEPS, FLIES, PAINLEVE, ROLLS, SLIPS
 
 NEARLY = 1e-4  # of the response of the ground that is left near Painleve's paradox
 STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
+SAME = 1e-12  # m: a contact that closes within it strikes together with another
 TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
 
@@ -62,9 +63,11 @@ def contact_changes(at: At) -> dict[str, Event]:
     """Return the state and the modes after each event of the switching contacts."""
     events = {}
     for i, name in enumerate(at.scene.switching.contacts):
-        number = at.number[i]
+        number, own = at.number[i], jnp.arange(len(at.number)) == i
         strikes, stops = number == FLIES, number == CREEPS
-        after = After(at, i, strikes)
+        together = own if at.impacts[i] != "moreau" else own | ((at.found.rows.gap < SAME) & (at.w[:, 0] < 0))
+        flying = strikes & (at.number == FLIES) & together
+        after = After(at, i, Changes(flying, own & stops, own & (number == ROLLS)))
         events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
         # where slip begins, the law at rest has its direction, also if round-off would let the contact stick
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
@@ -149,15 +152,12 @@ def contacts_at_start(at: At) -> Begun:
     e = jnp.where((closed & slips)[:, None], unit(w[:, 1:]), 0.0)
     q = jnp.append(motion.q.array[: -e.size], e)
     q, u = put_back(At(scene, switched(scene, motion, numbers, q, motion.u.array), at.found))
-    for i in range(len(numbers)):
-        after = After(At(scene, switched(scene, motion, numbers, q, u), None, at.responses), i, strikes[i])
-        settles = closed[i] & ~slips[i]
-        numbers = jnp.where(
-            strikes[i], after.numbers, numbers.at[i].set(jnp.where(settles, after.numbers[i], numbers[i]))
-        )
-        u = jnp.where(strikes[i], after.u, u)
-        e = jnp.where(strikes[i], after.e, jnp.where(settles, e.at[i].set(after.direction), e))
-        q = jnp.append(q[: -e.size], jnp.where((numbers >= SLIPS)[:, None], e, 0.0))
+    no = jnp.zeros_like(strikes)
+    begun = At(scene, switched(scene, motion, numbers, q, u), None, at.responses)
+    first = next((i for i, impact in enumerate(at.impacts) if impact != "moreau"), 0)
+    after = After(begun, first, Changes(strikes, no, no))
+    numbers, u, e = after.numbers, after.u, jnp.where((after.numbers >= SLIPS)[:, None], after.e, 0.0)
+    q = jnp.append(q[: -e.size], e)
     then = At(scene, switched(scene, motion, numbers, q, u), None, at.responses)
     bears = jnp.stack([(number != SLIPS) | (_bearing(then, i) > NEARLY) for i, number in enumerate(numbers)])
     below = jnp.where(jnp.all(bears & (numbers >= FLIES)), jnp.max(-gap, initial=0.0), jnp.inf)
