@@ -28,19 +28,22 @@ LEAST_PIVOT = 1e-12  # beside the entry that it is what is left of
 
 
 def solved(
-    K: Sequence[Float[Array, "n"]],
-    right: Sequence[Float[Array, "columns"]],
+    K: Sequence[Float[Array, "n"]], right: Sequence[Float[Array, "columns"]], vanishes: bool = True
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
-    An unknown whose pivot vanishes is zero, as the force across a plane in which all bodies move.
+    An unknown whose pivot vanishes is zero, as the force across a plane in which all bodies move; `vanishes`:
+    whether one may.
     """
     count, inverses = len(K), []
     rows = [jnp.concatenate([a, b]) for a, b in zip(K, right, strict=True)]
     for p in range(count):
         pivot = rows[p][p]
-        there = jnp.abs(pivot) > LEAST_PIVOT * jnp.abs(K[p][p])
-        inverses.append(jnp.where(there, 1 / jnp.where(there, pivot, 1.0), 0.0))
+        if vanishes:
+            there = jnp.abs(pivot) > LEAST_PIVOT * jnp.abs(K[p][p])
+            inverses.append(jnp.where(there, 1 / jnp.where(there, pivot, 1.0), 0.0))
+        else:
+            inverses.append(1 / pivot)
         for r in range(p + 1, count):
             rows[r] = rows[r] - (rows[r][p] * inverses[p]) * rows[p]
     x: list = [None] * count

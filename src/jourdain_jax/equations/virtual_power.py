@@ -202,7 +202,7 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     count, kept = len(motion.u.array), len(held.phi)
     right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
     # the last speeds first: they belong to the leaves of a tree, whose elimination fills nothing
-    moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1])))[::-1]
+    moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]
     if kept:
         by_rows, drift = moved[:, len(moved[0]) - kept :], jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1)
         moved = moved[:, : len(moved[0]) - kept]

@@ -45,7 +45,8 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
     for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
         rests, x = w.equal(side, 0.0), c[k]
         c[k] = w.where(rests, slowest(w, p) - w.magnitude(x), x)
-        rate[k] = w.where(rests & (x > 0.0), -rate[k], rate[k])
+        falling = w.where(w.equal(x, 0.0), -w.magnitude(rate[k]) * p["direction"], -rate[k])
+        rate[k] = w.where(rests & ~(x < 0.0), falling, rate[k])
     return [c, rate]
 
 
