@@ -578,3 +578,16 @@ def test_jelletts_integral_of_a_tippe_top():
         integral.append(momentum @ (R @ np.array([0.0, 0.0, 0.004]) - np.array([0.0, 0.0, 0.02])))
     np.testing.assert_allclose(integral, integral[0], rtol=1e-10)
     assert np.isfinite(motion.phases.ts).sum() > 3
+
+
+@pytest.mark.parametrize("bounce", [0.0, 0.5])
+def test_a_disc_that_falls_flat_has_a_code(bounce):
+    class Disc(Ball):
+        def contacts(self, pose):
+            law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
+            return {"rim": jj.disc_contact(pose["ball"], self.radius, **law)}
+
+    attitude = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])
+    motion = jj.simulate(Disc(bounce=bounce), {"z": 0.04, "attitude": attitude}, t1=1.0)
+    assert "fell flat on its ground" in str(motion)
+    assert abs(motion.q_end[2]) < 1e-5

@@ -27,7 +27,7 @@ from jourdain_jax.equations.contact_laws import (
     unit,
 )
 from jourdain_jax.equations.contact_state import At, switched
-from jourdain_jax.scene.switching import CREEPS, FLIES, GAINS_ENERGY, PAINLEVE, ROLLS, SLIPS, UNDECIDED
+from jourdain_jax.scene.switching import CREEPS, FLAT, FLIES, GAINS_ENERGY, PAINLEVE, ROLLS, SLIPS, UNDECIDED
 
 LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
 
@@ -109,6 +109,8 @@ class After:
             (gained > ROUND_OFF * jnp.abs(P @ rows.w), GAINS_ENERGY),
             ((hits & ~struck.is_decided) | ~jnp.isfinite(gained), UNDECIDED),
         )
+        if (leaning := at.leaning[i]) is not None:
+            faults = (*faults, ((touches | strikes)[i] & (leaning < 0), FLAT))
         for fault, why in faults:
             numbers = numbers.at[i].set(jnp.where(fault, float(why), numbers[i]))
         self.numbers = numbers

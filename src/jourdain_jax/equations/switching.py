@@ -13,6 +13,8 @@
     slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
     creeps      L_n             e.w_t                        2 s - e.w_t
 
+A disc or wheel that rolls or slips ends its motion as it falls flat, too, by the event of speed.
+
 The direction of slip is a number of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e (`slip_turns`):
 errors of w_t across it do not turn it. It has no limit at rest: below the speed s, s replaces e.w_t.
 
@@ -28,11 +30,11 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
 from jourdain_jax.equations.contact_laws import SLOW, moves, solved, unit
 from jourdain_jax.equations.contact_rows import switching_contacts
-from jourdain_jax.equations.contact_state import At, switched
+from jourdain_jax.equations.contact_state import LEVEL, At, switched
 from jourdain_jax.equations.impacts import LEAST_REBOUND, After, Changes
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.modes import Event
-from jourdain_jax.scene.switching import CREEPS, FLIES, PAINLEVE, ROLLS, SLIPS
+from jourdain_jax.scene.switching import CREEPS, FLAT, FLIES, PAINLEVE, ROLLS, SLIPS
 
 NEARLY = 1e-4  # of the response of the ground that is left near Painleve's paradox
 STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
@@ -53,9 +55,12 @@ def contact_events(at: At) -> dict[str, Scalar]:
             one,
             jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed),
         )
-        events[f"{name} speed"] = jnp.where(
-            number == CREEPS, 2 * SLOW - along, jnp.where(number == SLIPS, _bearing(at, i) - NEARLY, one)
-        )
+        bears, stands = _bearing(at, i) - NEARLY, one
+        if (leaning := at.leaning[i]) is not None:
+            stands = jnp.where(number == ROLLS, leaning, one)
+            bears = bears * leaning / jnp.sqrt(bears**2 + leaning**2)  # zero with either
+        while_slips = jnp.where(number == SLIPS, bears, stands)
+        events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, while_slips)
     return events
 
 
@@ -72,7 +77,10 @@ def contact_changes(at: At) -> dict[str, Event]:
         # where slip begins, the law at rest has its direction, also if round-off would let the contact stick
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
-        faster = jnp.where(number == CREEPS, float(SLIPS), float(PAINLEVE))
+        ends = jnp.asarray(float(PAINLEVE))
+        if (leaning := at.leaning[i]) is not None:
+            ends = jnp.where(leaning < LEVEL, float(FLAT), ends)
+        faster = jnp.where(number == CREEPS, float(SLIPS), ends)
         events[f"{name} speed"] = _event(
             after,
             jnp.asarray(False),

@@ -102,6 +102,10 @@ class Contact(eqx.Module):
         """Signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
+    def leaning(self) -> Scalar | None:
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero where it lies flat; None of other shapes."""
+        return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
+
 
 class Rolling(Slipping, total=False):
     """Statements of all rolling contacts."""

@@ -25,7 +25,7 @@ from jourdain_jax.scene.motion_state import BodyPose, Pose
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
-GAINS_ENERGY, PAINLEVE, UNDECIDED = -1, -2, -3  # in place of a mode: why a motion cannot continue
+GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4  # in place of a mode: why a motion cannot continue
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
 

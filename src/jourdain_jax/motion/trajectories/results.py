@@ -5,7 +5,7 @@ Codes up to `EVENT` are those of motions that reached the end of their span, or 
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = 10, 11, 12, 13, 14, 15, 16, 17
-TOO_MANY_TRANSITIONS, IMPACT_GAINS_ENERGY, PAINLEVE, CONTACTS_UNDECIDED, STICKS = 18, 19, 20, 21, 22
+TOO_MANY_TRANSITIONS, IMPACT_GAINS_ENERGY, PAINLEVE, CONTACTS_UNDECIDED, LIES_FLAT, STICKS = 18, 19, 20, 21, 22, 23
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 MOST_PROJECTED = 0.5  # of the change by a step
 
@@ -45,6 +45,8 @@ MESSAGES = {
     PAINLEVE: "Coulomb's law has no solution at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
     CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no tried combination of modes satisfies Coulomb's law at each; "
     "or slip turns during an impact that is followed along its impulse: give the contact impact='moreau'",
+    LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where its contact is no point; give it "
+    "contacts that can bear it there, or stop the motion before, by an event",
     STICKS: "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a speed does at rest: "
     "no motion follows; give the contact `friction=`, which holds at rest, or let the load change within a short range, as "
     "by `jnp.tanh`",
