@@ -240,3 +240,16 @@ def test_guards_have_no_sides():
         law=lambda s, t, x, v: -jnp.where(jnp.abs(x) > 1e-9, jnp.sin(x) / jnp.where(x == 0, 1.0, x), 1.0)
     )
     assert end(scene).crossings == 0
+
+
+def test_a_start_where_a_branch_is_no_number_ends():
+    class Lost(jj.Scene):
+        coordinates = jj.coordinates("x")
+
+        def bodies(self, t, q):
+            return {"mass": jj.RigidBody(1.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jnp.eye(3))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 20.0, jnp.nan, -9.81)),)
+
+    assert jj.simulate(Lost(), {"x": 22.0}, t1=1.0).result == results.NOT_FINITE

@@ -208,9 +208,7 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
 
 
 def is_flat(w, c_dot, slope):
-    """Return whether a value has no slope where it falls through zero, within its accuracy, relative to its
-    mean `slope` over the step.
-    """
+    """Return whether a value has no slope where it falls through zero, beside its mean `slope` over the step."""
     return w.magnitude(c_dot) <= FLAT * slope
 
 
@@ -346,6 +344,7 @@ def monitored(
         why = w.where(w.load(stuck) > 0.0, w.load(stuck), float(results.TOO_MANY_TRANSITIONS))
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
+        changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)  # they count as tries, so that these end
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:

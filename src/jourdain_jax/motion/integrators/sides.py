@@ -32,7 +32,7 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
         for k, row in enumerate(list(form.rows["mode"])[form.modes :], first):
             x, later = w.load(values, k), w.load(ahead, k)
             # noise beside what it changes by
-            x = w.where(w.magnitude(x) > w.eps**0.35 * w.magnitude(later - x), x, later)
+            x = w.where(w.magnitude(x) <= w.eps**0.35 * w.magnitude(later - x), later, x)
             side = w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0))
             w.store(w.where(fresh, side, w.load(p.pointer, row)), p.pointer, row)
 
