@@ -251,7 +251,7 @@ BAD = {
     "mass-is-no-number": (_robot(_joint(child="c"), WEIGHT.format("heavy"), links="a"), r"value of `mass` of `inertial` of link `c` is `heavy`, expected"),
     "axis-of-two": (_robot(_joint(inside='<axis xyz="1 0"/>')), r"xyz of `axis` of joint `j` is `1 0`, expected 3 numbers"),
     "axis-zero": (_robot(_joint(inside='<axis xyz="0 0 0"/>')), r"xyz of `axis` of joint `j` is zero"),
-    "friction": (_robot(_joint(inside='<dynamics friction="0.1"/>')), r'the friction of joint `j` is not read.*ignore=\("friction",\)'),
+    "friction": (_robot(_joint(inside='<dynamics friction="0.1"/>')), r'the friction of joint `j` is not supported.*ignore=\("friction",\)'),
     "negative-damping": (_robot(_joint(inside='<dynamics damping="-1"/>')), r"damping of `dynamics` of joint `j` is -1"),
     "unknown-motor": (_robot(_joint()), r"`motors` names `jj`, which is not a joint with one coordinate"),
     "unknown-free-link": (_robot(_joint()), r"`free` names `bb`, which is not a link; did you mean `b`"),

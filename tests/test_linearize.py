@@ -409,7 +409,7 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
         ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {}, "2 freedoms.*name 1 of `lean`.*`held`"),
         ({"leen": 0.3}, {}, "did you mean `lean`"),
         ({"lean": 0.3}, {"vary": "radios"}, "did you mean `radius`"),
-        ({"lean": 0.3}, {"until": {"x": 1.0}}, "`x` is no unknown"),
+        ({"lean": 0.3}, {"until": {"x": 1.0}}, "`x` is not an unknown"),
         ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {"held": "lean", "names": ("one",)}, "expected one for each of the 2 modes"),
         ({"lean": float("nan")}, {}, "undefined near the guess"),
         ({"spin_rate": -4.0}, {"held": "lean", "until": {"spin_rate": float("nan")}}, "`until` of `spin_rate` is nan, expected a finite"),

@@ -102,7 +102,7 @@ START = {"x": 0.7, "v": 0.4, "k": 4.0}
 
 def motion(scene: jj.Scene, values: dict, *, first: float | None = None, **options):
     """What machine code returns of a motion, and its start as a state."""
-    setup = jax.tree.map(jnp.asarray, set_up(scene, values, work=False, **options))
+    setup = jax.tree.map(lambda x: x if isinstance(x, bool) else jnp.asarray(x), set_up(scene, values, work=False, **options))
     assert not setup.reason_against_machine_code, setup.reason_against_machine_code
     setup = setup if first is None else setup._replace(dt0=jnp.asarray(first) * jnp.sign(setup.t1 - setup.t0))
     return setup.integrator.solved(setup.fitting(), integration._begin(setup))
