@@ -516,7 +516,9 @@ SCOOTER = {"mass": 1.0, "radius": 0.1, "friction": 0.4, "bounce": 0.3}
 
 
 def test_bodies_dropped_on_two_contacts_in_space():
-    """Both contacts slip, stick and open together; where Newton's restitution would gain energy, a code says so."""
+    """Both contacts slip, stick and open together; where Newton's restitution would gain energy, a code says
+    so.
+    """
     count = 60
     draw = np.random.default_rng(0)
     angle, height = draw.uniform(-0.25, 0.25, count), draw.uniform(0.0, 0.1, count)
@@ -534,7 +536,9 @@ def test_bodies_dropped_on_two_contacts_in_space():
 
 
 def test_contacts_that_close_together_strike_together():
-    """Dropped flat on both, the body stays level and slips by the impulse of both, in either order of the contacts."""
+    """Dropped flat on both, the body stays level and slips by the impulse of both, in either order of the
+    contacts.
+    """
     start = {"z": 0.1 + 0.2, "y_rate": 2.5}
     ends = []
     for order in (("front", "rear"), ("rear", "front")):

@@ -175,7 +175,8 @@ def test_samples_drawn_on_a_device_have_the_bits_of_the_host(sampler):
         "d": jj.LogUniform(0.01, 30.0),
     }
     correlation = None if sampler == "saltelli" else {("a", "b"): 0.6, ("b", "c"): -0.3, ("a", "d"): 0.5}
-    # XLA for CPUs, as these tests ask for it, refuses loops over many numbers, by which the hypercube is walked
+    # XLA for CPUs, as these tests ask for it, refuses loops over many numbers, by which the hypercube is
+    # walked
     count = 402 if sampler == "latin-hypercube" else 40_002
     design = jj.Design(kinds, sampler=sampler, samples=count, seed=2**62 + 11, correlation=correlation)
     found = design._at(np.arange(7, count), on_device=True)

@@ -268,7 +268,9 @@ def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, ba
 
 
 class Led(jj.Scene):
-    """A wheel whose height a geometric row leads, and a rod with a point on a plane of its own, right at the start."""
+    """A wheel whose height a geometric row leads, and a rod with a point on a plane of its own, right at the
+    start.
+    """
 
     slope: float = jj.parameter(0.0)
     lift: float = jj.parameter(0.0)

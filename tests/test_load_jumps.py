@@ -1,4 +1,5 @@
-"""Derivatives of motions that cross a jump of their loads: where steps do not end there, they leave out how the time of the jump moves, and a warning says so.
+"""Derivatives of motions that cross a jump of their loads: where steps do not end there, they leave out how
+the time of the jump moves, and a warning says so.
 
 Kinks are none of this. Closed forms of derivatives through relations: `test_sides.py`.
 """

@@ -358,7 +358,7 @@ ON, ON_BACK, ON_TWICE = forward_mode_through_a_transition, reverse_mode_through_
 TRIED, WRONG = "tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant("a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"),
-    Mutant("the whole step for its error", step, TRIED, "weighted(w, method.b_error, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
+    Mutant("the whole step for its error", step, TRIED, "weighted(w, weights, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
     Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", FORM, "closed form"),
     Mutant("rows of the tableau too small", step, "stages", "*method.A[1:n, :n],", "*(0.999 * method.A[1:n, :n]),", FORM, "closed form|too many"),
     Mutant("stages at the first time", step, "stages", "w.fma(step, c[i], t)", "t", FORM, "closed form|too many"),

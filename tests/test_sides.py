@@ -242,14 +242,24 @@ def test_guards_have_no_sides():
     assert end(scene).crossings == 0
 
 
-def test_a_start_where_a_branch_is_no_number_ends():
-    class Lost(jj.Scene):
-        coordinates = jj.coordinates("x")
+class Lost(jj.Scene):
+    coordinates = jj.coordinates("x")
 
-        def bodies(self, t, q):
-            return {"mass": jj.RigidBody(1.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jnp.eye(3))}
+    def bodies(self, t, q):
+        return {"mass": jj.RigidBody(1.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jnp.eye(3))}
 
-        def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 20.0, jnp.nan, -9.81)),)
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 20.0, jnp.nan, -9.81)),)
 
+
+def test_a_start_where_a_load_is_no_number_ends():
     assert jj.simulate(Lost(), {"x": 22.0}, t1=1.0).result == results.NOT_FINITE
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_step_goes_on_where_a_load_is_no_number(backend):
+    """The place 20 = 19 + 5 t - g t^2/2; a comparison with NaN is false, which hid that of an early stage."""
+    found = jj.simulate(Lost(), {"x": 19.0, "x_rate": 5.0}, ts=np.linspace(0.0, 0.5, 51), backend=backend)
+    assert found.result == results.STEP_TOO_SMALL
+    assert_allclose(found.t_end, (5 - np.sqrt(25 - 2 * 9.81)) / 9.81, rtol=1e-9)
+    assert not np.any(found["x"] > 20.0)

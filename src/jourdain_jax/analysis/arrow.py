@@ -183,7 +183,8 @@ def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[n
 def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows that give own unknowns in terms of shared unknowns and of the piece before, and the rows that are left for these.
 
-    `below`: the diagonal (members, pieces, local) of the rows that are added, with a residual. The remaining rows follow one another.
+    `below`: the diagonal (members, pieces, local) of the rows that are added, with a residual. The remaining
+    rows follow one another.
     """
     members, pieces, m, width = local.shape
     if not m:

@@ -30,7 +30,8 @@ def chain(weight: Float[Array | np.ndarray, "times *rest"], ts: Float[Array | np
     """Return for each sample of a channel the time index of its last present predecessor (itself if there is
     none), and the time between, s.
 
-    That time is infinite if there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
+    That time is infinite if there is none, and for samples that are missing. `weight` is zero where a sample
+    is missing. Both have its shape.
     """
     index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
     last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)

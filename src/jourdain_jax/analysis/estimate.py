@@ -200,7 +200,8 @@ class Estimate:
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg
 
-    - `guess`: where the fit begins, in the unit of the number. It may be omitted where the number has a value already: a parameter, a start value.
+    - `guess`: where the fit begins, in the unit of the number. It may be omitted where the number has a
+      value already: a parameter, a start value.
     - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; by default what suits the number.
     - `per_run`: whether each run has one of its own; otherwise all runs share it. Start values are each run's own, parameters are shared.
     - `prior`: what is known beforehand, as `Normal(mean, sigma)`; it counts as one measured value.

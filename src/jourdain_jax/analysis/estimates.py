@@ -223,8 +223,10 @@ GONE = {
 class Estimates(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. Results at the minimum are computed on first
-    access; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. Results at the minimum
+    are computed on first
+    access; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`,
+    `at_bound`, `residuals`, `whitened`, `sigma`,
     `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
     """
 

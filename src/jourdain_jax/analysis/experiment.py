@@ -35,18 +35,21 @@ class Experiment(eqx.Module):
       NaN in `values`, the mask of a masked array, or an infinite sigma marks a sample that is missing.
     - `correlation_time`: s, of noise with a memory, whose correlation falls as exp(-|t - t'| / correlation time): channel -> number, or one number for all;
       channels that are not named have white noise, as with zero. None: not known; one for all components of the channel in all runs is estimated.
-    - `start`: coordinate or speed -> value at `t0`. These are held; missing ones are solved for, as by `jj.start`.
+    - `start`: coordinate or speed -> value at `t0`. These are held; missing ones are solved for, as by
+      `jj.start`.
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
       `unbounded()` (None: unbounded), or an `Estimate` with a prior.
     - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`; or an `Actuator`.
-    - `sensors`: channel -> `Sensor`; or the quantity of an ideal one: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion`
+    - `sensors`: channel -> `Sensor`; or the quantity of an ideal one: a coordinate, a speed, an
+      `Accelerometer`, a `LoadCell`, or a function of a `Motion`
       (one instant), such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
     - `events`: the stop event of the scene that ended the run, with the time at which it was observed and its sigma, both in s:
       `events={"has_fallen": (1.83, 0.005)}`. The time at which the motion stops there, less that one, is a residual. Samples after it do not count.
 
     **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, names
-    that do not match, more than one event, one that is not after the start, and samples that may show times before the start.
+    that do not match, more than one event, one that is not after the start, and samples that may show times
+    before the start.
     """
 
     ts: Times  # s; all on NumPy where it is known

@@ -52,7 +52,8 @@ def filtered_log_likelihood(
 
     **Arguments**
     - `data`: one run or several. A start value is known, or a first guess with an `Estimate(prior=Normal(mean, sigma))` in `unknown_start`: the motion then
-      begins with this spread. Sensors are without delay and lag, with known gain and bias; all numbers are known.
+      begins with this spread. Sensors are without delay and lag, with known gain and bias; all numbers are
+      known.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the speed)^2 / s: left to it alone, the variance of
       the speed grows by q t. Speeds that are not named are not disturbed. Which speeds are independent: `scene.privileged`, or the engine's choice.
     - `options`, `by_name`: as of `simulate`.
@@ -61,7 +62,8 @@ def filtered_log_likelihood(
     others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
 
     Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion), under
-    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is not a number.
+    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is not a
+    number.
 
     **Raises** ValueError for names that are no independent speed, intensities below zero, quaternions, sensors with a delay or lag, accelerometers, noise with
     a correlation time, and numbers that are not known.

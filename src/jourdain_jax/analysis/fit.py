@@ -52,10 +52,12 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     """Return the minimum from each `theta`; where none is found, or residuals are far beyond their sigmas,
     the lower one of it and that over growing spans.
 
-    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins at the end of the fit over the shorter span, and
+    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins
+    at the end of the fit over the shorter span, and
     unknowns not determined by a short span stay near the first guess. A distant fit without progress is
     replaced by growing spans, and continues only if these do not lead
-    to small residuals either. Where each theta is a first guess of one problem, spans grow only where none led to a minimum with small residuals.
+    to small residuals either. Where each theta is a first guess of one problem, spans grow only where none
+    led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
@@ -141,9 +143,11 @@ def fit(
       is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
       `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
       `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. The name of a body, with
-      `possible_inertia()`, frees its moments of inertia. Unknowns in `unknown_start`, sensors and actuators of the runs are free as well.
+      `possible_inertia()`, frees its moments of inertia. Unknowns in `unknown_start`, sensors and actuators
+      of the runs are free as well.
     - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
-      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` is the number of guesses that led to it.
+      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` is
+      the number of guesses that led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. The objective is unchanged.
 
@@ -153,20 +157,27 @@ def fit(
     - `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
       more than about this fraction. `max_iterations` (50): steps tried at most, over each span.
     - `loss`: `huber()` or `student_t()` for data with outliers (default: least squares).
-    - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white noise. "runs": the differences between runs
-      (the cluster sandwich, for five runs or more), valid for any noise within a run, also where the scene is not quite right; unknowns of
+    - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white
+      noise. "runs": the differences between runs
+      (the cluster sandwich, for five runs or more), valid for any noise within a run, also where the scene is
+      not quite right; unknowns of
       single runs still take noise within the run as white.
     - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
       and `Fit.warnings` names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the
       fitted one does, estimates whose motion ends early would have fewer residuals.
 
-    If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans (unless `shooting` is
-    given): the first 1/32 of each run, then more of it, as far as the fitted motion follows the data, with the first guess as a weak prior (known to
-    its own size). So unstable motions can be fitted that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` tells which one it
+    If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans
+    (unless `shooting` is
+    given): the first 1/32 of each run, then more of it, as far as the fitted motion follows the data, with
+    the first guess as a weak prior (known to
+    its own size). So unstable motions can be fitted that no first guess would follow to their end. The lower
+    minimum counts, and `Fit.grown` tells which one it
     was.
 
-    **Returns** a `Fit`: estimates with covariance and 95 % intervals (given sigmas count as known; where they are None, or under a robust loss,
-    intervals are those of Student's t), residuals, the fitted scene, and sentences on undetermined combinations. An unknown at its bound has a one-sided
+    **Returns** a `Fit`: estimates with covariance and 95 % intervals (given sigmas count as known; where they
+    are None, or under a robust loss,
+    intervals are those of Student's t), residuals, the fitted scene, and sentences on undetermined
+    combinations. An unknown at its bound has a one-sided
     interval, by profile likelihood. `converged` is False where no minimum was found. Runs of equal structure go through one compiled program, whatever their
     number and lengths; time and memory are proportional to the number of runs.
 

@@ -205,7 +205,8 @@ class Fit(Estimates):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene;
     `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; the following describes one fit.
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; the following describes
+    one fit.
     """
 
     @property
@@ -223,8 +224,10 @@ class Fit(Estimates):
         range within which 2 (F - F_min) stays below 3.84 when all others are fitted again, "bounded",
         "one-sided" or "flat". `data`: the runs of the fit.
 
-        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by the
-        increase of variances and quantiles. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
+        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or
+        errors="runs", the rise is divided by the
+        increase of variances and quantiles. ValueError for a fit of a batch or one that failed, and other
+        data than the fit's; KeyError for names that were
         not estimated.
         """
         self._check_one()
@@ -237,7 +240,8 @@ class Fit(Estimates):
         """Predict `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the unit of the
         channel) and `r_squared`.
 
-        Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
+        Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of
+        each run, are fitted to the run itself.
         ValueError for a fit of a batch or one that failed, and for runs that do not fit its scene or whose motion fails.
         """
         self._check_one()

@@ -14,7 +14,8 @@ Numbers that depend on the estimates of a fit: their estimates, standard errors 
 
     y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
 
-A number can be determined although its parts are not: it has a standard error where g has no part in the directions that do not show.
+A number can be determined although its parts are not: it has a standard error where g has no part in the
+directions that do not show.
 Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
 
 Poorly determined combinations of unknowns ("sloppy" directions), in words.

@@ -2,7 +2,8 @@
 
     v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: parameters that vary, where some do
 
-The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are requested; others are zero. It follows from t, q and the
+The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are requested;
+others are zero. It follows from t, q and the
 independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
 """
 

@@ -5,7 +5,8 @@ it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanish
 
 Rows together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1, D_k]` grow to
 a last dimension; the motion stays on a manifold of that dimension. Time counts as one more coordinate with the field `(1, X_0)`
-where the rows or rates depend on time or are not homogeneous; its dimension is omitted from the growth vector.
+where the rows or rates depend on time or are not homogeneous; its dimension is omitted from the growth
+vector.
 
 `[X, Y] = DY X - DX Y` along the fields. A bracket of brackets needs the derivative of such a derivative: taken by eighth-order central differences
 (to about 1e-11), because every further derivative doubles what is evaluated.

@@ -54,7 +54,8 @@ def possible_inertia() -> PossibleInertia:
 
     In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments D (kg m^2) and shears l as unknowns,
     `"rear frame second moment[0]"` and `"rear frame shear[0]"`. Principal moments of inertia are then positive, and each is at most the sum of the other two.
-    `Fit.tied` has moments and products, with standard errors and intervals to first order; none where D is at its bound, where the body
+    `Fit.tied` has moments and products, with standard errors and intervals to first order; none where D is at
+    its bound, where the body
     is flat according to the data. Where two axes have one parameter, as those of a wheel do, they have one D.
 
     It is for scenes that have a parameter for each of the three moments, and for none, one or all of the products; ValueError, from `fit`, for others, and

@@ -144,7 +144,8 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         trial, promised = evaluate(x + d, here), slope - 0.5 * change
         gained = fallen(way.at.cost[here], trial, d, slope, promised, control)
         better = np.isfinite(gained) & (gained > 1e-4 * promised)
-        # damping rises where steps overshoot: where residuals stay large, undamped ones go back and forth along what shows least
+        # damping rises where steps overshoot: where residuals stay large, undamped ones go back and forth
+        # along what shows least
         by = np.where(gained > 0.9 * promised, 1 / fall[here], np.where(gained < 0.6 * promised, 3.0, 1.0))
         damping[here] = np.maximum(damping[here] * np.where(better, by, growth[here]), LEAST)
         # after a step that failed it falls slowly: in a curved valley every other step would fail; it grows twice as much after each further one

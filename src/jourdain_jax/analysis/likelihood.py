@@ -2,13 +2,16 @@
 
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 
-Oddities of measurements that are not errors: inputs that are not sampled where a run needs them, and angles that jump by a turn.
+Oddities of measurements that are not errors: inputs that are not sampled where a run needs them, and angles
+that jump by a turn.
 
-The information of a planned run: the Fisher information of a planned experiment, differentiable with respect to its start and inputs.
+The information of a planned run: the Fisher information of a planned experiment, differentiable with respect
+to its start and inputs.
 
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior,     cov(theta) >= F^-1 (Cramer and Rao)
 
-Unknown start values are among theta; log det F of those unknowns that are requested is that of their block of F^-1, all others being estimated with them.
+Unknown start values are among theta; log det F of those unknowns that are requested is that of their block of
+F^-1, all others being estimated with them.
 Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
@@ -282,7 +285,8 @@ def planned_information(
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
     inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
 
-    **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and correlated noise.
+    **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and
+    correlated noise.
 
     **Example**
 

@@ -161,7 +161,8 @@ def linearize(
         small.M, small.C, small.K, small.eigenvalues()
 
     **Arguments**
-    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and `residual` reports it. They are
+    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant,
+      and `residual` reports it. They are
       constant along a steady motion where only ignorable coordinates move: a disc's yaw and spin, but not the attitude of a spinning disc.
     - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A quaternion `attitude` has
       `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
@@ -169,7 +170,8 @@ def linearize(
     - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
       is well conditioned at the state (over the scene's domain, while state or parameters are traced).
 
-    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` settles the backend.
+    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` settles the
+    backend.
 
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
     determine the others, all is NaN there and `code` is not 0: name others.

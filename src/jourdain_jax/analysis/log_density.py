@@ -187,9 +187,11 @@ def log_density(
       that are estimated, and sigmas that are None, which are named `"lean.sigma"`.
     - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma,
       and in arcsin rho, rho = exp(-h / tau), of a correlation time tau that is None, where h is the shortest interval between samples of its channel.
-      A flat prior without bounds has no integral: if the data do not determine an unknown, the posterior has none either, and a sampler diverges.
+      A flat prior without bounds has no integral: if the data do not determine an unknown, the posterior has
+      none either, and a sampler diverges.
 
-    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead back and forth. The logarithms of the transforms'
+    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead
+    back and forth. The logarithms of the transforms'
     derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad`.
 
     **Raises** ValueError as `fit`.

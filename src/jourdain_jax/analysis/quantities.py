@@ -1,6 +1,7 @@
 """Channels that are functions of a `Motion`: traced by every fit, and equal if they compute equal values.
 
-A function is traced where it is handed over. Captured values become arguments, and the operations are compared by value: a new lambda that
+A function is traced where it is handed over. Captured values become arguments, and the operations are
+compared by value: a new lambda that
 does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.
 
 Instruments for accelerations and forces: accelerometers on bodies, load cells under contacts.
@@ -129,7 +130,8 @@ class Accelerometer(Instrument):
     - `body`: its name. `point`: where it sits, in m, in the body's frame, from its mass centre.
     - `gravity`: g in m/s^2, in the inertial frame.
 
-    A channel of shape (times, 3). It uses the scene's accelerations at the states of the motion, not differences.
+    A channel of shape (times, 3). It uses the scene's accelerations at the states of the motion, not
+    differences.
 
     **Raises** ValueError for anything but a name, or three components.
     """
@@ -173,7 +175,8 @@ class LoadCell(Instrument):
 
     A channel of shape (times, 3): two components along the tangents of the ground, then the one along its normal, as `Trajectory.contact_forces` has them.
 
-    **Raises** ValueError for anything but a name; with a scene, for a contact that is not there, or whose force the rows do not determine.
+    **Raises** ValueError for anything but a name; with a scene, for a contact that is not there, or whose
+    force the rows do not determine.
     """
 
     contact: str = eqx.field(static=True)

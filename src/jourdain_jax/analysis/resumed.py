@@ -4,7 +4,8 @@ Predictions of a fit for other runs.
 
 error = prediction - value,    rms^2 = mean error^2,    R^2 = 1 - sum error^2 / sum (value - mean)^2         over the samples of a channel that are not missing
 
-All that runs share is held at its estimate. Unknowns of a run (start values, numbers of its sensors) are fitted to the run itself.
+All that runs share is held at its estimate. Unknowns of a run (start values, numbers of its sensors) are
+fitted to the run itself.
 
 Which samples inform which unknown: of each, the share of what the data tell of it.
 
@@ -19,7 +20,8 @@ How far an unknown may be moved before the data object, all others being fitted 
     rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, which is held at x; inflation: as of the covariance, for the loss and for sigmas
     interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom              that are estimated
 
-bounded: both ends are found; one-sided: one of them; flat: none, the data do not determine the unknown. From the estimate outwards, each point begins where the
+bounded: both ends are found; one-sided: one of them; flat: none, the data do not determine the unknown. From
+the estimate outwards, each point begins where the
 one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25
 (2009) 1923.
 """

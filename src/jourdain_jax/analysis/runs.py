@@ -324,6 +324,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    # XLA's newer emitters compile it in twice the time, for a program that is not a faster; from jaxlib 0.11.1 on there are no others
+    # XLA's newer emitters compile it in twice the time, for a program that is not a faster; from jaxlib
+    # 0.11.1 on there are no others
     older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
     return jax.jit(jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)

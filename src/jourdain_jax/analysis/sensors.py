@@ -7,7 +7,8 @@ Each number is known, or a `jj.Estimate`. Source: L. Ljung, System Identificatio
 
 Equal intervals of time, where the motion is computed that late sensors read between.
 
-The reading of a sensor for a quantity known at equal intervals of time: late by a delay, and through a first-order low-pass.
+The reading of a sensor for a quantity known at equal intervals of time: late by a delay, and through a
+first-order low-pass.
 
     reading(t) = y(t - delay),      lag y' + y = x,      y(t0) = x(t0):      the filter starts at rest
 
@@ -188,7 +189,8 @@ class Sensor(eqx.Module):
 
     Each number may be an `Estimate`. By default an estimated lag is positive, gain and bias may be any number; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, a motion (a piece of one, with `shooting`) is computed at equal intervals, 64 or more and none longer than the median interval of
+    With a delay or a lag, a motion (a piece of one, with `shooting`) is computed at equal intervals, 64 or
+    more and none longer than the median interval of
     the samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the
     slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to
     0.08 J h^2.

@@ -3,7 +3,8 @@
     piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
     continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
 
-Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it may show, and for it the piece continues beyond
+Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it
+may show, and for it the piece continues beyond
 t_i+1. The output of a sensor's low-pass is part of s.
 
 Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
@@ -65,7 +66,8 @@ class MultipleShooting:
     - `pieces`: how many pieces each run has; give one of the two.
 
     Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole
-    run: steps are as for an almost linear problem. The objective and its minimum equal those of a fit without `shooting`.
+    run: steps are as for an almost linear problem. The objective and its minimum equal those of a fit without
+    `shooting`.
 
     **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
     """

@@ -14,7 +14,8 @@ First guesses of the states between pieces, from measurements there.
 A coordinate or speed that a channel shows is that of a parabola through the samples about the node; so is the rate of a coordinate,
 qdot = N(q) u + nu, met by the smallest change of the speeds. Quantities without a channel keep their value at
 the start; coordinates that no geometric row depends on
-continue from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and the quantity is y + lag y'.
+continue from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and
+the quantity is y + lag y'.
 """
 
 from dataclasses import replace

@@ -27,7 +27,8 @@ How large noise is that nobody stated: what sigmas are estimated to be, once it 
     variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    as the weights of channels and priors are estimated, too
 
 With one channel and no prior n - p is left, and intervals are those of Student's t. Under a robust loss the same holds of all samples together, and the factor
-by which their variance is to be multiplied takes the place of sigma^2. Priors and given sigmas count as known.
+by which their variance is to be multiplied takes the place of sigma^2. Priors and given sigmas count as
+known.
 Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; M. G. Kenward and J. H. Roger,
 Biometrics 53 (1997) 983.
 """
@@ -84,7 +85,8 @@ class Side(NamedTuple):
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
     """Follow the profile of member `b` along one unknown to one side (`way` is 1 or -1) until F has risen by `end`, from a distance `first` on.
 
-    All others continue from where they were at the point before. The end is found by secants of the root of the rise, which is nearly straight.
+    All others continue from where they were at the point before. The end is found by secants of the root of
+    the rise, which is nearly straight.
     """
     close, origin, theta = 0.01, float(found.theta[b, place]), found.theta[b : b + 1]  # close: of the rise at the end
     bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])

@@ -73,7 +73,8 @@ def steady(
     - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It need not meet the constraints.
     - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. Where many steady motions meet this,
       the result is one near the guess.
-    - `moving`: names of the coordinates that may keep moving; default: those without influence on the scene's accelerations (`ignorable`).
+    - `moving`: names of the coordinates that may keep moving; default: those without influence on the
+      scene's accelerations (`ignorable`).
     - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
       own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
     - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60); `by_name`: `max_steps` alone.

@@ -55,7 +55,8 @@ def verify(
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
-    Values are relative to the size of the compared quantities; thresholds go with the floating-point type (`analysis.statements`): in single precision
+    Values are relative to the size of the compared quantities; thresholds go with the floating-point type
+    (`analysis.statements`): in single precision
     gross errors are found, and nothing is certified. Where no reduction applies (no inertia along a free direction) there are no gradients to check, and
     the verification fails.
 
@@ -64,7 +65,8 @@ def verify(
       domain, where it has none); generic, for a symmetric one hides errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
     - `seed`: of that state, and of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the
-      speeds, relative in the parameters; the Gibbs-Appell reduction is omitted from them. Parameters that split rows which are dependent have no
+      speeds, relative in the parameters; the Gibbs-Appell reduction is omitted from them. Parameters that
+      split rows which are dependent have no
       derivative there and are omitted, with a note (`derivative_exists`).
 
     **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a

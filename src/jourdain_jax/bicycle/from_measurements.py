@@ -43,7 +43,8 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
 
     **Arguments:** `path`, of a file of readings (`readings.py` lists what it holds), or the name of a shipped one (`shipped_measurements`).
     **Returns:** a `MeasuredBicycle`, with a warning for lines that miss the mass centre by more than their sigmas allow.
-    **Raises** ValueError: an unreadable or incomplete file, an unknown name, and readings that belong to no bicycle.
+    **Raises** ValueError: an unreadable or incomplete file, an unknown name, and readings that belong to no
+    bicycle.
     """
     if isinstance(path, str) and not Path(path).exists() and not Path(path).suffix:
         known = shipped_measurements()

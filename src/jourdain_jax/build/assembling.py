@@ -38,7 +38,8 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
     """Return configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the
     states numbered k, these by the entries of a pattern.
 
-    Of the `generic` ones those that find no place inside the domain begin again elsewhere, so that there are `tries` after the first one.
+    Of the `generic` ones those that find no place inside the domain begin again elsewhere, so that there are
+    `tries` after the first one.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
     # where configurations lie anywhere in the domain: on the rows a row may be of no length at all

@@ -8,8 +8,9 @@ dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that s
 I_3 <= I_1 + I_2
 
 They are one table, `CHECKS`, of functions of numbers at some states. It is looked at where a scene is probed, where a fault is an error with its text. What
-has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the start,
-which may hide what is wrong, and at random states of the domain, put on the geometric rows.
+has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the
+start,
+which may hide a fault, and at random states of the domain, projected onto the geometric rows.
 """
 
 from collections.abc import Callable
@@ -279,7 +280,8 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return fault -> whether the scene has it at this state, or `elsewhere`, with the coordinates of `others`.
+    """Return fault -> whether the scene has it at this state, or `elsewhere`, with the coordinates of
+    `others`.
 
     Also under jit and vmap. NaN is no fault.
     """

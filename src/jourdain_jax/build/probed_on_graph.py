@@ -233,7 +233,9 @@ class _AtStates:
         return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
-        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are not numbers."""
+        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are
+        not numbers.
+        """
         at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
             return u

@@ -74,7 +74,8 @@ def redundant_rows(
     """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
     state, and does not come near to losing it.
 
-    A row that is omitted is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
+    A row that is omitted is a combination of the others. Where its coefficients are large somewhere, they
+    have no bounds: so those of one wheel's row
     along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
     `far`: rows at full turns of all angles.
     """

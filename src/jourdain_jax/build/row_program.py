@@ -41,7 +41,7 @@ class RowProgram:
     A: dict[tuple[int, int], int]
     M: dict[tuple[int, int], int] | None  # lower triangle; None where it is too large to be written out
     right: int  # whether parameters and bodies are
-    others: tuple[int, ...]  # coordinates of other states, put on the geometric rows, on which that depends as well
+    others: tuple[int, ...]  # coordinates of other states, projected onto the geometric rows, on which that depends too
 
 
 @once_per_class
@@ -79,8 +79,10 @@ def row_program(scene: Scene) -> RowProgram | None:
 def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     """Return the node of a truth value, and the coordinates of other states on which it depends.
 
-    Every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters decide. Numbers
-    that no parameter decides are judged where the scene is probed. Where geometric rows depend on parameters, these
+    Every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters
+    decide. Numbers
+    that no parameter decides are judged where the scene is probed. Where geometric rows depend on parameters,
+    these
     decide coordinates.
     """
     g, traced = looked.graph, looked.traced

@@ -172,7 +172,8 @@ def structure_of(scene: Scene) -> Structure:
     """Return static facts about a scene: rank of its constraints, privileged velocities and their
     conditioning, kinds of constraints; eqs. (25)-(31).
 
-    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers replace traced parameters.
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers
+    replace traced parameters.
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
     """
@@ -189,7 +190,9 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def is_judged(scene: Scene) -> bool:
-    """Return whether the parameters of a scene are known, so that what is found at its probed states is its own."""
+    """Return whether the parameters of a scene are known, so that what is found at its probed states is its
+    own.
+    """
     return not is_traced(scene)
 
 

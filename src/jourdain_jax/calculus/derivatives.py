@@ -9,7 +9,8 @@ Derivatives of f(x) in both modes, to the second order, come from two functions 
 Pulls transpose pushes. As f'' is symmetric, bends along v transpose bends, and turns, whose w is that v. What f(x) is counts as a number at which these
 are taken, beside x: a derivative along x is the whole one.
 
-Each is a linear map: one function computes its values, another one those of its transpose. JAX meets such a map where a derivative was taken. Forward mode
+Each is a linear map: one function computes its values, another one those of its transpose. JAX meets such a
+map where a derivative was taken. Forward mode
 evaluates it, reverse mode transposes it, and neither traces what only the other one needs.
 
 A function and its rule of differentiation must agree on which results have lanes and where: JAX takes that from the one that it batches first.

@@ -272,7 +272,8 @@ def with_usual_promotion(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be omitted: a first motion of a disc
+# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be
+# omitted: a first motion of a disc
 # from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
 _EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS

@@ -14,7 +14,8 @@ on until the last has ended (J. Nocedal and S. Wright, Numerical Optimization (2
 iteration converges quadratically, each further step doubles the order of derivatives that are right: two steps that change nothing give those up to the
 third. Steps left out cost nothing, under `vmap` neither once all lanes have settled.
 
-In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows reports it; then small singular values are omitted.
+In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows reports it; then
+small singular values are omitted.
 """
 
 from collections.abc import Callable

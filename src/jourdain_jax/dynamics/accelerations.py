@@ -109,10 +109,13 @@ def accelerations(
     - `inputs`: values of the scene's inputs (default: zero), which count as constant.
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: as found for this scene).
+    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: as
+      found for this scene).
 
-    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is constant. Check `applicable`
-    and `residual`: nothing is raised where a reduction does not apply. ValueError for an unknown reduction, and for known parameters with impossible
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is
+    constant. Check `applicable`
+    and `residual`: nothing is raised where a reduction does not apply. ValueError for an unknown reduction,
+    and for known parameters with impossible
     values of bodies, loads or planes. Eqs. (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)

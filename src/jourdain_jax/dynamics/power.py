@@ -6,7 +6,8 @@
                 + dV/dt at fixed poses          potentials that depend on time
                 + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
 
-A term that is zero at every state by the scene's structure is omitted, not computed. Inputs count as constant here (their rates reach rows
+A term that is zero at every state by the scene's structure is omitted, not computed. Inputs count as constant
+here (their rates reach rows
 through the accelerations). Where the potential V_i of a load depends on inputs, these do the work dV_i/df . df/dt besides. It is found without a
 derivative of the inputs, which may jump:
 

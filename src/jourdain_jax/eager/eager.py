@@ -36,7 +36,8 @@ def eval_numpy(f: Callable) -> Callable:
 
 
 def eager_if_concrete(f: Callable) -> Callable:
-    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced values, unchanged.
+    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced
+    values, unchanged.
 
     What `f` finds out by the scene's own numbers (rank, privileged speeds) must be among its arguments: inside, the numbers are traced.
     """

@@ -2,7 +2,8 @@
 
 Sums, quotients and roots are rounded alike everywhere. Of a product that is added to something a compiler makes one operation with one rounding, on some
 machines: `product` keeps it apart. The normal distribution and its inverse are those of Cephes, as in SciPy,
-with the exponential and the logarithm of fdlibm (errors of one unit in the last place and below), and one pair of
+with the exponential and the logarithm of fdlibm (errors of one unit in the last place and below), and one
+pair of
 polynomials for all of a tail of the inverse (right to 3e-15 for u > 1e-16, to 1e-13 for u > 1e-22).
 """
 
@@ -61,7 +62,8 @@ def library(x):
 def apart(x, u):
     """Return x, which a compiler leaves as it is.
 
-    `u`: an argument of the program, above zero, of which it does not know that: its sign, 0, goes into that of x.
+    `u`: an argument of the program, above zero, of which it does not know that: its sign, 0, goes into that
+    of x.
     """
     if not isinstance(u, jax.Array):
         return x
@@ -108,7 +110,9 @@ def exponential(x, u):
 
 
 def normal_probability(x, u):
-    """Return the probability that a standard normal number lies below x; `u` as in `apart`, of the shape of x."""
+    """Return the probability that a standard normal number lies below x; `u` as in `apart`, of the shape of
+    x.
+    """
     xp = library(x)
     z = xp.abs(x) * 0.5**0.5
     near = xp.minimum(z, 1.0)
@@ -124,7 +128,8 @@ def normal_probability(x, u):
 def correlated(factor, u):
     """Return the probabilities of correlated numbers from those of independent ones, samples by variables.
 
-    Normal numbers of these probabilities are multiplied by the rows of `factor`, one after another: a product of
+    Normal numbers of these probabilities are multiplied by the rows of `factor`, one after another: a product
+    of
     matrices may round otherwise.
     """
     xp, z, rows = library(u), normal_quantile(u), []

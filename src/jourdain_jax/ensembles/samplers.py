@@ -7,7 +7,8 @@ sobol            Sobol's sequence with Owen's linear scrambling and a digital sh
 saltelli         for Sobol' indices of d variables: points (A_j, B_j) of that sequence in 2 d dimensions; samples j (d + 2) + i are A_j,
                  then A_j with the entry of one variable from B_j, one after another, then B_j (Saltelli et al. 2010)
 
-Each is a function of an array of whole numbers k in order, of NumPy, and of JAX on a device, too, with the same
+Each is a function of an array of whole numbers k in order, of NumPy, and of JAX on a device, too, with the
+same
 bits: what is computed are words.
 """
 

@@ -100,7 +100,7 @@ def responses(
 
 
 class Law(NamedTuple):
-    """Contacts at which Coulomb's law is to hold; `G P + b` are their speeds, or accelerations."""
+    """The contacts of one Coulomb problem; `G P + b` are their speeds, or their accelerations."""
 
     G: Float[Array, "rows rows"]
     b: Float[Array, "rows"]

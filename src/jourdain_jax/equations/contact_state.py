@@ -18,14 +18,14 @@ from jourdain_jax.equations.virtual_power import (
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
-LEVEL = 1e-8  # of (sine of the lean)^2: a disc lies flat
+FLAT_BELOW = 1e-8  # the squared sine of the lean of a disc that counts as flat
 
 
 class At:
     """The contacts that switch at the state of a motion, and how they respond to their forces.
 
-    `found`: that response, where it is known. `responses`: all that were worked out, here and at later
-    states, each after its coordinates, speeds and inputs.
+    `found`: that response, if known. `responses`: all that were computed, here and at later states,
+    each after its coordinates, speeds and inputs.
     """
 
     def __init__(
@@ -45,8 +45,8 @@ class At:
         self.static = jnp.stack([contact.friction.static for contact in contacts if contact.friction])
         self.restitution = jnp.stack([jnp.asarray(contact.restitution) for contact in contacts])
         self.impacts = [contact.impact for contact in contacts]
-        leaning = [contact.leaning() for contact in contacts]
-        self.leaning = [None if x is None else x - LEVEL for x in leaning]  # zero where a disc lies flat
+        leans = [contact.lean() for contact in contacts]
+        self.above_flat = [None if x is None else x - FLAT_BELOW for x in leans]
         self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])

@@ -41,7 +41,7 @@ class Changes(NamedTuple):
 
 
 class Struck(NamedTuple):
-    """Impulses at all contacts, their modes while these act, and why they may be wrong."""
+    """Impulses at all contacts, their modes meanwhile, and whether these are right."""
 
     P: Float[Array, "contacts 3"]
     modes: Modes
@@ -68,7 +68,7 @@ def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "cont
 
 
 class After:
-    """Speeds, modes and directions of slip after changes, of which contact i has the first.
+    """Speeds, modes and directions of slip after the changes of an event of contact i.
 
     Impulses stop the slip of contacts, or are those of an impact where some strike; then the law at rest
     decides whether contacts that do not slip open, stick or begin to. Where no solution is found, or an
@@ -109,8 +109,8 @@ class After:
             (gained > ROUND_OFF * jnp.abs(P @ rows.w), GAINS_ENERGY),
             ((hits & ~struck.is_decided) | ~jnp.isfinite(gained), UNDECIDED),
         )
-        if (leaning := at.leaning[i]) is not None:
-            faults = (*faults, ((touches | strikes)[i] & (leaning < 0), FLAT))
+        if (above := at.above_flat[i]) is not None:
+            faults = (*faults, ((touches | strikes)[i] & (above < 0), FLAT))
         for fault, why in faults:
             numbers = numbers.at[i].set(jnp.where(fault, float(why), numbers[i]))
         self.numbers = numbers

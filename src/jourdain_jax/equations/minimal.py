@@ -5,7 +5,8 @@ in the speeds.
     udot = C ydot + c'                 from their rates
     C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
 
-A, C and the partial velocities do not depend on u: they are computed once, at `u = (y, 0)`, and serve both levels. A holds the rows that are requested:
+A, C and the partial velocities do not depend on u: they are computed once, at `u = (y, 0)`, and serve both
+levels. A holds the rows that are requested:
 without those that follow from the others A_z is square, and its determinant changes its sign where it is singular.
 Source: Wang and Pao (2003), sections III and IV.
 """

@@ -13,7 +13,7 @@
     slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
     creeps      L_n             e.w_t                        2 s - e.w_t
 
-A disc or wheel that rolls or slips ends its motion as it falls flat, too, by the event of speed.
+The event of speed also ends the motion of a disc or wheel that rolls or slips until it is flat.
 
 The direction of slip is a number of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e (`slip_turns`):
 errors of w_t across it do not turn it. It has no limit at rest: below the speed s, s replaces e.w_t.
@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
 from jourdain_jax.equations.contact_laws import SLOW, moves, solved, unit
 from jourdain_jax.equations.contact_rows import switching_contacts
-from jourdain_jax.equations.contact_state import LEVEL, At, switched
+from jourdain_jax.equations.contact_state import FLAT_BELOW, At, switched
 from jourdain_jax.equations.impacts import LEAST_REBOUND, After, Changes
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.modes import Event
@@ -56,9 +56,9 @@ def contact_events(at: At) -> dict[str, Scalar]:
             jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed),
         )
         bears, stands = _bearing(at, i) - NEARLY, one
-        if (leaning := at.leaning[i]) is not None:
-            stands = jnp.where(number == ROLLS, leaning, one)
-            bears = bears * leaning / jnp.sqrt(bears**2 + leaning**2)  # zero with either
+        if (above := at.above_flat[i]) is not None:
+            stands = jnp.where(number == ROLLS, above, one)
+            bears = bears * above / jnp.sqrt(bears**2 + above**2)  # zero with either
         while_slips = jnp.where(number == SLIPS, bears, stands)
         events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, while_slips)
     return events
@@ -78,8 +78,8 @@ def contact_changes(at: At) -> dict[str, Event]:
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
         ends = jnp.asarray(float(PAINLEVE))
-        if (leaning := at.leaning[i]) is not None:
-            ends = jnp.where(leaning < LEVEL, float(FLAT), ends)
+        if (above := at.above_flat[i]) is not None:
+            ends = jnp.where(above < FLAT_BELOW, float(FLAT), ends)
         faster = jnp.where(number == CREEPS, float(SLIPS), ends)
         events[f"{name} speed"] = _event(
             after,

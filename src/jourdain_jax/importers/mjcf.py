@@ -39,7 +39,8 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
     - `path`: of the file, or its text.
     - `free`: names of bodies whose place in the frame of their parent is a parameter.
-    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such as "armature" or "equality". With
+    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such
+      as "armature" or "equality". With
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and

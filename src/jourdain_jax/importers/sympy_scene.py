@@ -177,7 +177,8 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str
     """Return the loads by kind and place, inertial frame: "weight" (constant, so that it has a potential),
     "force" and "torque" of a body, "generalized" of a speed.
 
-    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by the power that they have by SymPy's velocity of that
+    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by the
+    power that they have by SymPy's velocity of that
     point or frame: Q_k = F . dv/du_k.
     """
     sympy = sympy_package()

@@ -76,7 +76,8 @@ def from_urdf(
     - `free`: names of links whose place in the frame of their parent is a parameter.
     - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held: `locked={"thumb": 0.0}`.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
-    - `ignore`: what may be omitted without a word: names of elements and attributes, "friction", or "text" between elements. With
+    - `ignore`: what may be omitted without a word: names of elements and attributes, "friction", or "text"
+      between elements. With
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
@@ -88,7 +89,8 @@ def from_urdf(
     **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
     loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a
     joint with friction, what is said twice; and by its name all that an element of a URDF does not hold: a misspelt attribute, `spring` of `dynamics`,
-    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are omitted, such as `gazebo` and `transmission`.
+    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are omitted,
+    such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:

@@ -161,7 +161,8 @@ class Lowered:
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
         """Return `rates`; the pivots, which must keep their signs; directions; and the smallest sine between a row that is
-        kept by multipliers and those before it, None if there are none. The last three are numbers to differentiation.
+        kept by multipliers and those before it, None if there are none. The last three are numbers to
+        differentiation.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """

@@ -56,7 +56,8 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion continues, and the program does not serve
+    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion
+    # continues, and the program does not serve
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]

@@ -1,4 +1,5 @@
-"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: they become sides (`sides.py`).
+"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: they become
+sides (`sides.py`).
 
     a < b, max(a, b), ...    a - b          sign(x), |x|    x          floor(x)    sin(pi x)          round(x)    cos(pi x)
 
@@ -56,7 +57,7 @@ def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
 
 
 def _branch(graph: Graph, node: int, above: bool) -> int:
-    """What takes the place of a relation where its own number is positive (`above`), or negative."""
+    """Return the value of a relation where its own number is positive (`above`), or negative."""
     op, args = graph.op[node], graph.args[node]
     if op in COMPARED:
         return graph.const(COMPARED[op][0 if above else 1])
@@ -68,14 +69,19 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
 
 
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[list[int], list[int]]:
-    """The outputs with these relations (as `switches` has them) taken as they are where their number is positive, and negative."""
+    """Return the outputs with these relations (of `switches`) as for a positive number, and as for a negative
+    one.
+    """
     outputs = list(outputs)
     above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
     return above, below
 
 
 def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Numbers whose signs are to be watched: of the rates, and those of stop events besides; none that depends on `modes`, which have events of their own."""
+    """Return the numbers whose signs are watched: of the rates, and of stop events only.
+
+    Numbers that depend on `modes` are omitted: modes have events of their own.
+    """
     found: list[list[int]] = []
     for outputs, counts in ((rates, _differ), (events, _may_dip)):
         of_outputs = {n: nodes for n, nodes in switches(graph, outputs).items() if not set(modes) & set(graph.reachable([n]))}
@@ -86,7 +92,7 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
 
 def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
-    """Whether the branches of relations matter on either side of where their number vanishes."""
+    """Return whether the branches of relations differ on either side of a zero of their number."""
     if (beside := _beside(number, probes)) is None:
         return True
     above, below = branches(graph, nodes, outputs)
@@ -99,12 +105,14 @@ def _differ(values, above, below, least) -> bool:
 
 
 def _may_dip(values, above, below, least) -> bool:
-    """A value that is the lower one of its two branches on either side has a peak there, or goes on."""
+    """Return whether a value may dip: it is not the lower one of its two branches on either side."""
     return not np.all(values <= np.minimum(above, below) + least)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
-    """Return the numbers whose branches go on beyond where they vanish: both are finite wherever the outputs are."""
+    """Return the numbers whose branches continue beyond their zeros: both are finite wherever the outputs
+    are.
+    """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
     def go_on(number: int) -> bool:
@@ -128,7 +136,9 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(number: int, probes: Probes) -> Callable[[float], tuple[Probes, Probes]] | None:
-    """States on either side of places where a number vanishes, so far away; None where it vanishes between no probes."""
+    """Return a function of a distance: states on either side of zeros of a number; None if it has none
+    between probes.
+    """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
     count = min(len(positive), len(negative), 6)  # places

@@ -1,12 +1,13 @@
-"""Relations of a scalar program as modes and events: a number s says on which side of a relation a motion is.
+"""Relations of a scalar program as modes and events: a number s holds the side of a relation.
 
     x = a - b of a < b, max(a, b), ...; x of |x|, sign(x)     s = 1, -1: x counts as positive, negative
     c = s x falls through zero:  s <- -s                      s = 0: x rests at zero, and counts as it is
 
-Within a step no branch changes: the step ends where x vanishes, by the search for events, and the jump of the
-derivative there is that of any event (`motion/native/transitions.py`). Relations in Modelica are events, too.
-If a branch ends where x vanishes, as `sqrt` does, its relation has the event alone. floor(a), whose x is
-sin(pi a), is the nearest even or odd number, as s says.
+Within a step no branch changes: the search for events ends the step where x vanishes, and the derivative
+jumps
+there as at any event (`motion/native/transitions.py`). Relations in Modelica are events, too.
+If a branch ends where x vanishes, as `sqrt` does, its relation has the event only. floor(a), whose x is
+sin(pi a), is the nearest even or odd number, by the sign of s.
 """
 
 from collections.abc import Sequence
@@ -42,26 +43,26 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         number, side, turned = relations[n]
         new = graph.copied([number, *old.args[n]], old, new)
         if number not in signs:
-            signs[number] = graph.call("select", graph.call("eq", side, graph.zero), side, new[number])
+            signs[number] = _where(graph, graph.call("eq", side, graph.zero), new[number], side)
         sign = signs[number] if turned > 0 else graph.neg(signs[number])
         new[n] = _by_sign(graph, old.op[n], [new[a] for a in old.args[n]], side, sign)
     nodes = {name: getattr(program, name) for name in NODES}
     new = graph.copied([program.power, *numbers, *(n for part in nodes.values() for n in part)], old, new)
-    on_it: dict[str, Any] = {
-        name: tuple(new[n] for n in part) for name, part in nodes.items()
-    } | dict.fromkeys(("relations", "event_relations", "jumps"), ())
+    copied: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
+    copied |= dict.fromkeys(("relations", "event_relations", "jumps"), ())
     x = [new[n] for n in numbers]
     inputs = np.array([*(new[n] for n in program.traced.inputs.tolist()), *sides], np.int64)
-    q, u = (
-        np.array([new.get(n, 0) for n in part.tolist()], np.int64)
-        for part in (program.traced.q, program.traced.u)
-    )  # dependent speeds: none
+    parts = program.traced.q, program.traced.u
+    q, u = (np.array([new.get(n, 0) for n in part.tolist()], np.int64) for part in parts)  # dependent speeds: none
     now = [*q.tolist(), *(int(u[k]) for k in program.independent), *(int(inputs[i]) for i in modes)]
-    events, stops = (on_it["events"], program.stops) if has_events else ((), ())
-    each = len(on_it["resets"]) // max(len(events), 1)
+    events, stops = (copied["events"], program.stops) if has_events else ((), ())
+    each = len(copied["resets"]) // max(len(events), 1)
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
+        """Add a reset: the state and the modes `after` an event, sides by the numbers then, and the rise of
+        energy.
+        """
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # each after those that it is made of
             (moved,) = graph.substituted([x[k]], after)
             if moved != x[k] and sides[k] not in after:
@@ -69,33 +70,26 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         resets.extend([*(after.get(n, n) for n in (*now, *sides)), rise])
 
     for i in range(len(events)):
-        *after, rise = on_it["resets"][i * each : (i + 1) * each] or (*now, graph.zero)
+        *after, rise = copied["resets"][i * each : (i + 1) * each] or (*now, graph.zero)
         add(dict(zip(now, after, strict=True)), rise)
     for side, number in zip(sides, x, strict=True):
-        add(
-            {
-                side: graph.call(
-                    "select", graph.call("eq", side, graph.zero), graph.neg(side), graph.call("sign", number)
-                )
-            },
-            graph.zero,
-        )
-    on_it["events"] = (
-        *events,
-        *(
-            graph.call("select", graph.call("lt", s, graph.zero), n, graph.neg(n))
-            for s, n in zip(sides, x, strict=True)
-        ),
-    )
+        rests = graph.call("eq", side, graph.zero)
+        add({side: _where(graph, rests, graph.call("sign", number), graph.neg(side))}, graph.zero)
+    below = [graph.call("lt", side, graph.zero) for side in sides]
+    falls = [_where(graph, is_below, graph.neg(n), n) for is_below, n in zip(below, x, strict=True)]
     return replace(
         program,
         traced=Variables(graph, new[program.traced.t], q, u, inputs, []),
         inputs=(*program.inputs, *(f"side {k}" for k in range(len(sides)))),
         fixed=tuple(new[n] for n in program.fixed),
         power=new[program.power],
-        **on_it | {"resets": tuple(resets), "stops": (*stops, *[False] * len(sides)), "z": ()},
+        **copied | {"events": (*events, *falls), "resets": tuple(resets), "stops": (*stops, *[False] * len(sides)), "z": ()},
         sides=len(sides),
     )
+
+
+def _where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
+    return graph.call("select", condition, otherwise, there)
 
 
 def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -> int:
@@ -111,7 +105,7 @@ def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -
         "max": (args[-1], args[0]),
         "min": (args[0], args[-1]),
     }[op]
-    return graph.call("select", graph.call("lt", sign, graph.zero), high, low)
+    return _where(graph, graph.call("lt", sign, graph.zero), low, high)
 
 
 def _whole(graph: Graph, op: str, args: Sequence[int], side: int) -> int:
@@ -120,19 +114,14 @@ def _whole(graph: Graph, op: str, args: Sequence[int], side: int) -> int:
     `side`: 1, or -1 where that number is odd.
     """
     a = graph.div(*args) if op == "rem" else args[0]
-    odd = graph.call("select", graph.call("lt", side, graph.zero), graph.zero, graph.one)
+    odd = _where(graph, graph.call("lt", side, graph.zero), graph.one, graph.zero)
     middle = graph.sub(a, odd if op == "round" else graph.add(odd, graph.const(0.5)))
     n = graph.add(graph.mul(graph.const(2.0), graph.call("round", graph.mul(graph.const(0.5), middle))), odd)
-    n = graph.call(
-        "select", graph.call("eq", side, graph.zero), n, graph.call("round" if op == "round" else "floor", a)
-    )
+    plain = graph.call("round" if op == "round" else "floor", a)
+    n = _where(graph, graph.call("eq", side, graph.zero), plain, n)
     if op == "ceil":
         return graph.add(n, graph.one)
     if op == "rem":  # towards zero
-        return graph.sub(
-            args[0],
-            graph.mul(
-                args[1], graph.call("select", graph.call("lt", n, graph.zero), n, graph.add(n, graph.one))
-            ),
-        )
+        towards = _where(graph, graph.call("lt", n, graph.zero), graph.add(n, graph.one), n)
+        return graph.sub(args[0], graph.mul(args[1], towards))
     return n

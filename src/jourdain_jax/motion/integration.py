@@ -1,6 +1,7 @@
 """One motion from start to end as one compiled program, by one of two integrators: our own loop over steps, or diffrax.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are computed, and all is put into a
+Both give states at the saved times, which of those were reached, and where and why the motion ended; then
+speeds are computed, and all is put into a
 `Trajectory`.
 
 Two more checks are result codes, inside `jit` and in every lane. Where nothing does work that no potential accounts for, T + V is constant for a right motion.
@@ -86,7 +87,8 @@ def _with_machine_code(setup: Setup) -> Setup:
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
     """Return the motions of all lanes: `own_steps.width` at a time by a scalar program, else under `vmap`.
 
-    `lane`: the setup of what varies. On a GPU numbers that do not vary have no lanes: kernels are given them once.
+    `lane`: the setup of what varies. On a GPU numbers that do not vary have no lanes: kernels are given them
+    once.
     """
     setups = eqx.filter_vmap(lane)(*varied)
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:

@@ -36,11 +36,14 @@ class Options:
       times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
       is not missed where nothing else keeps steps short; inf: no bound.
-    - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a motion; those at which it continues stay.
+    - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
+      motion; those at which it continues stay.
       `work`: integrate the work of loads without a potential.
     - `max_transitions`: the largest number of events at which a motion continues (`jj.Event`).
-    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
-      `solver` is given); `trajectory.fallback` and its summary report it. Inside your own `jit` or `vmap`, and without it, the result code
+    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that
+      is stiff (by an implicit solver, unless
+      `solver` is given); `trajectory.fallback` and its summary report it. Inside your own `jit` or `vmap`,
+      and without it, the result code
       stays.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.

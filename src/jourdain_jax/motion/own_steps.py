@@ -183,7 +183,9 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
 
 
 def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
-    """Return the motion with a mode and an event for each relation (`lowering/sides.py`); functions of time are part of its program."""
+    """Return the motion with a mode and an event for each relation (`lowering/sides.py`); functions of time
+    are part of its program.
+    """
     field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
     if reason_against_watching(setup) or not isinstance(field, ByProgram):
         return setup, begun
@@ -226,7 +228,8 @@ def reason_against_watching(setup: Setup) -> str:
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
-    """Return whether rates may jump, in a way that derivatives leave out, at a time that depends on the state, on numbers of inputs, or, where the
+    """Return whether rates may jump, in a way that derivatives leave out, at a time that depends on the
+    state, on numbers of inputs, or, where the
     `scene_varies`, on parameters; `watched`: steps watch relations.
     """
     if field.lowered is None:

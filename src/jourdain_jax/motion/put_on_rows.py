@@ -234,7 +234,8 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
-    """Return coordinates of the states `elsewhere`, on the geometric rows; NaN where none are found in the domain.
+    """Return coordinates of the states `elsewhere`, on the geometric rows; NaN where none are found in the
+    domain.
 
     `native`: whether machine code may put them there.
     """

@@ -70,7 +70,8 @@ def simulate(
       default one; "xla", that program compiled by XLA: also for third derivatives, derivatives with respect to samples, `jax.export` and other devices, which
       machine code refuses; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
 
-    All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in all combinations
+    All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in
+    all combinations
     (`jax.hessian`); elsewhere forward mode of forward mode works, to any order.
 
     **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises

@@ -37,7 +37,8 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
 
-    Differentiable in any mode. The remaining violation is in `residual`, infinite where numbers are not finite (no error: this also runs
+    Differentiable in any mode. The remaining violation is in `residual`, infinite where numbers are not
+    finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
     model, scene = modelled(scene), as_scene(scene)
@@ -83,8 +84,10 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
 
     `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s); values that contradict each other by
     no more than a few typed digits do, 1.5e-5, move onto the constraints.
-    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows; where that fails, or leads out of
-    the scene's `domain`, they begin at those of states of the domain, nearest first, as `guess` of the state tells. `near`: coordinates by name, with
+    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
+    where that fails, or leads out of
+    the scene's `domain`, they begin at those of states of the domain, nearest first, as `guess` of the state
+    tells. `near`: coordinates by name, with
     values from which they begin but at which they are not held; those may be found outside of the domain, as may coordinates of which the rows leave no choice.
     Of a quaternion that is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the other parts are zero.
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;

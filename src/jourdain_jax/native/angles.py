@@ -9,7 +9,8 @@ while the multiple of pi/2 has 20 bits; angles beyond are multiplied by as many 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
     asin s = s + s^3 P(s^2) for |s| < 1/2,         otherwise   asin s = pi/2 - 2 asin sqrt((1 - s)/2)
 
-Errors are below 0.9 ulp. In a double-double number, the rest holds the round-off of the head. Sources: T. J. Dekker, Numerische Mathematik 18
+Errors are below 0.9 ulp. In a double-double number, the rest holds the round-off of the head. Sources: T. J.
+Dekker, Numerische Mathematik 18
 (1971) 224; J.-M. Muller et al., Handbook of Floating-Point Arithmetic (2018), chapter 4.
 """
 

@@ -49,8 +49,11 @@ def version() -> tuple[int, int] | None:
     """Return major and minor version of the interface; None, with a warning, if it is unknown."""
     found = _stated_version()
     if found is None:
-        warnings.warn("this jaxlib has an unknown foreign function interface: motions are integrated by XLA, "
-            "more slowly; install a supported version of jaxlib", stacklevel=2)
+        warnings.warn(
+            "this jaxlib has an unknown foreign function interface: motions are integrated by XLA, more slowly; "
+            "install a supported version of jaxlib",
+            stacklevel=2,
+        )
     return found
 
 
@@ -247,7 +250,9 @@ def share(w: Writer, job: Value, count: Value) -> None:
 
 
 class OfLane(NamedTuple):
-    """The numbers of one lane in an array of a batch: where the first one is, and how far the next is from it."""
+    """The numbers of one lane in an array of a batch: where the first one is, and how far the next is from
+    it.
+    """
 
     first: Value
     apart: Value | int
@@ -262,7 +267,7 @@ class OfLane(NamedTuple):
 
 
 def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
-    """Return what an array holds of one of `count` lanes: so many numbers, lane after lane on a CPU.
+    """Return the numbers of one of `count` lanes in an array, which follow one another on a CPU.
 
     On a GPU lanes come last: neighbouring threads, which begin and save together, touch neighbouring words.
     """

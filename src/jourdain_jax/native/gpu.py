@@ -126,14 +126,18 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the axes of an array, that of neighbours in memory first: of `lanes`, its first ones, before all others."""
+    """Return the axes of an array, that of neighbours in memory first: of `lanes`, its first ones, before all
+    others.
+    """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 
 
 def lowered(
     ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel, batch: tuple[int, ...], samples: int
 ) -> list:
-    """Return the call of a kernel for a batch, whose lanes come last but in samples, the first of the arguments."""
+    """Return the call of a kernel for a batch, whose lanes come last but in samples, the first of the
+    arguments.
+    """
     lanes = math.prod(batch)
     slot, allowed = kernel.scratch
     # of all threads, and no more than an eighth of the device: so many slots

@@ -1,9 +1,13 @@
 """The host processor: support of machine code, number of lanes, compilation, and the cache on disk.
 
-Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the user's cache. A file is named by the source of
-its code. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or exchanged for another is made again.
-Code from others would run in this process: a folder or a file that somebody else owns or may write is not used. The digest holds no secret, and LLVM
-does not check loaded code: who may write as the user can make a file that runs code or ends the process, and may change what Python imports anyway.
+Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the
+user's cache. A file is named by the source of
+its code. It begins with a digest of that name, of what made it and of the code, so that one that is torn,
+changed or exchanged for another is made again.
+Code from others would run in this process: a folder or a file that somebody else owns or may write is not
+used. The digest holds no secret, and LLVM
+does not check loaded code: who may write as the user can make a file that runs code or ends the process, and
+may change what Python imports anyway.
 """
 
 import contextlib

@@ -1,7 +1,8 @@
 """NVIDIA GPUs: the driver, PTX from LLVM, and compiled kernels. No toolkit is needed; calls go to `libcuda`
 by ctypes.
 
-A kernel is loaded for all devices at once (`cuLibraryLoadData`, of CUDA 12), and the driver compiles it for each where it is first used; it keeps compiled
+A kernel is loaded for all devices at once (`cuLibraryLoadData`, of CUDA 12), and the driver compiles it for
+each where it is first used; it keeps compiled
 code between processes.
 """
 

@@ -31,7 +31,8 @@ class Turn:
 def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int) -> tuple[list[Turn], int]:
     """Return a turn for each computed value, and the number of places in memory.
 
-    `uses`: the values in order, each with those that it is made of; `there`: those that are in memory already. A place is reused once its value
+    `uses`: the values in order, each with those that it is made of; `there`: those that are in memory
+    already. A place is reused once its value
     is no longer needed.
     """
     made_of = [tuple(dict.fromkeys(values)) for _, values in uses]

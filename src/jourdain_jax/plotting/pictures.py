@@ -115,7 +115,8 @@ def scene_picture(scene) -> str:
     """Return HTML of a scene's bodies at its `example`, in space, on a floor with their shadows; empty if
     there are none.
 
-    A scene that cannot be started has no picture: a notebook displays unfinished scenes, and `jj.start` reports their faults.
+    A scene that cannot be started has no picture: a notebook displays unfinished scenes, and `jj.start`
+    reports their faults.
     """
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)

@@ -53,7 +53,8 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.P
     - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres where there is no contact).
     - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body -> "#rrggbb".
 
-    Looks of bodies come from the scene's `visuals`, see `jj.Visual`; otherwise they are guessed. Returns a `View`. ValueError for other arguments.
+    Looks of bodies come from the scene's `visuals`, see `jj.Visual`; otherwise they are guessed. Returns a
+    `View`. ValueError for other arguments.
 
     **Examples**
 

@@ -59,7 +59,8 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
 def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> list[int]:
     """sum_i w_i d output_i/d variable for each variable (nodes that are not looked into), in one sweep from the outputs back.
 
-    The derivative of a branch that is not taken is zero, whatever its value: there a weight of zero counts, also times what is not a number.
+    The derivative of a branch that is not taken is zero, whatever its value: there a weight of zero counts,
+    also times what is not a number.
     """
     variables = list(variables)
     total: dict[int, int] = {}

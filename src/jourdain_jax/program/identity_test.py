@@ -2,12 +2,14 @@
 
 Sums, products, quotients, roots, sines and cosines of generic numbers agree at random only if they agree everywhere (Schwartz, 1980; Zippel, 1979). Numbers
 near those of a scene are not generic, though (a parameter may be tiny, time may stop before a switch), and a function that has branches, or saturates, may do
-elsewhere what it does at no probe. So inputs are drawn again, of the order of one and larger; and any other function is replaced by one of its operands that
+elsewhere what it does at no probe. So inputs are drawn again, of the order of one and larger; and any other
+function is replaced by one of its operands that
 is neither flat nor kinked anywhere. An identity that holds then holds whatever these functions are.
 
 Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (`calculus/round_off.py`), and two values are equal where they
 differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
-written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. A property of any R holds for this one.
+written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. A
+property of any R holds for this one.
 """
 
 import math

@@ -1,6 +1,7 @@
 """A jaxpr run over scalars, with parts that have no scalar form as calls in the graph.
 
-An equation without a rule is opaque. So are those that hand large arrays to it, those that continue with large arrays from it, and what lies between
+An equation without a rule is opaque. So are those that hand large arrays to it, those that continue with
+large arrays from it, and what lies between
 two opaque ones; so a network is one call. Opaque equations that follow on one another, with nothing else in between, are one call:
 
     level of a scalar = the largest level of what it is made from,   level of an opaque equation = that, and one more behind a scalar

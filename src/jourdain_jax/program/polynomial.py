@@ -1,6 +1,7 @@
 """Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a short expression.
 
-Atoms are inputs and everything that is not +, -, *: sines, cosines, square roots, reciprocals. Expanding cancels equal terms; going back,
+Atoms are inputs and everything that is not +, -, *: sines, cosines, square roots, reciprocals. Expanding
+cancels equal terms; going back,
 terms are gathered by their varying part, whose coefficient (a polynomial in parameters alone) is computed once per motion, and common
 factors are taken out greedily (Horner's scheme in several variables).
 """

@@ -2,7 +2,8 @@
 
 Kinds and shapes are known while a function is traced: no compiled program contains these checks.
 
-Errors in a user's own methods: the traceback shows their lines, and omits lines of this package and of JAX between them. As with JAX's own filtering,
+Errors in a user's own methods: the traceback shows their lines, and omits lines of this package and of JAX
+between them. As with JAX's own filtering,
 JAX_TRACEBACK_FILTERING=off shows all of them. Errors on whose way no user's method was keep their whole traceback.
 """
 

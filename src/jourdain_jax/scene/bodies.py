@@ -20,7 +20,8 @@ class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
     ValueError for other shapes. Its velocity comes by differentiating the position.
-    Where the mass depends on time or coordinates, `m a` holds with its momentary value; the thrust of ejected mass is a load.
+    Where the mass depends on time or coordinates, `m a` holds with its momentary value; the thrust of ejected
+    mass is a load.
     """
 
     mass: Scalar  # kg
@@ -41,7 +42,8 @@ class RigidBody(eqx.Module):
       "wheel", the one point of it is the corner of a box that holds this solid.
 
     ValueError for other shapes. Velocities come by differentiating the pose.
-    Where mass or inertia depend on time or coordinates, they count as they are at each instant, `m a` and `I alpha + omega x I omega`: mass that leaves
+    Where mass or inertia depend on time or coordinates, they count as they are at each instant, `m a` and `I
+    alpha + omega x I omega`: mass that leaves
     or joins carries its momentum, and its thrust is a load. A skater who draws in the arms is several bodies.
     """
 

@@ -53,10 +53,12 @@ class Contact(eqx.Module):
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
       force where `height="coordinates"`.
     - `distance` (m): the gap, where it is not the point's height above the plane.
-    - `shape`: set by `ball_contact` and similar functions, for pictures; other looks are given by the scene's `visuals`.
+    - `shape`: set by `ball_contact` and similar functions, for pictures; other looks are given by the
+      scene's `visuals`.
     - `friction`, `restitution`: as in `ball_contact`.
 
-    If the coordinates determine the point, this avoids the search for it: `jj.Contact(pose["disc"], p, ground=hill)`.
+    If the coordinates determine the point, this avoids the search for it: `jj.Contact(pose["disc"], p,
+    ground=hill)`.
     ValueError for an unknown height, or anything of another kind or shape.
     """
 
@@ -102,8 +104,10 @@ class Contact(eqx.Module):
         """Signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
-    def leaning(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero where it lies flat; None of other shapes."""
+    def lean(self) -> Scalar | None:
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero where it lies flat; None for other
+        shapes.
+        """
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 
 
@@ -126,7 +130,8 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. With it the contact flies, rolls or slips (`motion.phase`), and needs
-      `height="row"`; None (default): it rolls, with whatever friction it needs. `restitution` e, from 0 (default) to 1, of impacts.
+      `height="row"`; None (default): it rolls, with whatever friction it needs. `restitution` e, from 0
+      (default) to 1, of impacts.
     - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law on the slip afterwards. Along the normal impulse, with friction against the slip of
       each moment: "newton", until w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic", until its work is
       -e^2 times. These three are for balls and for slip that keeps its direction, as in a plane: a result code where it would turn.

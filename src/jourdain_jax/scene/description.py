@@ -116,7 +116,9 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """A count that is not a static field would be a number of the equations, and a loop or a branch over it could not be traced."""
+    """A count that is not a static field would be a number of the equations, and a loop or a branch over it
+    could not be traced.
+    """
     for field in fields(scene):
         value = getattr(scene, field.name)
         if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):

@@ -2,7 +2,8 @@
 
 A function counts by its code (byte code, constants, names), default arguments, what it closes over, and the globals that its code names, also in modules of
 the user; functions and classes of installed packages and of this one by their name, since their versions are kept beside, and, where a function made them for
-the user (as `jax.grad` does), by what they close over. So a changed function makes another study. Other objects count by their pickled content.
+the user (as `jax.grad` does), by what they close over. So a changed function makes another study. Other
+objects count by their pickled content.
 """
 
 import copyreg

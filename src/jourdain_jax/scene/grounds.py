@@ -66,7 +66,8 @@ class Plane(_Ground):
 
     A moving plane states its motion twice: `origin` and `tilt` or `normal` as functions of time, and `velocity` and `angular_velocity`, their rates and
     what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
-    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is not a unit vector, where its scene is built.
+    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is not a
+    unit vector, where its scene is built.
     """
 
     normal: Vector3  # unit vector, out of the ground
@@ -148,7 +149,8 @@ class Cylinder(_Round):
 
     `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s): a drum that
     turns has `angular_velocity = rate * axis`. All vectors in the inertial frame. The no-slip rows are along the axis and around it.
-    ValueError: a radius that is not positive, an unknown side; an axis that is not a unit vector, where its scene is built.
+    ValueError: a radius that is not positive, an unknown side; an axis that is not a unit vector, where its
+    scene is built.
     """
 
     axis: Vector3  # unit vector
@@ -191,7 +193,8 @@ class Surface(_Ground):
 
     `f`: a function of three numbers (m, inertial frame) to one, twice differentiable by JAX, with a gradient that does not vanish where it is touched;
     it may close over traced numbers, a surface that moves over the time: `lambda x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at
-    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. ValueError: an `f` that is not a such function.
+    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame.
+    ValueError: an `f` that is not a such function.
     """
 
     f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
@@ -266,7 +269,8 @@ def tangents_of(n: Vector3) -> Tangents:
     """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y
     after the shortest turn of z (or -z) to n.
 
-    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and with them the no-slip constraints, but not their solutions.
+    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and with them the no-slip
+    constraints, but not their solutions.
     Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
     """
     x, y, z = n

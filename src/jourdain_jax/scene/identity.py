@@ -28,7 +28,8 @@ from jourdain_jax.scene.parameters import stacked_parameters
 def clear_caches() -> None:
     """Empty the caches of this package and of JAX, and free their memory.
 
-    Every scene is traced, probed and compiled again at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
+    Every scene is traced, probed and compiled again at its next use. Call this after a change of values that
+    helpers, modules or classes hold. Machine code
     stays: it depends on the text of its program alone, and another thread may be running it.
     """
     for name, module in list(sys.modules.items()):
@@ -43,7 +44,8 @@ def once_per_values(probe, of_traced: Callable | None = None):
     """Decorate a function of a scene (and of further case keys) to run once per class and values, on concrete
     parameters, also during tracing.
 
-    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on numbers that replace them.
+    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on
+    numbers that replace them.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 

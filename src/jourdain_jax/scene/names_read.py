@@ -1,6 +1,7 @@
 """Names that methods read from outside their arguments.
 
-As everywhere in JAX, a method is traced once, and what it reads that is not a field of the scene is a constant of the trace: a part of the structure of the
+As everywhere in JAX, a method is traced once, and what it reads that is not a field of the scene is a
+constant of the trace: a part of the structure of the
 scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
 functions that a method loads itself:
 

@@ -45,11 +45,14 @@ class Scene(eqx.Module):
     - `conventions`: one text: axes, signs, frames.
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
-    Methods are traced once, as everywhere in JAX: values from outside the fields of the scene are constants. Numbers, texts, tuples of them and functions
-    that a method itself reads as global names, or as variables of an enclosing function, may change: the next call notices it, as well as a replaced method
+    Methods are traced once, as everywhere in JAX: values from outside the fields of the scene are constants.
+    Numbers, texts, tuples of them and functions
+    that a method itself reads as global names, or as variables of an enclosing function, may change: the next
+    call notices it, as well as a replaced method
     and code changed by `%autoreload`. Arrays, lists, dictionaries and objects
     with state are refused by name: make them parameters or static fields. Changes of values read by
-    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()` starts again.
+    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()`
+    starts again.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -121,7 +124,8 @@ class Scene(eqx.Module):
         """Return a function S (J s) of a `pose` whose rate is subtracted from the Lagrangian, L = T - V -
         dS/dt; None if there is none.
 
-        The motion does not depend on it, but integrators built on a discrete Lagrangian do: it shows how far their accuracy depends on the choice of L.
+        The motion does not depend on it, but integrators built on a discrete Lagrangian do: it shows how far
+        their accuracy depends on the choice of L.
         """
         return None
 
@@ -149,8 +153,10 @@ class Scene(eqx.Module):
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
-        """Named events at a `motion`: positive while it may continue; it stops where a value falls through zero, or is not a number beyond. At a
-        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion continue.
+        """Named events at a `motion`: positive while it may continue; it stops where a value falls through
+        zero, or is not a number beyond. At a
+        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion
+        continue.
 
         Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
         through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),

@@ -1,6 +1,7 @@
 """Contacts with friction as declarations of a scene: a mode, three events and a direction of slip each.
 
-Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It then has, besides that which its class states,
+Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It
+then has, besides that which its class states,
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`

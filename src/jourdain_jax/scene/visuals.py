@@ -1,6 +1,7 @@
 """Looks of bodies: shapes in the frame of their body, for pictures only.
 
-A scene states them in `visuals(self, pose)`; omitted bodies are drawn by other information: their `outline`, the shapes of
+A scene states them in `visuals(self, pose)`; omitted bodies are drawn by other information: their `outline`,
+the shapes of
 their contacts, their inertia.
 """
 
@@ -42,7 +43,8 @@ class Visual(eqx.Module):
     - `turn`: (3, 3), from its own axes to those of the body (default: the same axes).
     - `colour`: "#rrggbb" (default: the body's, one of a palette). `opacity`: 0 to 1.
 
-    Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Sizes are those at the first saved time; places, turns and the points of lines may
+    Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Sizes are those at the first
+    saved time; places, turns and the points of lines may
     change with the pose. ValueError for anything but a shape.
 
     **Examples**

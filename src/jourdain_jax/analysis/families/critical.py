@@ -4,7 +4,8 @@
     special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
 
     F (a b) = (a b) S(w)         pair on the imaginary axis: F (a + i b) = i w (a + i b);   double root: F a = w a, F b = w b + a;
-                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that continue at the same parameters
+                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that
+                                 continue at the same parameters
 
 R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It has more rows than it needs, and they agree: G_X has full column rank, and its
 pseudo-inverse comes from Q R.

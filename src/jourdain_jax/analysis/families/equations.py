@@ -140,7 +140,8 @@ class SteadyEquations(Motions):
         """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of going on
         along the family or along what is held.
 
-        Directions along which steady motions continue, T, belong to zeros by structure, and are taken out as a subspace, not by their size: with P orthonormal
+        Directions along which steady motions continue, T, belong to zeros by structure, and are taken out as
+        a subspace, not by their size: with P orthonormal
         and across T the others are those of P' A P.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])

@@ -60,7 +60,8 @@ class Family(Printed):
     """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
     periodic one are those at the start of a period.
 
-    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are omitted. Of periodic
+    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to
+    what is held, are omitted. Of periodic
     motions they are multipliers, all of them.
     """
 

@@ -84,7 +84,8 @@ class Rollout(Printed, eqx.Module):
         """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
         `levels` (0 to 1), shape (levels, times).
 
-        Lanes that ended are omitted from then on; NaN where none is left. ValueError where lanes were saved at times of their own.
+        Lanes that ended are omitted from then on; NaN where none is left. ValueError where lanes were saved
+        at times of their own.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
             raise ValueError("lanes were saved at different times, so there are no common quantiles; give all of them one start time, or one `ts`")

@@ -6,7 +6,8 @@ Minimal state z = (q, y), y the privileged speeds; H(z) = T + V = y' m(q) y/2 + 
     ydot = -m^-1 W' H_q + m^-1 G m^-1 H_y                     G(q, y) skew: G y = r,  r = m ydot + W' H_q
 
 r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. S comes from the rates themselves by autodiff, whatever the reduction. One step puts
-S at the midpoint and Gonzalez's discrete gradient in place of grad H, whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0:
+S at the midpoint and Gonzalez's discrete gradient in place of grad H, whence H(z_1) - H(z_0) = gbar.(z_1 -
+z_0) = 0:
 
     z_1 - z_0 = h S(z_m) gbar,   gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
 """
@@ -37,8 +38,10 @@ class DiscreteGradient(FixedStepMethod):
     Needs a minimal state and a constant T + V: rows linear and homogeneous in the speeds, loads with potentials, nothing that depends on time, and
     no geometric rows.
 
-    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also where the other methods drift
-    for lack of symmetry. Other integrals are kept to the order of the method only, and it is the most expensive of these methods per step.
+    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also
+    where the other methods drift
+    for lack of symmetry. Other integrals are kept to the order of the method only, and it is the most
+    expensive of these methods per step.
 
     Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
     J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.

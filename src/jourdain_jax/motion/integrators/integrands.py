@@ -16,7 +16,8 @@ from jourdain_jax.motion.vector_fields.field import Integrated
 def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
     """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
 
-    NaN counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
+    NaN counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last
+    allowed step.
     """
     squared = sum(jnp.sum(part**2, axis=0) for part in (y.q, y.v)) / (len(y.q) + len(y.v))
     squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)

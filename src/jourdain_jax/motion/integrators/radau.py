@@ -30,7 +30,8 @@ _ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1
 class RadauIIA(ImplicitMethod):
     """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff springs, dampers and drives.
 
-    L-stable: fast decaying modes do not bound the steps. The equations of a step are solved by Newton's method to round-off, and
+    L-stable: fast decaying modes do not bound the steps. The equations of a step are solved by Newton's
+    method to round-off, and
     differentiated through the implicit function theorem; a step whose equations are not solved is tried again at a fifth of its length. A step costs some
     fifty evaluations and a linear system three times the size of the state: worth it where an explicit method would need many more steps for
     stability than for accuracy. `simulate` turns to it by itself where its default solver runs out of steps on a stiff motion.

@@ -1,13 +1,13 @@
-"""Sides of relations (`lowering/sides.py`) at a start, and where a number leaves zero."""
+"""Sides of relations (`lowering/sides.py`) at a start, and as a number leaves zero."""
 
 from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
 from jourdain_jax.motion.native.transitions import slowest
 
 
 def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
-    """Take the sides of relations at the start of a motion, in lanes that have tried no step.
+    """Set the sides of relations at the start of a motion, in lanes that have tried no step.
 
-    Where a number vanishes its side is that on which it is after d = eps^(1/4) span, by the midpoint rule.
+    A number that vanishes gets the sign that it has after d = eps^(1/4) span, by the midpoint rule.
     """
     if not form.sides:
         return
@@ -40,7 +40,9 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
 
 def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> list[list[Number]]:
-    """Return values and rates of events, of relations at rest the way left until their numbers leave zero."""
+    """Return values and rates of events; for a relation at rest, the distance left until its number leaves
+    zero.
+    """
     c, rate = (list(part) for part in found)
     for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
         rests, x = w.equal(side, 0.0), c[k]
@@ -51,9 +53,9 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
 
 
 def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
-    """Return which values sink after an event, and the values, without those that still rise from zero.
+    """Return which values sink after an event, and the values, except those that still rise from zero.
 
-    A time asked for may follow an event within round-off.
+    A time to save may follow an event within round-off.
     """
     rising = [~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
     c_1 = [w.where(rises & ~(b > 0.0), 1.0, b) for b, rises in zip(c_1, rising, strict=True)]

@@ -17,7 +17,8 @@ class Taylor(eqx.Module):
     there. Against Dopri8 at equal error, a Chaplygin sleigh takes half of the time alone at 1e-12, a scene of some hundred operations more time than it.
 
     **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`.
-    **Raises** from `simulate`: ValueError without machine code, for sampled inputs, and for equations that branch or are too long.
+    **Raises** from `simulate`: ValueError without machine code, for sampled inputs, and for equations that
+    branch or are too long.
     Derivatives: forward mode by series too, and by Dopri8 where those of second derivatives were too long; reverse mode goes over the motion once more by it.
     Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99.
     """

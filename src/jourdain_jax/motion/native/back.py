@@ -1,8 +1,10 @@
 """Reverse mode of the loop over steps as machine code: cotangents of the start from those of the states and
 the end.
 
-Lanes side by side begin and end together here. On the forward pass every try of a step leaves a slot: the state before it, the slopes of its stages, by how
-far the state continued (zero where the step was refused, or the lane had ended), and how many times had been saved before it
+Lanes side by side begin and end together here. On the forward pass every try of a step leaves a slot: the
+state before it, the slopes of its stages, by how
+far the state continued (zero where the step was refused, or the lane had ended), and how many times had been
+saved before it
 (`record.py`). On the backward pass, a step being a number,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
@@ -133,7 +135,9 @@ def _write_added(w: MachineWriter, form: Form) -> None:
 
 
 def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that continued in it."""
+    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that continued
+    in it.
+    """
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         step_back(w, form, method, asked, state, here, g, by_known)
 

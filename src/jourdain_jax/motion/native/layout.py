@@ -5,7 +5,8 @@ A lane is handed over with all rows of `Form.given`, its progress at the start a
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
 derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
 second order those along e_1, e_2, and both. `taken` is by how far the last step has gone; of
-a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected.
+a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be
+after one that was rejected.
 
 Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and
 where the next knot is at which a step must end (`knot`; `samples.py`).
@@ -124,7 +125,9 @@ class Form:
 
     @property
     def transitions(self) -> int:
-        """The most transitions of a motion that are noted; none where all events that the scene states end it."""
+        """The most transitions of a motion that are noted; none where all events that the scene states end
+        it.
+        """
         return self.most if self.goes_on and not all(self.stops[: self.stated]) else 0
 
     @property
@@ -230,7 +233,8 @@ class MachineWriter(Writer):
     common: Sequence[bool] = ()
 
     def constant(self, pointer: Value, index: int) -> Value:
-        """Return a number that is the same in all threads of a GPU, in memory that nothing changes meanwhile."""
+        """Return a number that is the same in all threads of a GPU, in memory that nothing changes meanwhile.
+        """
         place = self.converted("addrspacecast", self.at(pointer, index), "ptr addrspace(1)").name
         text = f"load {self.real}, ptr addrspace(1) {place}, align 8, !invariant.load !{{}}"
         return self.instruction(self.real, text)

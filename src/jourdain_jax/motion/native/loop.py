@@ -2,7 +2,8 @@
 ends.
 
 Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
-narrow registers, in which an instruction takes less time. Results of a lane do not depend on the width. A call is given two arrays with one row per
+narrow registers, in which an instruction takes less time. Results of a lane do not depend on the width. A
+call is given two arrays with one row per
 lane: the rows of `Form.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
 were reached one after the other. Where inputs are given by samples, their tables and knots come first (`layout.py`).
 
@@ -52,8 +53,10 @@ from jourdain_jax.native.ffi import (
 )
 from jourdain_jax.native.ir import Value
 
-# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's
-# own memory (`ffi.py`), on a GPU where that is what all lanes share, and how many rows of times there are (one, or one
+# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a
+# kernel's
+# own memory (`ffi.py`), on a GPU where that is what all lanes share, and how many rows of times there are
+# (one, or one
 # of each lane), those of samples, then pointers to the arrays
 COUNT, TIMES, NEXT, OWN, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(7)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
@@ -166,9 +169,9 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
 
 
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
-    """Return rows of the start of a lane, and the numbers that these are given.
+    """Return the rows of the start of a lane, each run with its source.
 
-    What all lanes of a GPU share, and steps do not change, stays where it is.
+    On a GPU, numbers that all lanes share and no step changes are not copied.
     """
     count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
     found, shared = [], w.common if w.device else [False] * form.given

@@ -1,7 +1,9 @@
-"""How operands of a call of machine code become the arrays that it is given: on a CPU and on a GPU.
+"""Operands of a call of machine code, joined to the arrays that it takes on a CPU and on a GPU.
 
-Rows of a start come as vectors and numbers, some of which have lanes. On a CPU they are put together lane by lane; on a GPU
-those that all lanes share are an array of their own, without lanes, and the times to save at may have none, too.
+The rows of a start are vectors and numbers, some of them with lanes. On a CPU they are joined lane by lane.
+On a GPU
+the rows that all lanes share are an array of their own, without lanes; so are the times to save, where lanes
+share them.
 """
 
 from collections.abc import Sequence
@@ -12,13 +14,13 @@ from jaxtyping import Array
 
 
 class Operands(NamedTuple):
-    """How operands of a call, of which some have lanes, become the arrays that machine code is given."""
+    """The operands of one call, some of them with lanes."""
 
     batch: tuple[int, ...]  # numbers of lanes, one for each `vmap`
     ranks: tuple[int, ...]  # of the operands, without lanes
     samples: int  # how many come first
     others: int  # how many come last, each an array; those in between are rows of a start
-    constant: tuple[tuple[int, float], ...]  # rows of a start that are no operands
+    constant: tuple[tuple[int, float], ...]  # rows of a start that are not operands
 
     def _laned(self, x: Array, rank: int) -> Array:
         """Return the operand with all lanes."""
@@ -49,7 +51,7 @@ class Operands(NamedTuple):
         for x, rank, _ in rows:
             x = self._laned(jnp.asarray(x, dtype), rank) if laned else jnp.asarray(x, dtype)
             found.append(jnp.moveaxis(x, -1, 0) if rank else x[None])
-        # XLA compiles what is put together with lanes last in less time (`markers.entries_of`)
+        # XLA compiles a concatenation with lanes last in less time (`markers.entries_of`)
         return jnp.moveaxis(jnp.concatenate(found), 0, -1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
@@ -59,9 +61,10 @@ class Operands(NamedTuple):
         return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
 
     def given_once(self, *values: Array) -> list[Array]:
-        """Return the arrays of a GPU: rows of a start that lanes share come without lanes, after the others.
+        """Return the arrays of a GPU: the rows of a start that all lanes share follow the others, without
+        lanes.
 
-        The last operand may have none, too.
+        The last operand, the times, has no lanes either where all lanes share it.
         """
         rows, last = self._rows(values), len(values) - self.others
         starts = [

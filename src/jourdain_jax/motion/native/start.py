@@ -1,4 +1,4 @@
-"""What a loop over steps is given of a motion, and what it returns: as machine code and on arrays."""
+"""Input and output of a loop over steps, as machine code and on arrays."""
 
 import math
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jourdain_jax.motion.native.layout import PROGRESS, Form
 
 
 def constant_rows(form: Form) -> dict[int, float]:
-    """Return the rows with which all motions begin alike, and their numbers."""
+    """Return the rows that are equal at the start of every motion, with their numbers."""
     rows = form.rows
     said = {"code": float(RUNNING), "event": -1.0, "pivot": math.inf}
     begun = dict.fromkeys(range(form.integrated, form.returned), 0.0) | {
@@ -22,21 +22,21 @@ def constant_rows(form: Form) -> dict[int, float]:
 
 
 class Start(NamedTuple):
-    """A motion as a loop is given it; the state and what is known are followed by their tangents (`Form`)."""
+    """The input of a loop: a motion; the state and the known numbers are followed by their tangents (`Form`).
+    """
 
     of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
     control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
     goals: Float[Array, "times *lanes"]  # since the start
     origin: Float[Array, "*lanes"]  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
-    known: tuple[tuple[Array, ...], ...]  # numbers; of a loop on arrays those in which the arguments of rates are stored, with their lanes first
+    known: tuple[tuple[Array, ...], ...]  # numbers; for a loop on arrays the stored arguments of rates, lanes first
     modes: tuple[Float[Array, "*lanes"], ...] = ()
-    plain: tuple[Array, ...] = ()  # `known` as it was given, for kernels of a GPU: witshared
+    plain: tuple[Array, ...] = ()  # `known` without lanes where all share it, for kernels of a GPU
 
     def numbers(self) -> tuple[Float[Array, "*lanes"], ...]:
-        """Return the rows of a lane at the start, after the state, that are not `constant_rows`.
-
-        What of them has no lanes is the same in all.
+        """Return the rows at the start, after the state, that are not `constant_rows`; without lanes where
+        all share them.
         """
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
@@ -49,7 +49,7 @@ class Start(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A motion as a loop returns it; each with its tangents."""
+    """The output of a loop: a motion; each part is followed by its tangents."""
 
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
@@ -60,7 +60,9 @@ class Found(NamedTuple):
 
     @staticmethod
     def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
-        """Put a motion together from its states, its rows at the end, and the number of goals that were reached."""
+        """Put a motion together from its states, its rows at the end, and the number of goals that were
+        reached.
+        """
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
 
@@ -82,9 +84,11 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`: what of the start has.
+        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`:
+        what of the start has.
 
-        A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
+        A tangent has lanes where anything has that it depends on: all directions share the values of one
+        motion.
         """
         parts = range(len(self.y))
         base = any(jax.tree.leaves(given._replace(y=(), known=())))

@@ -4,10 +4,12 @@
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
 This is the one source of a step. It asks a writer for arithmetic, memory, branches and loops: `MachineWriter` (`layout.py`) writes what it asks as machine
-code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Events, those of relations among them (`lowering/sides.py`),
+code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Events, those of relations among
+them (`lowering/sides.py`),
 and the search for one are by the formulas of `motion/integrators/event_search.py`.
 
-A step ends at every time requested and at every knot of the inputs; the step size found before such a shortened step is remembered. The state advances by
+A step ends at every time requested and at every knot of the inputs; the step size found before such a
+shortened step is remembered. The state advances by
 the difference of the times at the ends of a step, as they are after rounding.
 
 Where rows are about to lose rank, sigma being the sine between a row and those before it, round-off eps of a row is a velocity eps/sigma^2 across it, which
@@ -15,7 +17,8 @@ fills the error of short steps. In a step that starts at sigma < 0.1 the stages 
 along the rows, less n^2, and the distance that the projection moves the state, less n. Here n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of
 the stages; a displacement n across the rows moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
 
-In single precision the state is summed with compensation (Kahan): the rounding error of an increment is added to the next one. Otherwise a state whose
+In single precision the state is summed with compensation (Kahan): the rounding error of an increment is added
+to the next one. Otherwise a state whose
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 
@@ -80,7 +83,9 @@ def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Numb
     y1, error = w.room(form.integrated), w.room(form.y)
     w.in_step(p["t"], step)
     smallest, changed_sign, rank = stages(w, form, method, p, k, p["t"], step, y1)
-    each_row(w, form.y, error, lambda i: step * weighted(w, method.b_error, k, form, i))
+    # every stage counts: a comparison hides a NaN of an earlier stage whose weight is zero
+    weights = method.b_error[: method.needed]
+    each_row(w, form.y, error, lambda i: step * weighted(w, weights, k, form, i, every=True))
     if form.compensated:
         _compensate(w, form, p, y1, lambda i: step * weighted(w, method.b, k, form, i))
     if form.projects:
@@ -188,7 +193,8 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
     """Return the smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing
     rank.
 
-    Puts the slopes of all stages into `k`, and into `y1` the state of the next stage, computed once, until it is that at the end of the step.
+    Puts the slopes of all stages into `k`, and into `y1` the state of the next stage, computed once, until it
+    is that at the end of the step.
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()
@@ -270,9 +276,11 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
     return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
 
 
-def weighted(w: StepWriter, weights: Number, k: Number, form: Form, row: int | Number) -> Number:
-    """sum_j w_j k_j of one number of the state; numbers of a loop over stages may all be other than zero."""
-    first, *others = [j for j in range(len(weights)) if w.may_count(weights, j)]
+def weighted(
+    w: StepWriter, weights: Number, k: Number, form: Form, row: int | Number, every: bool = False
+) -> Number:
+    """Return `sum_j w_j k_j` of one number of the state; `every`: with terms whose weight is zero."""
+    first, *others = [j for j in range(len(weights)) if every or w.may_count(weights, j)]
     total = w.load(k, row + first * form.integrated) * weights[first]
     for j in others:
         total = w.fma(w.load(k, row + j * form.integrated), weights[j], total)

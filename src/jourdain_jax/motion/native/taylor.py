@@ -3,7 +3,8 @@ within it.
 
     y(t + s) = sum_{k=0}^p y_k s^k,        h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
 
-so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y) are written out order by order:
+so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y) are
+written out order by order:
 
     y_{k+1} = f_k/(k + 1)                                  x_k = x^(k)/k! of any number x along the solution
     (a b)_k = sum_{j=0}^k a_j b_{k-j}

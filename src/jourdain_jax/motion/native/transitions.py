@@ -181,7 +181,8 @@ class Happened(NamedTuple):
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
     """Store the state after an event in `y1`; record the event, and the state before.
 
-    `stuck` becomes the code of a motion that does not go on: where the event's value rises afterwards, but so slowly that round-off
+    `stuck` becomes the code of a motion that does not go on: where the event's value rises afterwards, but so
+    slowly that round-off
     hides it; where a mode is negative; where a relation would turn back at once.
     """
     event, t, flat, quiet, switches, noise, found = happened

@@ -6,12 +6,15 @@ in which an instruction takes less time. Results of a lane do not depend on the 
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
-Each is machine code of its own, made when it is requested: derivatives are taken on the graph. For programs that are too large these are JAX's derivatives of
+Each is machine code of its own, made when it is requested: derivatives are taken on the graph. For programs
+that are too large these are JAX's derivatives of
 the program as XLA runs it.
 
 Beside the steps stand numbers that depend on parameters alone, and all speeds, pivots and energies at saved states: functions of JAX on one state or scene,
-for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's (`lowering/lowered.py`). Machine code
-costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place of 1,070.
+for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's
+(`lowering/lowered.py`). Machine code
+costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place
+of 1,070.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,9 +51,11 @@ def called(
     effort: int = 2,
     constant: Mapping[int, float] | None = None,
 ) -> Callable:
-    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the
+    arguments.
 
-    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. Where rows of a start
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. Where rows of
+    a start
     are `constant`, the next argument holds all others, as vectors of the state, and numbers.
     """
 

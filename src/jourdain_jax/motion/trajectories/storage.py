@@ -1,7 +1,8 @@
 """Saving and loading motions as NumPy's `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `fallback`, `inputs` (times, inputs;
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`,
+`fallback`, `inputs` (times, inputs;
 sampled at `ts`), `phases.NAME` for every array of `motion.phases` (absent where there is one phase, without modes), and `parameter:NAME` for every field that
 is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
@@ -64,7 +65,8 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
 
     A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
-    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is not an array, number or text.
+    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a
+    field that is not an array, number or text.
     Read it with `load_trajectory` or `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):

@@ -34,7 +34,8 @@ class Trajectory(Record, Printed):
     """A motion over time. Times after an early end (event, failure) hold NaN.
 
     `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
-    NaN. Automatic uses, such as a loss to be minimised, should take `motion.nan_if_failed()`, or check `motion.succeeded`.
+    NaN. Automatic uses, such as a loss to be minimised, should take `motion.nan_if_failed()`, or check
+    `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
@@ -135,7 +136,8 @@ class Trajectory(Record, Printed):
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states only units of parameters. ImportError without xarray.
+        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states only
+        units of parameters. ImportError without xarray.
         """
         return labelled.to_xarray(self, units)
 
@@ -169,7 +171,8 @@ class Trajectory(Record, Printed):
         """Reasons to doubt the motion, the most serious first; empty if there are none. The printed summary
         shows them.
 
-        A failure; rows that gain or lose rank, or come near it, so that constraint forces and derived quantities may not be unique; privileged speeds of a
+        A failure; rows that gain or lose rank, or come near it, so that constraint forces and derived
+        quantities may not be unique; privileged speeds of a
         reduction that do not determine the others in this precision; contacts that would have to pull.
         Computed where it is requested; needs numbers: not under jit or vmap.
         """
@@ -209,7 +212,8 @@ class Trajectory(Record, Printed):
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Their derivatives are NaN, too. Samples omitted from a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with
+        Their derivatives are NaN, too. Samples omitted from a loss by `jnp.where(motion.succeeded, ..., 0.0)`
+        do not disturb its derivatives with
         respect to shared values.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731
@@ -221,7 +225,8 @@ class Trajectory(Record, Printed):
         """Return the trajectory itself; raise a SimulationError with reason and time if it did not reach its
         end or an event.
 
-        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; use `nan_if_failed` there.
+        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; use `nan_if_failed`
+        there.
         """
         if int(self.result) > results.EVENT:
             raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")

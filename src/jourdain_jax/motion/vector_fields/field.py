@@ -40,8 +40,10 @@ class Formulation(eqx.Module):
     - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto" (default), the minimal one where the
       privileged speeds are well conditioned over the scene's domain and the rows are linear or affine.
     - `reduction`: how accelerations are found, a name or an object as in `accelerations` (default: the scene's scalar program where there is one).
-    - `stabilisation`: how start and state are kept on constraints that the integrated state does not satisfy by
-      construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
+    - `stabilisation`: how start and state are kept on constraints that the integrated state does not
+      satisfy by
+      construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)` adds its
+      terms to
       the constraints, for comparison; None does nothing.
 
     ValueError for anything else.
@@ -127,7 +129,8 @@ class Watched(NamedTuple):
 class VectorField(eqx.Module):
     """Packing, unpacking, rates and projection of a scene's state. All choices are static.
 
-    `fixed`: the scene's part of the rates, computed once per motion; `inputs`: their values at the time, for `rates` and `rates_and_pivots` from `now`.
+    `fixed`: the scene's part of the rates, computed once per motion; `inputs`: their values at the time, for
+    `rates` and `rates_and_pivots` from `now`.
     """
 
     independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
