@@ -13,7 +13,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 467_818,
+    "code tokens of src": 468_195,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
     "caches": 51,

@@ -30,8 +30,9 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.functions import reason_against_derivatives
 from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.loop import OF_SAMPLES, flow
-from jourdain_jax.motion.native.native_motion import driven, numbers_of, others_of
+from jourdain_jax.motion.native.native_motion import numbers_of, others_of
 from jourdain_jax.motion.native.start import Start
+from jourdain_jax.motion.native.time_functions import driven, may_jump
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
@@ -209,7 +210,8 @@ def reason_against_watching(setup: Setup) -> str:
     where one does, or they have none.
     """
     if setup.field.lowered is None:
-        return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
+        jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
+        return "the scene has no scalar program" if jump else ""
     program, numbers = _relations(setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names))
     if not numbers:
         return ""
@@ -232,14 +234,15 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     state, on numbers of inputs, or, where the
     `scene_varies`, on parameters; `watched`: steps watch relations.
     """
+    traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
-        return loads_may_jump(scene)
+        functions = [(x.program, numbers_of(y)) for x, y in zip(inputs.channels, traced, strict=True) if isinstance(x, FunctionOfTime)]
+        return loads_may_jump(scene) or any(may_jump(program, varies) for program, varies in functions)
     program, _ = _relations(field.lowered, inputs, False)
     left_out = [n for n in program.jumps if not watched or n not in program.sided]
     if not left_out:
         return False
     lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
-    traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     numbers = [varies for channel in compress(traced, lowered) for varies in numbers_of(channel)]
     others = [any(jax.tree.leaves(channel)) for channel, is_lowered in zip(traced, lowered, strict=True) if not is_lowered]
     count = len(program.traced.q) + len(program.independent)

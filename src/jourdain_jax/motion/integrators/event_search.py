@@ -288,8 +288,9 @@ def monitored(
     w.store(0.5, half)
     w.if_any(again, lambda: w.store(ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), half))
     dips, share = accept & ((share < 1.0) | again), w.where(again, w.load(half), share)
+    restarts = locating & again  # a trial that passes a second zero of a value that rises from zero: a shorter step
     happened = accept & ~dips & ~no_event(c_1)
-    was_trying, changes, first = search_of(form, p).trying, happened | locating, w.room()
+    was_trying, changes, first = search_of(form, p).trying, happened | (locating & ~restarts), w.room()
     w.store(p["event"], first)
 
     def follow() -> None:
@@ -298,9 +299,9 @@ def monitored(
     w.if_any(changes, follow)
     search = search_of(form, p)
     # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
-    found, back = locating & w.equal(search.left, 0.0), changes & search.trying
+    found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
     over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
-    stays = back | dips | over
+    stays = back | dips | restarts | over
 
     def state(i: int | Number) -> Number:
         after = w.load(y1, i)
@@ -311,13 +312,13 @@ def monitored(
     for i in reversed(range(count - 1)):
         which = w.where(sunk[i] | sinks[i], i, which)
     code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
-    tried = w.where(dips, 1.0, 0.0)
+    code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
     changed = {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
-        "h": w.where(over, p["h"], w.where(dips, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
+        "h": w.where(over, p["h"], w.where(dips | restarts, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
         "code": w.where(over, results.EVENT, code),
         "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
-        "rejected": w.where(over, p["rejected"], new["rejected"] + tried),
+        "rejected": w.where(over, p["rejected"], new["rejected"] + w.where(dips | restarts, 1.0, 0.0)),
         "event": w.where(over, which, w.where(happened | (locating & was_trying), w.load(first), p["event"])),
         "taken": w.where(stays, 0.0, new["taken"]),
     }

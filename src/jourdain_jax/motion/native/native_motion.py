@@ -14,8 +14,7 @@ A start is moved by less than its time, t_0 = number - d, what is found by more.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
@@ -23,86 +22,26 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.build.trace import Variables
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.lowering.lowered import NODES, Lowered
-from jourdain_jax.lowering.relations import jumps, sided, switches
-from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled, TimeProgram
+from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
 from jourdain_jax.motion.native.back import flow_back
 from jourdain_jax.motion.native.functions import check_derivatives, event_program
 from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.start import Found, Start
+from jourdain_jax.motion.native.time_functions import driven
 from jourdain_jax.motion.native.values import values_of_nodes
 from jourdain_jax.motion.setup import NONE_PASSED, Begun, Passed, Setup, Solved
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import on_its_own
-from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
-from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
-
-MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
-
-
-@lru_cache(maxsize=64)
-def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
-    """Return the program with these functions in place of inputs, or the reason why there is none; their
-    numbers come last among the `fixed` ones.
-    """
-    numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
-    if numbers > MOST_NUMBERS:
-        return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
-    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
-        return "the scene keeps parts as calls, and an input is a function of time"
-    graph = Graph(keeps_rules=True)
-    new = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
-    t, known = new[program.traced.t], []
-    try:
-        for node, function in zip(program.traced.inputs.tolist(), functions, strict=True):
-            if function is not None:
-                given = [[graph.input(f"{node} {k} {i}", True) for i in range(math.prod(shape))] for k, shape in enumerate(function.shapes)]
-                known += [n for part in given for n in part]
-                arguments = [Nodes(np.reshape(part, shape)) for part, shape in zip(given, function.shapes, strict=True)]
-                new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
-    except (Unsupported, ValueError) as error:
-        return f"an input is a function of time without scalar form ({error})"
-    nodes = {name: getattr(program, name) for name in NODES}
-    of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
-    by_functions = switches(graph, of_functions)
-    probes = _random(graph, [*by_functions, *of_functions])
-    go_on = sided(graph, by_functions, of_functions, probes)
-    new = graph.copied([program.power, *(n for part in nodes.values() for n in part)], program.graph, new)
-    on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
-    on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
-    on_it["sided"] += go_on
-    on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
-    stays = [i for i, function in enumerate(functions) if function is None]
-    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
-    q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
-    return replace(
-        program,
-        traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
-        inputs=tuple(program.inputs[i] for i in stays),
-        fixed=(*(new[n] for n in program.fixed), *known),
-        power=new[program.power],
-        **on_it,
-        z=(),  # what is seen of a motion is evaluated with the values of inputs
-    )
-
-
-def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
-    """Return random times and numbers for functions."""
-    generator = np.random.default_rng(11)
-    # states at which it is seen whether functions jump
-    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
+from jourdain_jax.program.graph import Unsupported
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
@@ -239,13 +178,6 @@ def _reason_against_series(form: Form, order: int) -> str:
         return reason
     count = taylor.products(form, order)
     return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
-
-
-def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
-    """The program that takes numbers and samples alone, or why there is none."""
-    if not inputs.programs:
-        return program
-    return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
