@@ -346,7 +346,7 @@ def test_bad_contacts():
         jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
     with pytest.raises(ValueError, match=r"contacts with friction, and time runs from t0 = 0\.0 back to t1 = -1\.0 s"):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
-    with pytest.raises(ValueError, match="`linearize` needs rolling contacts, but `cloth` of `Ball` may slip and lift off"):
+    with pytest.raises(ValueError, match="`linearize` needs contacts that roll and rows that hold, but `cloth` of `Ball` may slip"):
         jj.linearize(Ball(), {"z": 0.0285})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body begins below the ground" in below.message
@@ -552,8 +552,8 @@ def test_contacts_that_close_together_strike_together():
     sideways = 2.5 - 0.4 * 1.3 * G * fall
     turned = 0.4 * 1.3 * G * fall * 0.1 / 0.02
     np.testing.assert_allclose(ends[0], [height, speed, sideways, -turned, 0.0], atol=1e-11)
-    ends[1][4] *= -1  # what is round-off here changes its sign as the body is turned round
-    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[0][:4], ends[1][:4])  # the last one is round-off in both orders
+    np.testing.assert_allclose([ends[0][4], ends[1][4]], 0.0, atol=1e-16)
 
 
 class TippeTop(Ball):

@@ -67,6 +67,7 @@ from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
 from jourdain_jax.scene.contacts import Contact, Coulomb, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+from jourdain_jax.scene.held_rows import joint_friction
 from jourdain_jax.scene.identity import clear_caches
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.modes import Event, modes
@@ -297,6 +298,7 @@ __all__ = [
     "huber",
     "inertia_from_log_cholesky",
     "inputs",
+    "joint_friction",
     "joint_normal",
     "kinetic_energy",
     "knife_edge",

@@ -35,7 +35,7 @@ from jourdain_jax.scene.grounds import Cylinder, Sphere
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of, loads_of
+from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
 _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
@@ -46,9 +46,16 @@ Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]  # by kind, an
 def numbers_of(scene: Scene, motion: Motion) -> Numbers:
     """Return the numbers that the table judges, from known poses and velocities."""
     pose = motion.pose()
+    contacts = contacts_of(scene, pose)
+    laws = {f"contact `{name}`": c.friction for name, c in contacts.items() if c.friction is not None}
+    laws |= {f"`{name}`": row.friction for name, row in held_rows_of(scene, motion).items()}
     return stated_of(scene, pose, loads_of(scene, motion)) | {
         "position": {f"body `{name}`": body.position for name, body in pose.bodies.items()},
-        "touch": {f"contact `{name}`": contact.point + contact.plane.normal for name, contact in contacts_of(scene, pose).items()},
+        "touch": {f"contact `{name}`": contact.point + contact.plane.normal for name, contact in contacts.items()},
+        "friction": {f"the friction of {name}": law.sliding for name, law in laws.items()},
+        "static": {
+            f"the static friction of {name}": jnp.stack([law.static, law.sliding]) for name, law in laws.items()
+        },
         **_of_grounds(scene, motion),
     }
 
@@ -59,7 +66,6 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
-    laws = {name: c.friction for name, c in contacts.items() if c.friction is not None}
     size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
     away = _round_off(pose)  # in the places of contacts that are far out
     return {
@@ -73,8 +79,6 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
         "gap": {name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)]) for name, c in closed.items()},
         "length": {f"{what} of {name}": length for name, c in contacts.items() for what, length in _lengths(c).items()},  # m
         "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
-        "friction": {f"the friction of {name}": law.sliding for name, law in laws.items()},
-        "static": {f"the static friction of {name}": jnp.stack([law.static, law.sliding]) for name, law in laws.items()},
         "restitution": {f"the restitution of {name}": c.restitution for name, c in contacts.items() if c.restitution is not None},
         "gravity": {f"the direction of gravity in load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
     }

@@ -144,7 +144,7 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: A
     events = [event for _, event in sorted(every.items())]
     if all(event.stop for event in events):
         return jnp.zeros((len(events), 0))
-    names = (*scene.coordinate_names.entries, *scene.speed_names.entries, *scene.modes.names)
+    names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
     given, modes = jnp.split(motion.inputs.array, (len(scene.inputs) - len(scene.modes.names),))
     now = jnp.concatenate([motion.q.array, motion.u.array, modes])
 
@@ -153,8 +153,8 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: A
         return stored_by_inputs(scene, motion_at(scene, motion.t, q, 0.0 * u, jnp.concatenate([given, after])), of_inputs)
 
     def after(event: Event) -> Float[Array, "rows"]:
-        changed = {**event.jump, **event.to}
-        found = jnp.stack([changed.get(name, now[i]) for i, name in enumerate(names)])
+        state = [event.jump.get(name, value) for name, value in zip(names, now, strict=False)]
+        found = jnp.stack([*state, *map(event.to.get, scene.modes.names, modes)])
         return jnp.append(found, stored(found) - stored(now) if of_inputs else 0.0)
 
     return jnp.stack([after(event) for event in events])

@@ -154,7 +154,12 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     if scene.switching.contacts:
         found = switching_forces(scene, motion, contact_response(scene, motion))
         sure = jnp.array(True)
-        forces = {name: _contact_force(L[0], L[1:], sure, sure, margin) for name, L in zip(scene.switching.contacts, found.reshape(-1, 3), strict=True)}
+        by_name = dict(zip(scene.switching.contacts, found.reshape(-1, 3), strict=True))
+        forces = {
+            name: _contact_force(L[0], L[1:], sure, sure, margin)
+            for name, L in by_name.items()
+            if name in contacts
+        }
     for name, contact in contacts.items():
         if name in forces:
             continue

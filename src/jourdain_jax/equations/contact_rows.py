@@ -1,20 +1,24 @@
-"""How contacts that switch move: gaps, their rates, and slip, with the derivatives that their forces need.
+"""How contacts that switch move, and rows that hold up to a force: gaps, their rates, and slip, with the
+derivatives that their forces need.
 
     w = (dg/dt, slip along the tangents)    of each contact;   w = A u + a,   dw/dt = A udot + drift
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.rows import rates_along, slip_of
-from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.contacts import Contact, Coulomb
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of
+from jourdain_jax.scene.validated import contacts_of, held_rows_of
 
 
 class ContactRows(eqx.Module):
@@ -26,17 +30,49 @@ class ContactRows(eqx.Module):
     drift: Float[Array, "rows"]
 
 
-def switching_contacts(scene: Scene, pose: Pose) -> dict[str, Contact]:
-    """Return the contacts that have friction, in the order of their modes."""
+class SwitchingRow(NamedTuple):
+    """What a contact with friction, or a row that holds up to a force, brings into the law."""
+
+    friction: Coulomb
+    slip: Float[Array, "2"]  # m/s or rad/s
+    contact: Contact | None  # None: a row, with a normal force of one
+
+    @property
+    def restitution(self) -> Scalar:
+        """Newton's, of impacts; zero of rows."""
+        return jnp.zeros_like(self.slip[0]) if self.contact is None else jnp.asarray(self.contact.restitution)
+
+    @property
+    def impact(self) -> str:
+        """The law of impacts."""
+        return "moreau" if self.contact is None else self.contact.impact
+
+    def lean(self) -> Scalar | None:
+        """Lean of a disc or wheel (`Contact.lean`)."""
+        return None if self.contact is None else self.contact.lean()
+
+
+def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
+    """Return the contacts that have friction and the rows that hold up to a force, in the order of their modes."""
+    contacts = contacts_of(scene, motion.pose())
+    found = {name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction}
+    rows = held_rows_of(scene, motion).items()
+    found |= {name: SwitchingRow(row.friction, row.slip, None) for name, row in rows}
+    return {name: found[name] for name in scene.switching.contacts}
+
+
+def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
+    """Return the gaps of contacts that switch, m; zero of rows that hold up to a force."""
     contacts = contacts_of(scene, pose)
-    return {name: contacts[name] for name in scene.switching.contacts}
+    names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
+    return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
 
 
 def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
     """Rates of the gaps, and slip along both tangents, of all contacts that switch, m/s."""
-    rates = rates_along(scene, motion, lambda pose: {name: contact.gap() for name, contact in switching_contacts(scene, pose).items()})
-    contacts = switching_contacts(scene, motion.pose())
-    return jnp.concatenate([jnp.append(rates[name], slip_of(contact, motion)) for name, contact in contacts.items()])
+    rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
+    slips = [row.slip for row in switching_rows(scene, motion).values()]
+    return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
 
 
 def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
@@ -46,16 +82,25 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
     def speeds(t, q, u):
         return contact_speeds(scene, motion_at(scene, t, q, u, inputs))
 
-    gap = jnp.stack([contact.gap() for contact in switching_contacts(scene, motion.pose()).values()])
+    gap = gaps_of(scene, motion.pose())
     A = jax.jacfwd(lambda u: speeds(t, q, u))(u)
     w, drift = jax.jvp(lambda t, q: speeds(t, q, u), (t, q), (jnp.ones_like(t), coordinate_rates(scene, t, q, u)))
     return ContactRows(gap, w, A, drift)
 
 
-def contact_loads(scene: Scene, motion: Motion, forces: Float[Array, "rows"]) -> tuple[Load, ...]:
-    """The forces of the ground on the bodies as loads: normal ones, and along both tangents."""
-    loads = []
-    for (_, contact), (normal, *tangential) in zip(switching_contacts(scene, motion.pose()).items(), forces.reshape(-1, 3), strict=True):
+def contact_loads(
+    scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
+) -> tuple[Load, ...]:
+    """The forces of the ground on the bodies as loads: normal ones, and along both tangents; those of rows
+    that hold up to a force act on the speeds, as A' L.
+    """
+    loads, along, speeds = [], A[1::3], scene.speed_names.entries
+    for i, (row, (normal, *tangential)) in enumerate(
+        zip(switching_rows(scene, motion).values(), forces.reshape(-1, 3), strict=True)
+    ):
+        if (contact := row.contact) is None:
+            loads.append(Load(generalized=dict(zip(speeds, along[i] * tangential[0], strict=True))))
+            continue
         force = normal * contact.plane.normal + jnp.stack(tangential) @ contact.plane.tangents
         torque = jnp.cross(contact.point - motion[contact.body].position, force)
         loads.append(Load(forces={contact.body: force}, torques={contact.body: torque}))

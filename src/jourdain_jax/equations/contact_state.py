@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.contact_laws import Modes, responses
-from jourdain_jax.equations.contact_rows import switching_contacts
+from jourdain_jax.equations.contact_rows import switching_rows
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import (
     ContactResponse,
@@ -41,11 +41,11 @@ class At:
             [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
         )
         self.friction = friction_of(scene, motion)
-        contacts = switching_contacts(scene, motion.pose()).values()
-        self.static = jnp.stack([contact.friction.static for contact in contacts if contact.friction])
-        self.restitution = jnp.stack([jnp.asarray(contact.restitution) for contact in contacts])
-        self.impacts = [contact.impact for contact in contacts]
-        leans = [contact.lean() for contact in contacts]
+        rows = switching_rows(scene, motion).values()
+        self.static = jnp.stack([row.friction.static for row in rows])
+        self.restitution = jnp.stack([row.restitution for row in rows])
+        self.impacts = [row.impact for row in rows]
+        leans = [row.lean() for row in rows]
         self.above_flat = [None if x is None else x - FLAT_BELOW for x in leans]
         self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
 from jourdain_jax.equations.contact_laws import SLOW, moves, solved, unit
-from jourdain_jax.equations.contact_rows import switching_contacts
+from jourdain_jax.equations.contact_rows import gaps_of
 from jourdain_jax.equations.contact_state import FLAT_BELOW, At, switched
 from jourdain_jax.equations.impacts import LEAST_REBOUND, After, Changes
 from jourdain_jax.equations.kinematics import motion_at
@@ -117,7 +117,7 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 
     def gaps(q):
         pose = motion_at(scene, motion.t, q, motion.u.array, motion.inputs.array).pose()
-        return closed * jnp.stack([contact.gap() for contact in switching_contacts(scene, pose).values()])
+        return closed * gaps_of(scene, pose)
 
     D = jax.jacfwd(gaps)(q)
     moved = solved(list(D @ D.T + jnp.diag(1 - closed)), list(gaps(q)[:, None]))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
-from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_contacts
+from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_rows
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
     Inertias,
@@ -208,7 +208,9 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
         moved = moved[:, : len(moved[0]) - kept]
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
-    return ContactResponse(rows, impulses, rows.A @ impulses, rows.A @ free + rows.drift)
+    # rows that hold up to a force have the normal force one, the solution of L_n - 1 = 0
+    one = jnp.array([[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()], free.dtype).ravel()
+    return ContactResponse(rows, impulses, rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one)
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
@@ -244,7 +246,7 @@ def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coo
 
 def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
     """Coefficients of friction of the contacts that switch, while they slip."""
-    return jnp.stack([contact.friction.sliding for contact in switching_contacts(scene, motion.pose()).values() if contact.friction])
+    return jnp.stack([row.friction.sliding for row in switching_rows(scene, motion).values()])
 
 
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:
@@ -259,7 +261,8 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
     own = loads_of(scene, motion)
     if not scene.switching.contacts:
         return own
-    return (*own, *contact_loads(scene, motion, switching_forces(scene, motion, contact_response(scene, motion) if found is None else found)))
+    found = contact_response(scene, motion) if found is None else found
+    return (*own, *contact_loads(scene, motion, found.rows.A, switching_forces(scene, motion, found)))
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:

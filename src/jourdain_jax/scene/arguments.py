@@ -64,12 +64,15 @@ def as_scene(scene) -> Scene:
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """Return the scene; ValueError if a contact may slip or fly, which the function `what` does not support.
+    """Return the scene; ValueError if a contact or row may slip, which the function `what` does not support.
     """
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
-        raise ValueError(f"`{what}` needs rolling contacts, but {named} of `{type(scene).__name__}` may slip and lift off; omit `friction=` there")
+        raise ValueError(
+            f"`{what}` needs contacts that roll and rows that hold, but {named} of `{type(scene).__name__}` may slip; "
+            "omit the friction there"
+        )
     return scene
 
 

@@ -5,11 +5,14 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 `velocity_constraints` of a scene.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, checked_positive, checked_real, described
 from jourdain_jax.calculus.rotations import vee
+from jourdain_jax.scene.held_rows import HeldRow
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
 
 
@@ -17,15 +20,21 @@ def _point(position: Vector, what: str) -> Vector3:
     return checked_real(position, what, (3,), advice="give three components in the inertial frame, m")
 
 
-def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Scalar:
+def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector, *, holds: Any = None) -> Scalar | HeldRow:
     """Return the velocity constraint of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body`
     at `contact` does not move along `lateral`.
 
     - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7). The body's own axis y is
       `body.orientation[:, 1]`, a column.
+    - `holds`: the largest sideways force F in N, a number or a function of the motion, or `jj.Coulomb(sliding,
+      static)` with two forces: beyond it the blade slips against F, and holds again where it comes to rest
+      (`motion.phase`). None: it holds any force.
     """
-    contact = _point(contact, f"contact of the knife edge of `{body.name}`")
-    return body.velocity_at(contact) @ checked_real(lateral, f"lateral direction of the knife edge of `{body.name}`", (3,), advice="give a unit vector")
+    what = f"the knife edge of `{body.name}`"
+    contact = _point(contact, f"contact of {what}")
+    lateral = checked_real(lateral, f"lateral direction of {what}", (3,), advice="give a unit vector")
+    w = body.velocity_at(contact) @ lateral
+    return w if holds is None else HeldRow(w, holds, what)
 
 
 def rod(a: Vector, b: Vector, length: Number) -> Scalar:

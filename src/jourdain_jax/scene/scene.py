@@ -19,6 +19,7 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
+from jourdain_jax.scene.held_rows import HeldRow
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.modes import Event, Modes
 from jourdain_jax.scene.motion_state import Motion, Pose
@@ -140,7 +141,7 @@ class Scene(eqx.Module):
         """
         return {}
 
-    def velocity_constraints(self, motion: Motion) -> Mapping[str, Array]:
+    def velocity_constraints(self, motion: Motion) -> Mapping[str, Array | HeldRow]:
         """Return velocity constraints phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector:
         linear, affine or nonlinear in u; (6)-(9).
         """

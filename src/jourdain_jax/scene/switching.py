@@ -1,7 +1,8 @@
 """Contacts with friction as declarations of a scene: a mode, three events and a direction of slip each.
 
 Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It
-then has, besides that which its class states,
+then has, besides that which its class states (rows that hold up to a force count as contacts, which hold
+where others roll),
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
@@ -21,13 +22,15 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.held_rows import held_rows
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.motion_state import BodyPose, Pose
+from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
 GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4  # in place of a mode: why a motion cannot continue
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
+MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # it never flies
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
 
 
@@ -63,8 +66,17 @@ class Declared:
 
 
 def has_friction(kind: type) -> bool:
-    """Return whether the methods `contacts` of a class speak of friction."""
-    return any("friction" in _words(function.__code__) for owner in kind.__mro__ for function in functions_in(vars(owner).get("contacts")))
+    """Return whether methods of a class speak of friction."""
+    return any(
+        word in _words(function.__code__)
+        for method, word in (
+            ("contacts", "friction"),
+            ("velocity_constraints", "holds"),
+            ("loads", "joint_friction"),
+        )
+        for owner in kind.__mro__
+        for function in functions_in(vars(owner).get(method))
+    )
 
 
 def _words(code: CodeType) -> set[str]:
@@ -83,13 +95,21 @@ def switching_of(scene) -> Switching:
 @lru_cache(maxsize=256)
 def _switching(structure, shapes: tuple[tuple[int, ...], ...]) -> Switching:
     """`structure`, `shapes`: of the scene."""
-    names: list[str] = []
+    names: dict[str, tuple[str, ...]] = {}
 
     def look(leaves) -> None:
         scene = jax.tree.unflatten(structure, leaves)
-        t, q = jnp.zeros(()), scene.coordinates.names.view(jnp.zeros(len(scene.coordinates.names)))
-        pose = Pose(t, q, {name: BodyPose(name, body) for name, body in scene.bodies(t, q).items()})
-        names.extend(name for name, contact in scene.contacts(pose).items() if contact.friction is not None)
+        t, q, u, inputs = jnp.zeros(()), *(
+            of.view(jnp.zeros(len(of))) for of in (scene.coordinates.names, scene.speed_names, scene.inputs)
+        )
+        at_rest = jnp.zeros(3)
+        bodies = {
+            name: BodyMotion(name, body, at_rest, at_rest) for name, body in scene.bodies(t, q).items()
+        }
+        motion = Motion(t, q, u, q, inputs, bodies)
+        contacts = scene.contacts(motion.pose())
+        names.update({name: MODES_OF_CONTACT for name, c in contacts.items() if c.friction is not None})
+        names.update(dict.fromkeys(held_rows(scene.velocity_constraints(motion), scene.loads(motion)), MODES_OF_ROW))
 
     leaves = [jax.ShapeDtypeStruct(shape, real_type()) for shape in shapes]
     jax.eval_shape(look, leaves)
@@ -102,5 +122,5 @@ def _switching(structure, shapes: tuple[tuple[int, ...], ...]) -> Switching:
         tuple(names),
         replace(own, names=Names((*own.names.entries, *directions), own.names.groups)),
         Names((*scene.inputs.entries, *names), scene.inputs.groups),
-        Modes((*scene.modes.pairs, *((name, MODES_OF_CONTACT) for name in names))),
+        Modes((*scene.modes.pairs, *names.items())),
     )

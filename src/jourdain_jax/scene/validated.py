@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Scalar, checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.held_rows import HeldRow, JointFriction, held_rows
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
@@ -60,6 +61,9 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
     where = f"load {i} of `{_name(scene)}`"
     if not isinstance(load, Load):
         raise ValueError(f"{where} is {described(load)}, expected a load, such as jj.point_force(...) or jj.Load(forces=...)")
+    if isinstance(load, JointFriction):
+        _declared(scene, load.rows, "loads", "joint_friction")
+        return load
     checked = Load(
         forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
         torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
@@ -93,8 +97,25 @@ def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of the scene's own velocity rows."""
-    return _numbers(scene, "velocity_constraints", motion, '{"edge": value}', "row", _VANISH, None)
+    """Return values of the scene's own velocity rows, without those that hold up to a force."""
+    given = _dictionary(scene, "velocity_constraints", (motion,), '{"edge": value}')
+    always = {name: value for name, value in given.items() if not isinstance(value, HeldRow)}
+    _declared(scene, given.keys() - always, "velocity_constraints", "holds=")
+    return _checked(scene, always, "row", _VANISH, None)
+
+
+def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> None:
+    for name in names:
+        if name not in scene.switching.contacts:
+            raise ValueError(
+                f"`{name}` of `{_name(scene)}` got its friction outside the method `{method}`; state `{word}` in that method"
+            )
+
+
+def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
+    """Return the velocity rows that hold up to a force, by name."""
+    given = scene.velocity_constraints(motion)
+    return held_rows(given, loads_of(scene, motion))
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
@@ -163,7 +184,10 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
 
 def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: tuple[int, ...] | None = ()) -> dict[str, Array]:
     """Return a method's result at a time, pose or motion: numbers by name, or arrays of another `shape`."""
-    given = _dictionary(scene, method, (at,), example)
+    return _checked(scene, _dictionary(scene, method, (at,), example), what, advice, shape)
+
+
+def _checked(scene: Scene, given: dict, what: str, advice: str, shape: tuple[int, ...] | None) -> dict[str, Array]:
     return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
 
 

@@ -48,8 +48,8 @@ MESSAGES = {
     LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where its contact is no point; give it "
     "contacts that can bear it there, or stop the motion before, by an event",
     STICKS: "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a speed does at rest: "
-    "no motion follows; give the contact `friction=`, which holds at rest, or let the load change within a short range, as "
-    "by `jnp.tanh`",
+    "no motion follows; give the contact `friction=` or the joint `jj.joint_friction`, which hold at rest, or let the load "
+    "change within a short range, as by `jnp.tanh`",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; use a shorter step, or look for a singularity there",
 }
 

@@ -1,0 +1,285 @@
+"""Rows that hold up to a force: friction in joints, and blades that slip sideways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+DERIVATIVES = pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+
+
+class Oscillator(jj.Scene):
+    """A mass on a spring that rubs: |x| falls by 2 F/k in each half swing of pi sqrt(m/k)."""
+
+    mass: float = jj.parameter(1.3)
+    stiffness: float = jj.parameter(20.0)
+    friction: float = jj.parameter(0.9)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(self.mass, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+    def loads(self, motion):
+        spring = jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x)
+        return spring, jj.joint_friction(motion, x_rate=self.friction)
+
+
+def rest(x, friction, stiffness=20.0):
+    """Where it stays, after how many half swings."""
+    swings = 0
+    while stiffness * abs(x) > friction:
+        x = np.sign(-x) * (abs(x) - 2 * friction / stiffness)
+        swings += 1
+    return x, swings
+
+
+def end(x, friction, backend="auto"):
+    model = jj.build(Oscillator(friction=friction), backend=backend)
+    return jj.simulate(model, {"x": x}, ts=[8.0], **TIGHT)["x"][0]
+
+
+@DERIVATIVES
+def test_an_oscillator_that_rubs_stops_where_the_spring_no_longer_moves_it(derivative):
+    x, swings = rest(0.5, 0.9)
+    assert swings == 6
+    assert end(0.5, 0.9) == pytest.approx(x, abs=1e-11)
+    slopes = derivative(lambda p: end(p[0], p[1]))(jnp.array([0.5, 0.9]))
+    np.testing.assert_allclose(slopes, [(-1.0) ** swings, -((-1.0) ** swings) * 2 * swings / 20.0], atol=1e-9)
+
+
+def test_a_batch_of_oscillators_stops_after_different_numbers_of_swings():
+    forces = np.linspace(0.4, 6.0, 12)
+    motions = jj.rollout(Oscillator(), {"x": np.full(12, 0.5)}, parameters={"friction": forces}, ts=[12.0], **TIGHT)
+    assert len({rest(0.5, force)[1] for force in forces}) > 5
+    np.testing.assert_allclose(motions["x"][:, 0], [rest(0.5, force)[0] for force in forces], atol=1e-10)
+
+
+def test_arrays_of_jax_have_the_same_motion():
+    assert end(0.5, 0.9, "xla") == pytest.approx(rest(0.5, 0.9)[0], abs=1e-11)
+
+
+class Pushed(jj.Scene):
+    """A cart under a force that grows, 2 N/s, held by more force than it then slips against."""
+
+    static: float = jj.parameter(1.1)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(0.7, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+    def loads(self, motion):
+        law = jj.Coulomb(0.5, static=self.static)
+        return jj.generalized_force(motion, x_rate=2.0 * motion.t), jj.joint_friction(motion, x_rate=law)
+
+
+@DERIVATIVES
+def test_a_joint_at_rest_may_hold_with_more_than_it_slips_with(derivative):
+    def x(static):
+        return jj.simulate(Pushed(static=static), {}, t0=0.0, ts=[0.5, 1.5], **TIGHT)["x"]
+
+    def closed(static):  # from t = static/2 on 0.7 a = 2 t - 0.5
+        t = 1.5 - static / 2
+        return ((static - 0.5) * t**2 / 2 + t**3 / 3) / 0.7
+
+    np.testing.assert_allclose(x(1.1), [0.0, closed(1.1)], atol=1e-12)
+    np.testing.assert_allclose(derivative(x)(1.1), [0.0, jax.grad(closed)(1.1)], atol=1e-10)
+
+
+class Sled(jj.Scene):
+    """A sled whose blade, along its axis under the mass centre, holds up to a force sideways."""
+
+    holds: float = jj.parameter(3.0)
+    coordinates = jj.coordinates("x y yaw")
+
+    def bodies(self, t, q):
+        where = jnp.stack([q.x, q.y, 0 * q.x])
+        return {"sled": jj.RigidBody(1.5, jnp.diag(jnp.array([0.1, 0.1, 0.2])), where, jj.rot_z(q.yaw))}
+
+    def velocity_constraints(self, motion):
+        sled = motion["sled"]
+        return {"blade": jj.knife_edge(sled, sled.position, sled.orientation[:, 1], holds=self.holds)}
+
+
+def closed_sled(holds, t):
+    """Place at t of a sled that turns at 2 rad/s and begins at 1.5 m/s: it slips until yaw is pi, then holds."""
+    r = holds / 1.5 / 2.0  # F/(m w)
+    slid = jnp.pi / 2
+    place = jnp.stack([(1.5 - r) * slid, r])
+    ahead, turned = 2 * r - 1.5, 2 * t
+    return place + ahead / 2 * jnp.stack([jnp.sin(turned), -1 - jnp.cos(turned)])
+
+
+@DERIVATIVES
+def test_a_blade_slips_where_a_turn_needs_more_than_it_holds(derivative):
+    def place(holds):
+        start = {"x_rate": 1.5, "yaw_rate": 2.0}
+        motion = jj.simulate(Sled(holds=holds), start, t0=0.0, ts=[2.5], **TIGHT)
+        return jnp.stack([motion["x"][0], motion["y"][0]])
+
+    np.testing.assert_allclose(place(3.0), closed_sled(3.0, 2.5), atol=1e-10)
+    np.testing.assert_allclose(derivative(place)(3.0), jax.jacfwd(closed_sled)(3.0, 2.5), atol=1e-8)
+    motion = jj.simulate(Sled(), {"x_rate": 1.5, "yaw_rate": 2.0}, t0=0.0, ts=[1.0, 2.5])
+    assert motion.phase("blade").tolist() == [2, 1]
+    assert "blade: holds" in str(motion.phases)
+
+
+class Braked(jj.Scene):
+    """A wheel on a floor with a brake that holds up to a torque."""
+
+    brake: float = jj.parameter(9.0)
+    coordinates = jj.coordinates("x z spin")
+
+    def bodies(self, t, q):
+        where = jnp.stack([q.x, 0 * q.x, q.z])
+        return {"wheel": jj.RigidBody.thin_disc(4.0, 0.3, position=where, orientation=jj.rot_y(q.spin), axis="y")}
+
+    def loads(self, motion):
+        return jj.gravity(motion, 9.81), jj.joint_friction(motion, spin_rate=self.brake)
+
+    def contacts(self, pose):
+        return {"tread": jj.disc_contact(pose["wheel"], 0.3, axis="y", height="row", friction=0.5)}
+
+
+@pytest.mark.parametrize(("brake", "locks"), [(9.0, True), (1.0, False)])
+def test_a_braked_wheel_locks_and_skids_or_rolls_to_rest(brake, locks):
+    start = {"z": 0.3, "x_rate": 3.0, "spin_rate": 10.0}
+    motion = jj.simulate(Braked(brake=brake), start, t0=0.0, ts=[0.05, 0.6, 6.0], **TIGHT)
+    slowing = 0.5 * 9.81 if locks else brake / 0.3 / (1.5 * 4.0)  # mu g, or torque/r over 3 m/2
+    np.testing.assert_allclose(motion["x"][2], 3.0**2 / (2 * slowing), rtol=1e-9)
+    assert motion.phase("tread").tolist() == ([2, 2, 1] if locks else [1, 1, 1])
+    assert motion.phase("spin_rate").tolist() == ([2, 1, 1] if locks else [2, 2, 1])
+
+
+class Chain(jj.Scene):
+    """Two rods that hang from one another, with friction in both joints."""
+
+    coordinates = jj.coordinates("first second")
+
+    def bodies(self, t, q):
+        turn, place, found = jnp.zeros(()), jnp.zeros(3), {}
+        for name, angle in (("upper", q.first), ("lower", q.second)):
+            turn = turn + angle
+            along = jnp.stack([jnp.sin(turn), 0 * turn, -jnp.cos(turn)])
+            inertia = jnp.diag(jnp.array([0.02, 0.02, 0.001]))
+            found[name] = jj.RigidBody(0.8, inertia, place + 0.25 * along, jj.rot_y(-turn))
+            place = place + 0.5 * along
+        return found
+
+    def loads(self, motion):
+        return jj.gravity(motion, 9.81), jj.joint_friction(motion, first_rate=0.3, second_rate=0.15)
+
+
+def test_two_joints_stop_and_start_as_by_an_independent_integration():
+    """Each interval without a change of modes by SciPy; the modes from the equations of each."""
+    from scipy.integrate import solve_ivp
+    from scipy.optimize import brentq
+
+    m, l, c, I, g = 0.8, 0.5, 0.25, 0.02, 9.81
+    F = np.array([0.3, 0.15])
+
+    def matrices(q, u):
+        M11 = 2 * I + m * c * c + m * (l * l + c * c + 2 * l * c * np.cos(q[1]))
+        M12 = I + m * (c * c + l * c * np.cos(q[1]))
+        M = np.array([[M11, M12], [M12, I + m * c * c]])
+        s = m * l * c * np.sin(q[1])
+        h = np.array([-s * (2 * u[0] * u[1] + u[1] ** 2), s * u[0] ** 2])
+        lower = m * g * c * np.sin(q[0] + q[1])
+        return M, -h - np.array([m * g * (c + l) * np.sin(q[0]) + lower, lower])
+
+    def forces(q, u, modes):
+        """Modes: 0 holds, +1 and -1 slip."""
+        M, f = matrices(q, u)
+        f = f - F * modes
+        held = modes == 0
+        G = np.linalg.inv(M)
+        L = np.zeros(2)
+        if held.any():
+            L[held] = np.linalg.solve(G[np.ix_(held, held)], -(G @ f)[held])
+        return L - F * modes, G @ (f + L)
+
+    def next_modes(q, u, begins):
+        tried = [np.array(modes) - 1.0 for modes in np.ndindex(3, 3)]
+        found = [modes for modes in tried if fits(q, u, modes) and (begins is None or modes[begins] != 0)]
+        assert len(found) == 1
+        return found[0]
+
+    def fits(q, u, modes):
+        L, a = forces(q, u, modes)
+        moving = np.abs(u) > 1e-12
+        if np.any(moving & (modes != np.sign(u))):
+            return False
+        held = modes == 0
+        return bool(np.all(np.abs(L[held]) <= F[held] + 1e-13) and np.all((a * modes)[~held & ~moving] > -1e-9))
+
+    start, t, end = np.array([1.2, -0.9, 0.0, 0.0]), 0.0, 3.0
+    y, changes, begins = start, 0, None
+    while t < end:
+        modes = next_modes(y[:2], y[2:], begins)
+
+        def rates(t, y, modes=modes):
+            return np.concatenate([y[2:], forces(y[:2], y[2:], modes)[1]])
+
+        found = solve_ivp(rates, (t, end), y, "DOP853", rtol=3e-14, atol=1e-14, dense_output=True, max_step=0.01)
+
+        def values(s, modes=modes, found=found):
+            z = found.sol(s)
+            L, _ = forces(z[:2], z[2:], modes)
+            return np.where(modes == 0, F - np.abs(L), modes * z[2:])
+
+        times = np.linspace(t, end, 30001)[1:]
+        low = np.array([values(s) for s in times]) < 0
+        if not low.any():
+            y, t = found.y[:, -1], end
+            break
+        k = int(np.argmax(low.any(axis=1)))
+        j = int(np.argmax(low[k]))
+        t = brentq(lambda s, j=j: values(s)[j], times[k - 1] if k else t + 1e-9, times[k], xtol=1e-15)
+        y = found.sol(t)
+        y[2:] = np.where(modes == 0, 0.0, y[2:])
+        begins = j if modes[j] == 0 else None
+        if modes[j] != 0:
+            y[2 + j] = 0.0
+        changes += 1
+    motion = jj.simulate(Chain(), {"first": 1.2, "second": -0.9}, ts=[3.0], **TIGHT)
+    assert changes >= 4
+    np.testing.assert_allclose([motion["first"][0], motion["second"][0]], y[:2], atol=1e-8)
+
+
+def test_a_contact_may_have_the_name_of_a_coordinate():
+    """Modes and coordinates are named apart: of one name, the coordinate became the number of the mode."""
+
+    class Named(Braked):
+        def contacts(self, pose):
+            return {"x": super().contacts(pose)["tread"]}
+
+    start = {"z": 0.3, "x_rate": 3.0, "spin_rate": 0.0}
+    places = [jj.simulate(kind(brake=0.0), start, ts=[1.0])["x"][0] for kind in (Braked, Named)]
+    assert places[0] == places[1]
+
+
+def test_what_cannot_hold_is_refused():
+    class Unknown(Oscillator):
+        def loads(self, motion):
+            return (jj.joint_friction(motion, y_rate=1.0),)
+
+    with pytest.raises(ValueError, match="friction on unknown speed `y_rate`"):
+        Unknown()
+    with pytest.raises(ValueError, match=r"the friction of `x_rate` of `Oscillator` is -0\.9"):
+        jj.simulate(Oscillator(friction=-0.9), {"x": 0.5}, t1=1.0)
+    lanes = jj.rollout(Oscillator(), {"x": np.full(2, 0.5)}, parameters={"friction": np.array([0.9, -0.9])}, t1=1.0)
+    assert lanes.lanes.succeeded.tolist() == [True, False]
+
+    def elsewhere(motion):
+        return (jj.joint_friction(motion, x_rate=1.0),)
+
+    class Outside(jj.Scene):
+        coordinates, bodies = Sled.coordinates, Sled.bodies
+
+        def loads(self, motion):
+            return elsewhere(motion)
+
+    with pytest.raises(ValueError, match="outside the method"):
+        jj.simulate(Outside(), {}, t1=1.0)
