@@ -6,14 +6,16 @@ Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `
 sampled at `ts`), `phases.NAME` for every array of `motion.phases` (absent where there is one phase, without modes), and `parameter:NAME` for every field that
 is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays` (names of all arrays), `versions`.
+`state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays` (names of all arrays), `versions`,
+`digest` (SHA-256 of the rest of the header and of all arrays; files of earlier versions have none).
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
 says how lanes with a `fallback` were run.
 
-What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
-A file is believed in nothing: it may be of another version of a scene's class, written by another program, or damaged in a way that its format does not show.
+A file is an error where its content has another digest, because it is damaged or was changed since, and where the scene's class has changed since: its
+parameters, their units, or its names.
 """
 
+import hashlib
 import io
 import json
 import math
@@ -21,41 +23,30 @@ import os
 import zipfile
 from dataclasses import fields
 from operator import attrgetter
-from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import described, largest
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.retries import RERUN_FIELDS
 from jourdain_jax.motion.trajectories.over_times import Phases, Record, one_phase
-from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameters import parameter_faults, parameters_of
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-# arrays and their axes, after that of the lanes of a rollout, as a trajectory states them; `work` is absent where it is not tracked
-_STATED: dict[str, Any] = {field.name: (get_args(field.type) or (field.type,))[0] for field in fields(Record)}
+_ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))  # without `work`, which may be absent
 _PHASES = tuple(f"phases.{field.name}" for field in fields(Phases) if hasattr(field.type, "dim_str"))
-_STATED |= {f"phases.{field.name}": field.type for field in fields(Phases)}
-AXES = {name: tuple(kind.dim_str.split()) for name, kind in _STATED.items() if hasattr(kind, "dim_str")} | {"inputs": ("times", "input_names")}
-# entries of the header: their type, in words too
-HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "unwatched", "kind"), (str, "a text"))
-_LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
-HEADER |= dict.fromkeys(_LISTS, (list, "a list of names"))
-HEADER |= {"static": (dict, "a dictionary"), "units": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
-_ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work", *_PHASES))
+_HEADER = ("scene", "static", "units", "coordinates", "speeds", "input_names", "event_names", "reruns", *RERUN_FIELDS)
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
@@ -104,9 +95,18 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
+    header["digest"] = _digest(header, arrays)
     content = io.BytesIO()
     np.savez_compressed(content, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
     write_whole(os.path.realpath(path), content.getbuffer(), wait=True)
+
+
+def _digest(header: dict, arrays: dict) -> str:
+    """Return the digest of all arrays and of the header but for the digest in it."""
+    found = hashlib.sha256(json.dumps(header | {"digest": ""}, sort_keys=True).encode())
+    for name, x in sorted(arrays.items()):
+        found.update(f"{name} {x.dtype.str} {x.shape} ".encode() + x.tobytes())
+    return found.hexdigest()
 
 
 def _sampled(inputs: Inputs, ts):
@@ -148,7 +148,7 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     except _NEEDS_NUMBERS:  # a class that looks at them when a scene is made
         each = [_trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()}) for i in range(len(arrays["result"]))]
         lanes = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    check_scenes(path, lanes.scene, lanes.result)
+    _check_scene(path, jax.tree.map(lambda x: x[0], lanes.scene))
     return lanes
 
 
@@ -159,7 +159,7 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     except _NEEDS_NUMBERS:
         raise
     except TypeError as error:
-        raise refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+        raise _refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
     parameters, static = _stored_fields(scene)
     if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would replace what moved
         raise ValueError(
@@ -215,11 +215,6 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
         raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass its class")
     known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
     check_names((*parameters, *header["static"]), known, f"`{path}` has a parameter `{{}}` that `{kind.__name__}` has not")
-    for name, value in parameters.items():
-        if value.dtype.kind not in "fiub":
-            raise refused(path, f"has `{name}` of type {value.dtype}, expected numbers")
-        if header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
-            raise refused(path, f"has `{name}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
     return kind
 
 
@@ -237,21 +232,17 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
     check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
     if not isinstance(header, dict):
-        raise refused(path, "has a header that is no dictionary")
-    if header.get("format") != 1 or isinstance(header["format"], bool):
+        raise _refused(path, "has a header that is no dictionary")
+    if header.get("format") != 1:
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.get("kind")
     if found != kind:
         raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
-    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
-    missing += [name for name in _PHASES if name not in arrays and any(one in arrays for one in _PHASES)]
-    missing += [name for name in HEADER if name not in header]
-    if not missing:
-        check_header(path, header)
-        missing = [name for name in header["arrays"] if name in AXES and name not in arrays]
+    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays] + [name for name in _HEADER if name not in header]
     if missing:
-        raise refused(path, f"lacks `{missing[0]}`")
-    check_arrays(path, header, arrays)
+        raise _refused(path, f"lacks `{missing[0]}`")
+    if header.get("digest", own := _digest(header, arrays)) != own:
+        raise _refused(path, "has another digest than it states")
     return header, arrays, _checked_class(path, scene, header, arrays)
 
 
@@ -263,8 +254,6 @@ def _unpacked(file) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
-            if name not in (*AXES, "header") and not name.startswith("parameter:"):
-                continue
             # bytes that a compressed one stands for, at most: deflate's longest match
             if name in found or member.file_size > 1100 * member.compress_size + 1000:
                 raise ValueError(f"`{name}` occurs twice" if name in found else f"`{name}` claims {member.file_size} bytes")
@@ -292,103 +281,20 @@ def _stored_fields(scene: Scene) -> tuple[dict, dict]:
     return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}
 
 
-def refused(path, sentence: str) -> ValueError:
-    """Return the error for an inconsistent file."""
+def _refused(path, sentence: str) -> ValueError:
+    """Return the error for a file that is not as `save` wrote it."""
     return ValueError(f"`{path}` {sentence}; it is damaged or was not written by `save`")
 
 
-def check_header(path, header: dict) -> None:
-    """ValueError for an entry of the header that is of another kind than `save` writes."""
-    for name, (kind, text) in HEADER.items():
-        if not isinstance(header[name], kind) or (name in _LISTS and not all(isinstance(x, str) for x in header[name])):
-            raise refused(path, f"has {described(header[name])} as `{name}` of its header, expected {text}")
-    if header["state_form"] not in ("minimal", "full"):
-        raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
-    for way in header["reruns"]:
-        if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == len(RERUN_FIELDS)):
-            raise refused(path, f"has {way!r} among the `reruns` of its header, expected a code of a fallback and how such lanes were run")
-
-
-def check_arrays(path, header: dict, arrays: dict) -> None:
-    """ValueError for an array of another shape or type than the others ask for, or with numbers that no motion has."""
-    lead = arrays["result"].shape[:1] if header["kind"] == "rollout" else ()
-    times = arrays["ts"].shape[-1] if arrays["ts"].ndim else 0
-    sizes = dict(zip(("modes", "phases"), arrays["phases.modes"].shape[-2:], strict=False)) if "phases.modes" in arrays else {}
-    sizes |= {"times": times, "transitions": sizes.get("phases", 1) - 1} | {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
-    for name in ("q", "u", "inputs"):
-        found, what = arrays[name].shape[-1:], AXES[name][1]
-        if found not in ((), (sizes[what],)):
-            raise refused(path, f"has {found[0]} columns for {sizes[what]} {what.replace('_', ' ')}")
-    for name, axes in AXES.items():
-        if name not in arrays:
-            continue
-        array, expected = arrays[name], (*lead, *(sizes[axis] for axis in axes))
-        if array.shape != expected or not times or 0 in lead:
-            raise refused(path, f"has `{name}` of shape {array.shape}, expected {expected if times else 'at least one time'}")
-        kinds, text = ("iu", "whole numbers") if getattr(_STATED[name], "dtype", None) is Int else ("f", "floating-point numbers")
-        if array.dtype.kind not in kinds:
-            raise refused(path, f"has `{name}` of type {array.dtype}, expected {text}")
-    _check_codes(path, header, arrays)
-    _check_finite(path, arrays)
-
-
-def _check_codes(path, header: dict, arrays: dict) -> None:
-    events = np.where(arrays["result"] == EVENT, np.arange(len(header["event_names"]) + 1).max() - 1, -1)
-    ranges = {"result": np.isin(arrays["result"], list(MESSAGES)), "fallback": np.isin(arrays["fallback"], list(FALLBACKS))}
-    ranges["event"] = (arrays["event"] <= events) & (arrays["event"] >= np.where(arrays["result"] == EVENT, 0, -1))
-    ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")} | {"crossings": arrays["crossings"] >= -1}
-    if "phases.events" in arrays:
-        ranges["phases.events"] = (arrays["phases.events"] >= -1) & (arrays["phases.events"] < len(header["event_names"]))
-    for name, right in ranges.items():
-        if not np.all(right):
-            raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, impossible for a motion")
-
-
-def _check_finite(path, arrays: dict) -> None:
-    """Motions that reached their end, or an event, are finite as far as they went; failed ones may hold anything."""
-    whole = np.asarray(arrays["result"] <= EVENT)
-    for name in ("t_end", "q_end", "u_end", "moved_q", "moved_u"):
-        good = np.isfinite(arrays[name])
-        if not np.all(good.reshape(*whole.shape, -1)[whole]):
-            raise refused(path, f"has numbers in `{name}` that are not finite, though the motion did not fail")
-    if np.any(np.isnan(arrays["ts"])):
-        raise refused(path, "has times in `ts` that are NaN")
-    reached = np.all(np.isfinite(arrays["q"]), axis=-1)
-    if np.any(whole & ~_go_one_way(arrays, reached)):
-        raise refused(path, "has times in `ts` that are not ordered towards the end of the motion")
-    due = np.isfinite(arrays["ts"]) & (np.asarray(arrays["result"]) == SUCCESS)[..., None]
-    for name in ("q", "u", "inputs", *(["work"] if "work" in arrays else [])):
-        values = arrays[name].reshape(*arrays["ts"].shape, -1)
-        finite = np.all(np.isfinite(values), axis=-1)
-        apart = (np.any(np.isfinite(values), axis=-1) if name in ("q", "u") else reached) & ~finite
-        if np.any((due | (apart & whole[..., None])) & ~finite):
-            raise refused(path, f"has numbers in `{name}` that are not finite at times that the motion reached")
-
-
-def _go_one_way(arrays: dict, reached: np.ndarray) -> np.ndarray:
-    """Return whether the saved times that each sample reached are monotonic, up to its end within round-off.
-    """
-    ts, end = np.asarray(arrays["ts"], float), np.asarray(arrays["t_end"], float)[..., None]
-    with np.errstate(invalid="ignore"):  # of motions that failed
-        steps = np.diff(np.concatenate([np.where(np.isfinite(ts) & reached, ts, end), end], axis=-1), axis=-1)
-    slack = 1e-6 * largest(steps, -1, keepdims=True)
-    return np.asarray(np.all(steps >= -slack, axis=-1) | np.all(steps <= slack, axis=-1))
-
-
-def check_scenes(path, scene: Scene, result) -> None:
-    """ValueError where parameters of lanes are wrong in a motion that did not end for it, or of shapes that do not make the scene."""
-    for name, fault in jax.vmap(parameter_faults)(scene).items():
-        wrong = np.flatnonzero(np.asarray(fault) & (np.asarray(result) != BAD_PARAMETER))
-        if wrong.size:
-            value = f"{np.asarray(getattr(scene, name))[wrong[0]]} as a value of the parameter `{name}`"
-            raise refused(path, f"has {value}, which is not finite or has the wrong sign, though the motion did not fail")
+def _check_scene(path, scene: Scene) -> None:
+    """ValueError where parameters have shapes that do not make the scene."""
 
     def quantities(scene):
         q, u, _ = scene.named()
         return velocity_quantities(scene, motion_at(scene, jnp.zeros(()), q, u), with_events=False)
 
     try:
-        jax.eval_shape(quantities, jax.tree.map(lambda x: x[0], scene))
+        jax.eval_shape(quantities, scene)
     except (ValueError, TypeError, IndexError) as error:
         said = str(error).splitlines()[0]
         raise ValueError(
