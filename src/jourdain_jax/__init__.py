@@ -79,7 +79,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
 
-if _typing.TYPE_CHECKING:  # what else there is, for static tools
+if _typing.TYPE_CHECKING:  # imported on first use
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
     from jourdain_jax.analysis.experiment import Experiment
@@ -127,59 +127,11 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.plotting.quantities import plot
     from jourdain_jax.plotting.show import View, show
 else:  # a static tool does not see it: to one, any other name is a mistake
-    _ON_FIRST_USE = {
-        "analysis.energy": "Energy EnergyBalance energy energy_balance",
-        "analysis.estimate": "Estimate bounds joint_normal positive unbounded",
-        "analysis.experiment": "Experiment",
-        "analysis.families.chart": "stability_chart",
-        "analysis.families.critical": "critical",
-        "analysis.families.family": "family",
-        "analysis.families.periodic": "periodic",
-        "analysis.filtering": "filtered_log_likelihood",
-        "analysis.fit": "fit fit_batch",
-        "analysis.fit_result": "Fit",
-        "analysis.layout": "possible_inertia",
-        "analysis.likelihood": "PlannedInformation log_likelihood planned_information",
-        "analysis.linearize": "Linearization linearize",
-        "analysis.log_density": "LogDensity log_density",
-        "analysis.problem": "huber student_t",
-        "analysis.quantities": "Accelerometer LoadCell",
-        "analysis.report": "Report report",
-        "analysis.sensors": "Actuator Sensor",
-        "analysis.shooting": "MultipleShooting",
-        "analysis.statements": "Verification derivative_exists",
-        "analysis.steady": "SteadyMotion steady",
-        "analysis.verify": "verify",
-        "ensembles.design": "Design",
-        "ensembles.distributions": "Levels LogNormal LogUniform Normal Uniform",
-        "ensembles.files": "InUseError",
-        "ensembles.mean_gradients": "MeanGradients",
-        "ensembles.outputs": "End EventTime Happened Integral Largest LargestMagnitude Quantity Smallest",
-        "ensembles.result": "StudyResult load_study merge_studies",
-        "ensembles.sensitivity": "SobolIndices sobol_indices",
-        "ensembles.study": "Study",
-        "equations.gibbs_appell": "GibbsAppell gibbs_equations gibbs_function",
-        "equations.lagrange": "lagrange_equations",
-        "importers.mjcf": "from_mjcf",
-        "importers.sympy_scene": "from_sympy",
-        "importers.urdf": "from_urdf",
-        "motion.batches.rollout": "Rollout rollout",
-        "motion.check": "Checked check",
-        "motion.diffrax_steps": "diffrax_term",
-        "motion.integrators.discrete_gradient": "DiscreteGradient",
-        "motion.integrators.discrete_lagrange_dalembert": "DiscreteLagrangeDAlembert",
-        "motion.integrators.implicit_midpoint": "ImplicitMidpoint",
-        "motion.integrators.radau": "RadauIIA",
-        "motion.trajectories.storage": "load_rollout load_trajectory save",
-        "plotting.pictures": "animate",
-        "plotting.quantities": "plot",
-        "plotting.show": "View show",
-    }
     _GONE = {
         "Built": "it is `Model`, which `build` returns",
         "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time",
     }
-    __getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()}, _GONE)
+    __getattr__, __dir__ = _names_on_first_use(globals(), _GONE)
 
 _pictures = _module_on_first_use("jourdain_jax.plotting.pictures")
 _show_scenes_with(lambda scene: _pictures.scene_picture(scene))

@@ -1,18 +1,20 @@
 """Modules imported on first use, so that a first motion does not pay for what it does not need.
 
-There are two ways, both known to users of Python, and both for names that static tools are told of by a plain import under `if TYPE_CHECKING:`.
+There are two ways, both for names that are imported under `if TYPE_CHECKING:`, where static tools see them.
 
     diffrax = module_on_first_use("diffrax")                      in a module: stands for another one; its attributes are those of that
-    __getattr__, __dir__ = names_on_first_use(globals(), {...})   in a package: names of its own that are defined in modules below it (PEP 562)
+    __getattr__, __dir__ = names_on_first_use(globals())          in a package: names that it imports under `if TYPE_CHECKING:` (PEP 562)
 
 A class that derives from one of such a module is defined in a module that is imported on first use too. `isinstance(x, diffrax.AbstractSolver)` imports
 diffrax, so `x` is compared with what needs no import first: with None, and with what is ours.
 """
 
+import ast
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from types import ModuleType
+from pathlib import Path
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 
@@ -45,19 +47,22 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
         raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from error
 
 
-def names_on_first_use(package: dict[str, Any], where: Mapping[str, str], gone: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package, given its globals, for names that are defined in modules below it: name -> module, such as "analysis.fit".
+def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = MappingProxyType({})) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package, given its globals, for names that its source imports under a condition.
 
     `gone`: names that there were once -> what serves now.
 
     A name is looked up once: from then on it is a global of the package as any other.
     """
+    conditions = [statement for statement in ast.parse(Path(package["__file__"]).read_text("utf-8")).body if isinstance(statement, ast.If)]
+    imports = [line for condition in conditions for line in condition.body if isinstance(line, ast.ImportFrom)]
+    where = {alias.name: str(line.module) for line in imports for alias in line.names}
 
     def __getattr__(name: str) -> Any:
         if name not in where:
             advice = f": {gone[name]}" if name in gone else ""
             raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}{advice}")
-        package[name] = getattr(import_module(f"{package['__name__']}.{where[name]}"), name)
+        package[name] = getattr(import_module(where[name]), name)
         return package[name]
 
     def __dir__() -> list[str]:

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from jourdain_jax.calculus.on_first_use import names_on_first_use
-from jourdain_jax.models.registry import CLASSES, MODELS, model
+from jourdain_jax.models.registry import MODELS, model
 
 if TYPE_CHECKING:
     from jourdain_jax.models.blades import ChaplyginSleigh, Skate, Snakeboard, TrailerChain
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jourdain_jax.models.two_wheel_axle import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
     from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 else:
-    __getattr__, __dir__ = names_on_first_use(globals(), CLASSES, {})
+    __getattr__, __dir__ = names_on_first_use(globals())
 
 __all__ = [
     "MODELS",
