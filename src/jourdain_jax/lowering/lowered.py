@@ -192,10 +192,11 @@ class Lowered:
 
     def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
         """Return the integrated speeds and the dependent ones. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
+        y = tuple(y)  # each entry is taken out of the vector once
         every = [*y, *self.values(self.z, fixed, t, q, y, inputs)]
         return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
-    def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
+    def energies_at(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
         """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
@@ -205,7 +206,7 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        real = jnp.result_type(*q)
+        real, y = jnp.result_type(*q), tuple(y)
 
         def step(nodes, q, y):
             return tuple(jnp.broadcast_to(jnp.asarray(x, real), jnp.shape(q[0])) for x in run(self.graph, nodes, self._known(fixed, t, q, y, inputs)))
@@ -213,8 +214,8 @@ class Lowered:
         # twice: what a step of integration leaves is small, and its square is round-off
         q = jax.lax.scan(lambda q, _: (step(self.projected_q, q, y), None), tuple(q), length=2)[0]
         if not self.projected_u:
-            return q, tuple(y)
-        return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), tuple(y), length=1 if affine else 2)[0]
+            return q, y
+        return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
 
     def watched(self, has_events: bool) -> tuple[int, ...]:
         """Return the numbers whose signs are monitored over every step, in the rates and, if it `has_events`,

@@ -25,7 +25,7 @@ from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.vector_fields.field import Formulation, Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import Formulation, Instant, Integrated, VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.scene import Scene
 
@@ -40,7 +40,7 @@ class _Rates(eqx.Module):
 
     def __call__(self, t, y, args) -> tuple:
         q, u = y
-        found = self.field.rates(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t))
+        found = self.field.rates(Instant(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t)))
         return found.q, found.v
 
 

@@ -39,7 +39,7 @@ from jourdain_jax.motion.setup import Begun, Passed, Plain, Setup, Solved, times
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.over_times import Phases
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated
+from jourdain_jax.motion.vector_fields.field import ByProgram, Instant, Integrated
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.parameters import parameter_faults
@@ -79,9 +79,9 @@ def _with_machine_code(setup: Setup) -> Setup:
     it, if possible.
     """
     field = setup.field
-    if setup.reason_against_machine_code or not isinstance(field, ByProgram) or values.beside(field.program) is None:
+    if setup.reason_against_machine_code or not isinstance(field, ByProgram):
         return setup
-    return setup._replace(field=replace(field, native=True))
+    return setup._replace(field=replace(field, native=values.beside(field.program)))
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
@@ -168,10 +168,10 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         # what was never reached holds anything: compute at the end state instead, then mark
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
-        t = origin + tau
-        u, pivot = field.speeds_and_pivot(scene, fixed, t, y, inputs(t))
-        work = None if y.work is None else y.work + field.stored(scene, t, y.q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (t, y), _step_errors(setup, free, y) if puts_back else None
+        _, at = integrands.at_time(tau, y, args)
+        u, pivot = field.speeds_and_pivot(at)
+        work = None if y.work is None else y.work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (at.t, y), _step_errors(setup, free, y) if puts_back else None
 
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
@@ -308,7 +308,7 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
     rtol, atol = setup.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
     every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
-    at = lambda state: field.energies(scene, fixed, state[0], state[1], inputs(state[0]))  # noqa: E731
+    at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))  # noqa: E731
     # loads by matrices may be callbacks, which need not know batches
     found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
     return found.reshape(2, -1, 2)

@@ -29,7 +29,7 @@ from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import VectorField, as_formulation
+from jourdain_jax.motion.vector_fields.field import Instant, VectorField, as_formulation
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 
@@ -156,7 +156,7 @@ def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state sta
 
     def rates(x):
         q, v = unravel(x)
-        found = field.rates(scene, fixed, t, replace(y, q=q, v=v), field.now(inputs, t))
+        found = field.rates(Instant(scene, fixed, t, replace(y, q=q, v=v), field.now(inputs, t)))
         return jnp.concatenate([found.q, found.v])
 
     return jax.jacfwd(rates)(x)

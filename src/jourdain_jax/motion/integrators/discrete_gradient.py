@@ -20,11 +20,10 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -104,7 +103,7 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
 @eqx.filter_jit
 def _rates(args, t, q, v):
     field, scene, inputs, fixed, _ = args
-    found = field.rates(scene, fixed, t, Integrated(q, v, None), field.now(inputs, t))
+    found = field.rates(Instant(scene, fixed, t, Integrated(q, v, None), field.now(inputs, t)))
     return found.q, found.v
 
 
@@ -112,8 +111,7 @@ def _rates(args, t, q, v):
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
     field, scene, inputs, fixed, _ = args
-    u = field.speeds(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
-    return sum(energies_at(scene, motion_at(scene, t, z[:n], u, inputs(t))))
+    return sum(energies_at(scene, field.motion(Instant(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t)))))
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:

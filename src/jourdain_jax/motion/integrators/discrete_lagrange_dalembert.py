@@ -31,7 +31,7 @@ from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorField
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import gauge_of, loads_of
@@ -226,4 +226,4 @@ def _work(args, over: Interval, y: Integrated, q1, u1):
         return None
     field, scene, inputs, fixed, _ = args
     t = (over.t0 + over.t1) / 2
-    return over.h * field.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t)).work
+    return over.h * field.rates(Instant(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t))).work

@@ -4,13 +4,15 @@ and for batches.
 `args`: the vector field, the scene, its inputs, what the rates need of the scene, and the time from which tau counts; of lanes, with their axis first.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.motion.inputs import seen_from_within
-from jourdain_jax.motion.vector_fields.field import Integrated
+from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorField, Watched
 
 
 def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
@@ -24,65 +26,68 @@ def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
     return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
 
 
+def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorField, Instant]:
+    """Return the vector field, and its arguments in a state; `of_rates`: for its rates. Of lanes, with their axis last."""
+    field, scene, inputs, fixed, origin = args
+    t = origin + tau
+    values = field.now if of_rates else lambda inputs, t: inputs(t)
+    inputs = eqx.filter_vmap(values, out_axes=-1)(inputs, t) if jnp.ndim(t) else values(inputs, t)
+    return field, Instant(scene, fixed, t, y, inputs)
+
+
+def _lane_by_lane(knows_lanes: Callable[[VectorField], bool]) -> Callable:
+    """Return a decorator for functions of (tau, y, args): lanes go through them one by one, unless the field knows lanes."""
+
+    def decorated(function: Callable) -> Callable:
+        @eqx.filter_jit
+        def of_lanes(tau, y, args):
+            if jnp.ndim(tau) and not knows_lanes(args[0]):
+                return eqx.filter_vmap(function, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
+            return function(tau, y, args)
+
+        return of_lanes
+
+    return decorated
+
+
 @eqx.filter_jit  # traced once, not once per stage and derivative
-def rates(tau, y, args):
-    field, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return field.rates(scene, fixed, t, y, _at(field.now, inputs, t))
+def rates(tau, y, args) -> Integrated:
+    field, at = at_time(tau, y, args, of_rates=True)
+    return field.rates(at)
 
 
 @eqx.filter_jit
-def rates_and_pivots(tau, y, args):
-    field, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return field.rates_and_pivots(scene, fixed, t, y, _at(field.now, inputs, t))
+def rates_and_pivots(tau, y, args) -> Watched:
+    field, at = at_time(tau, y, args, of_rates=True)
+    return field.rates_and_pivots(at)
 
 
 @eqx.filter_jit
-def project(tau, y, args):
-    field, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return field.project(scene, fixed, t, y, _at(_values, inputs, t))
+def project(tau, y, args) -> Integrated:
+    field, at = at_time(tau, y, args)
+    return field.project(at)
 
 
-@eqx.filter_jit
+@_lane_by_lane(lambda field: field.lowers_events)
 def events(tau, y, args) -> Float[Array, "events *lanes"]:
-    field, scene, inputs, fixed, origin = args
-    if jnp.ndim(tau) and not field.lowers_events:
-        return eqx.filter_vmap(events, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
-    t = origin + tau
-    return field.events(scene, fixed, t, y, _at(_values, inputs, t))
+    field, at = at_time(tau, y, args)
+    return field.events(at)
 
 
-@eqx.filter_jit
+@_lane_by_lane(lambda field: field.lowers_events)
 def resets(tau, y, args) -> Float[Array, "events rows *lanes"]:
-    field, scene, inputs, fixed, origin = args
-    if jnp.ndim(tau) and not field.lowers_events:
-        return eqx.filter_vmap(resets, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
-    t = origin + tau
-    return field.resets(scene, fixed, t, y, _at(_values, inputs, t))
+    field, at = at_time(tau, y, args)
+    return field.resets(at)
 
 
-@eqx.filter_jit
+@_lane_by_lane(lambda field: field.lowered is not None)
 def energy(tau, y, args) -> PerLane:
     """T + V, J; a number to differentiation."""
-    field, scene, inputs, fixed, origin = args
-    if jnp.ndim(tau) and field.lowered is None:
-        return eqx.filter_vmap(energy, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
-    t = origin + tau
-    return jnp.sum(field.energies(scene, fixed, t, y, _at(_values, inputs, t)), axis=0)
+    field, at = at_time(tau, y, args)
+    return jnp.sum(field.energies(at), axis=0)
 
 
 def within(middle, args):
     """`args` for the stages of a step with this middle."""
     field, scene, inputs, fixed, origin = args
     return field, scene, seen_from_within(inputs, origin + middle), fixed, origin
-
-
-def _values(inputs, t) -> Float[Array, "inputs"]:
-    return inputs(t)
-
-
-def _at(values, inputs, t):
-    """Return `values(inputs, t)`, for every sample of a batch."""
-    return eqx.filter_vmap(values, out_axes=-1)(inputs, t) if jnp.ndim(t) else values(inputs, t)

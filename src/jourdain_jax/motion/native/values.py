@@ -18,8 +18,8 @@ of 1,070.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -278,20 +278,32 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
     return by_xla, lambda x: placed(kernel(x), x)
 
 
-class Beside(NamedTuple):
-    """Machine code for quantities beside the steps of a program."""
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Machine code for quantities beside the steps of a program: functions of fixed values, time, coordinates, privileged speeds and inputs."""
 
+    program: Lowered
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
     fixed: Callable[[Array], Array]  # of those entries
-    at_states: "AtStates"
-    at_start: Callable[..., Array]  # `Lowered.at_start`, of the same
-
-
-class AtStates(NamedTuple):
-    """Functions of fixed values, time, coordinates, privileged speeds and inputs."""
-
     speeds: Callable[..., Array] | None  # all of them; None where XLA is quicker
     numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
+    at_start: Callable[..., Array]  # `Lowered.at_start`
+
+    def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
+        """As `Lowered.fixed_values`."""
+        parameters = entries(scene, self.needed)
+        if not self.program.fixed or not parameters:  # nothing to hand over, or nothing requested
+            return self.program.fixed_values(scene)
+        return entries_of(self.fixed(jnp.concatenate(parameters)))
+
+    def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """As `Lowered.speeds_and_pivot`."""
+        of = self.speeds or self.program.all_speeds
+        return of(fixed, t, q, y, inputs), smallest_pivot(self.numbers(fixed, t, q, y, inputs)[:-2])
+
+    def energies_at(self, *state) -> Float[Array, "2"]:
+        """As `Lowered.energies_at`."""
+        return self.numbers(*state)[-2:]
 
 
 @lru_cache(maxsize=64)
@@ -304,19 +316,21 @@ def beside(program: Lowered) -> Beside | None:
     used = set(graph.reachable(program.fixed))
     needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
     given = [n for leaf in needed for n in leaf if n >= 0]
-    return Beside(needed, values_of_nodes(graph, program.fixed, given), _at_states(program), _at_state(program, program.at_start, values_of_nodes))
-
-
-def _at_states(program: Lowered) -> AtStates:
-    numbers = _at_state(program, [*program.pivots, *program.energies], nodes_called)
-    speeds = None
+    numbers, speeds = _at_state(program, [*program.pivots, *program.energies], nodes_called), None
     # Operations from which on speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers (228 operations) 0.69 and
     # 0.54, of 16 (436) 2.6 and 1.8, derivatives of which compile in 13 and 6 s; 256 bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of
     # 4 trailers (124) 44 and 39, their gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
     if program.graph.operations(program.z) >= 100:
         every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
         speeds = _at_state(program, [every[i] for i in np.argsort([*program.independent, *program.dependent])], values_of_nodes)
-    return AtStates(speeds, lambda *state: numbers(*jax.lax.stop_gradient(state)))
+    return Beside(
+        program,
+        needed,
+        values_of_nodes(graph, program.fixed, given),
+        speeds,
+        lambda *state: numbers(*jax.lax.stop_gradient(state)),
+        _at_state(program, program.at_start, values_of_nodes),
+    )
 
 
 def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
@@ -343,31 +357,6 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
             flat = jnp.reshape(jnp.asarray(leaf, real_type()), (-1,))
             found.append(flat if needed.size == flat.shape[0] else flat[needed])
     return found
-
-
-def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
-    """As `Lowered.fixed_values`."""
-    own = beside(program)
-    parameters = [] if own is None else entries(scene, own.needed)
-    if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing requested
-        return program.fixed_values(scene)
-    return entries_of(own.fixed(jnp.concatenate(parameters)))
-
-
-def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-    """As `Lowered.speeds_and_pivot`."""
-    if (own := beside(program)) is None:
-        return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
-    speeds = own.at_states.speeds
-    u = program.all_speeds(fixed, t, tuple(q), tuple(y), inputs) if speeds is None else speeds(fixed, t, q, y, inputs)
-    return u, smallest_pivot(own.at_states.numbers(fixed, t, q, y, inputs)[:-2])
-
-
-def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
-    """As `Lowered.energy_values`."""
-    if (own := beside(program)) is None:
-        return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
-    return own.at_states.numbers(fixed, t, q, y, inputs)[-2:]
 
 
 def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:

@@ -23,7 +23,7 @@ from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled, speed_scale
 from jourdain_jax.equations.switching import put_back
 from jourdain_jax.equations.virtual_power import coordinate_rates_in_modes, mass_matrix_at
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
+from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorField, Watched
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -90,29 +90,33 @@ class ByMatrices(VectorField):
         """Return the values of the inputs, with their own rates where rows depend on them."""
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
-    def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
+    def solved(self, at: Instant, u) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
         """Return the motion with these speeds, its accelerations, and the eliminated rows that are nonlinear in the speeds."""
-        found, equations, rows = reduced_at(scene, t, q, u, inputs, self.reduction, self.stabilisation, self.usual.rows)
-        return motion_at(scene, t, q, u, inputs), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
+        state = at.scene, at.t, at.y.q, u, at.inputs
+        found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
+        return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
 
-    def watched(self, scene: Scene, t, y: Integrated, rates: Integrated, pivots, rows) -> Watched:
-        """Add the rates of coordinates by each speed of the scene's own, which must not become infinite, to these rates, pivots and rows."""
-        N = jax.lax.stop_gradient(rates_by_own_speeds(scene, t, y.q))
+    def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
+        """Return the rates with these accelerations `v`, pivots and rows, and with the rates of coordinates by each speed of the scene's own, which
+        must not become infinite.
+        """
+        power = rate_of_work(at.scene, motion, found, self.of_inputs) if self.with_work else None
+        N = jax.lax.stop_gradient(rates_by_own_speeds(at.scene, at.t, at.y.q))
         width = max(rows.shape[1], N.shape[1])
         padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
-        return Watched(rates, jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1)), jnp.concatenate(padded))
+        pivots = jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1))
+        return Watched(Integrated(coordinate_rates_in_modes(at.scene, motion), v, power), pivots, jnp.concatenate(padded))
 
-    def power(self, scene: Scene, motion: Motion, found) -> Scalar | None:
-        """The rate of the work that is integrated, W."""
-        return rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None
-
-    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+    def project(self, at: Instant) -> Integrated:
+        scene, _, t, y, inputs = at
+        q, v = y.q, y.v
         if scene.switching.contacts and self.projects_speeds:
-            y = Integrated(*put_back(At(scene, motion_at(scene, t, y.q, y.v, inputs))), y.work)
-        q = project_positions(scene, t, y.q, iterations=2, typical=self.usual.closures) if self.projects_positions else y.q
-        if not self.projects_speeds:
-            return Integrated(q, y.v, y.work)
-        return Integrated(q, project_speeds(scene, t, q, y.v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths), y.work)
+            q, v = put_back(At(scene, motion_at(scene, t, q, v, inputs)))
+        if self.projects_positions:
+            q = project_positions(scene, t, q, iterations=2, typical=self.usual.closures)
+        if self.projects_speeds:
+            v = project_speeds(scene, t, q, v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths)
+        return Integrated(q, v, y.work)
 
 
 class MinimalByMatrices(ByMatrices):
@@ -126,25 +130,24 @@ class MinimalByMatrices(ByMatrices):
         """The sign of det A_z."""
         return True
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
-        return self._kinematics(scene, t, y, inputs).u
+    def speeds(self, at: Instant) -> Speeds:
+        return self._kinematics(at).u
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
         """Return all speeds, and the pivot with the sign of det A_z."""
-        found = self._kinematics(scene, t, y, inputs)
+        found = self._kinematics(at)
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+    def rates_and_pivots(self, at: Instant) -> Watched:
         """As `rates`, and the sign of det A_z."""
-        known = self._kinematics(scene, t, y, inputs)
+        known = self._kinematics(at)
         own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
-        motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)[:2]
+        motion, found = accelerations_of(at.scene, known, at.t, at.y.q, at.inputs) if own else self.solved(at, known.u)[:2]
         v = found.udot[jnp.array(self.independent, jnp.int32)]
-        rates = Integrated(coordinate_rates_in_modes(scene, motion), v, self.power(scene, motion, found))
-        return self.watched(scene, t, y, rates, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
+        return self.watched(at, motion, found, v, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
 
-    def _kinematics(self, scene: Scene, t, y: Integrated, inputs) -> MinimalKinematics:
-        return minimal_kinematics(scene, self.independent, self.rows, t, y.q, y.v, inputs)
+    def _kinematics(self, at: Instant) -> MinimalKinematics:
+        return minimal_kinematics(at.scene, self.independent, self.rows, at.t, at.y.q, at.y.v, at.inputs)
 
 
 class FullByMatrices(ByMatrices):
@@ -175,20 +178,19 @@ class FullByMatrices(ByMatrices):
         """Whether branches may cross on the rows that a step is put back onto."""
         return self.projects and self.undecided is not None
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
-        return y.v
+    def speeds(self, at: Instant) -> Speeds:
+        return at.y.v
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
         if not isinstance(self.reduction, Privileged | GibbsAppell):
-            return y.v, jnp.ones(())
-        return y.v, bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot
+            return at.y.v, jnp.ones(())
+        return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+    def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates`, eliminated rows, and 1 where the rows decide on which branch the motion continues, -1 where round-off does."""
-        motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
-        rates = Integrated(coordinate_rates_in_modes(scene, motion), found.udot, self.power(scene, motion, found))
+        motion, found, directions = self.solved(at, at.y.v)
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
-        watched = self.watched(scene, t, y, rates, branch.astype(y.q.dtype), directions)
+        watched = self.watched(at, motion, found, found.udot, branch.astype(at.y.q.dtype), directions)
         return watched._replace(sine=found.pivot) if self.near_rank_loss else watched
 
 

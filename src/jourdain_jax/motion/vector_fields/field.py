@@ -7,7 +7,7 @@ Where some force or row does work that no potential accounts for, that work is i
 """
 
 import abc
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ from jourdain_jax.equations.switching import contacts_at_start
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import values
+from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 
@@ -126,12 +127,23 @@ class Watched(NamedTuple):
     sine: PerLane | None = None  # the smallest between a row and those before it; None: rows that are solved for speeds, or none
 
 
-class VectorField(eqx.Module):
-    """Packing, unpacking, rates and projection of a scene's state. All choices are static.
+class Instant(NamedTuple):
+    """Arguments of a vector field."""
 
-    `fixed`: the scene's part of the rates, computed once per motion; `inputs`: their values at the time, for
-    `rates` and `rates_and_pivots` from `now`.
-    """
+    scene: Scene
+    fixed: tuple  # the scene's part of the rates, computed once per motion
+    t: PerLane  # s
+    y: Integrated
+    inputs: Any  # values at the time; for `rates` and `rates_and_pivots` from `now`
+
+    @property
+    def of_program(self) -> tuple[tuple, Any, Any, Any, Any]:
+        """The arguments of a scalar program."""
+        return self.fixed, self.t, self.y.q, self.y.v, self.inputs
+
+
+class VectorField(eqx.Module):
+    """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
 
     independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
     reduction: Reduction | GibbsAppell
@@ -208,45 +220,50 @@ class VectorField(eqx.Module):
         return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
 
     @abc.abstractmethod
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
+    def speeds(self, at: Instant) -> Speeds:
         """All speeds."""
 
     @abc.abstractmethod
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
         """All speeds, and how well the privileged ones determine the others, with a sign that changes where they do not.
 
         For the full state the second is that of its reduction, without a sign, and 1 where it has none.
         """
 
-    def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
-        """Return values of the stop events, in the order of their names; lanes only where `lowers_events`."""
-        return event_values(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
+    def motion(self, at: Instant) -> Motion:
+        """Return the motion with all speeds."""
+        return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
 
-    def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
+    def events(self, at: Instant) -> Float[Array, "events *lanes"]:
+        """Return values of the stop events, in the order of their names; lanes only where `lowers_events`."""
+        return event_values(at.scene, self.motion(at))
+
+    def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
         """As `event_resets` has them, of the speeds those that are integrated; lanes only where `lowers_events`."""
-        found = event_resets(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs), self.of_inputs)
-        left_out = set(range(len(scene.speed_names))) - set(range(len(scene.speed_names)) if self.independent is None else self.independent)
-        return jnp.delete(found, np.array([len(y.q) + k for k in sorted(left_out)], int), axis=1)
+        found = event_resets(at.scene, self.motion(at), self.of_inputs)
+        every = range(len(at.scene.speed_names))
+        left_out = [len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent]
+        return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
         """Contacts that switch at the start of a motion from (q, u): `switching.Begun` in one vector."""
         return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
 
-    def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+    def energies(self, at: Instant) -> Float[Array, "2"]:
         """Kinetic and potential energy, J; numbers to differentiation."""
-        scene, fixed, t, y, inputs = jax.lax.stop_gradient((scene, fixed, t, y, inputs))
-        return jnp.stack(energies_at(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs)))
+        at = jax.lax.stop_gradient(at)
+        return jnp.stack(energies_at(at.scene, self.motion(at)))
 
-    def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+    def rates(self, at: Instant) -> Integrated:
         """Time derivative of the integrated state."""
-        return self.rates_and_pivots(scene, fixed, t, y, inputs).rates
+        return self.rates_and_pivots(at).rates
 
     @abc.abstractmethod
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+    def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates` with what is watched at all stages of a step."""
 
     @abc.abstractmethod
-    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+    def project(self, at: Instant) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
 
 
@@ -255,7 +272,7 @@ class ByProgram(VectorField):
 
     program: Lowered = eqx.field(static=True)
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    native: bool = eqx.field(static=True, default=False)  # machine code of our own computes what stands beside the steps
+    native: values.Beside | None = eqx.field(static=True, default=None)
 
     @property
     def lowered(self) -> Lowered:
@@ -293,47 +310,43 @@ class ByProgram(VectorField):
 
     def fixed(self, scene: Scene) -> tuple:
         """Return what depends on parameters alone."""
-        return values.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
+        return (self.native or self.program).fixed_values(scene)
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
-        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+    def speeds(self, at: Instant) -> Speeds:
+        return self.program.speeds_and_pivot(*at.of_program)[0]
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
         """Return all speeds, and the smallest pivot of the elimination."""
-        if self.native:
-            return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
-        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
+        return (self.native or self.program).speeds_and_pivot(*at.of_program)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
-        if self.native and (own := values.beside(self.program)) is not None:
-            return own.at_start(self.fixed(scene), t, q, u, inputs)
-        return self.program.values(self.program.at_start, self.fixed(scene), t, tuple(q), tuple(u), inputs)
+        state = self.fixed(scene), t, q, u, inputs
+        return self.native.at_start(*state) if self.native else self.program.values(self.program.at_start, *state)
 
-    def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
-        if self.native:
-            return values.energies(self.program, fixed, t, y.q, y.v, inputs)
-        return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+    def energies(self, at: Instant) -> Float[Array, "2"]:
+        return (self.native or self.program).energies_at(*at.of_program)
 
-    def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
+    def events(self, at: Instant) -> Float[Array, "events *lanes"]:
         if self.program.events:
-            return self.program.values(self.program.events, fixed, t, tuple(y.q), tuple(y.v), inputs)
-        return super().events(scene, fixed, t, y, inputs)
+            return self.program.values(self.program.events, *at.of_program)
+        return super().events(at)
 
-    def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
+    def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
         if self.program.events:
-            found = self.program.values(self.program.resets, fixed, t, tuple(y.q), tuple(y.v), inputs)
+            found = self.program.values(self.program.resets, *at.of_program)
             return found.reshape(len(self.program.events), -1, *found.shape[1:])
-        return super().resets(scene, fixed, t, y, inputs)
+        return super().resets(at)
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+    def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates`, the pivots of the elimination, and the eliminated rows."""
-        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+        y = at.y
+        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(*at.of_program, self.with_work)
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
         rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
         return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
 
-    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+    def project(self, at: Instant) -> Integrated:
         """Return the state projected onto the constraints."""
-        q, v = self.program.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
-        return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
+        q, v = self.program.projected(*at.of_program, self.affine)
+        return Integrated(jnp.stack(q), jnp.stack(v) if v else at.y.v, at.y.work)
