@@ -20,7 +20,7 @@ from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, presen
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce

@@ -13,7 +13,7 @@ from browser import needs_browser, screenshot
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.plotting.guesses import guessed
+from jourdain_jax.plotting.looks import guessed
 from jourdain_jax.plotting.pictures import draw_still
 
 RED = "#ff0000"

@@ -51,7 +51,7 @@ from jourdain_jax.equations.virtual_power import (
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.inputs import Sampled
-from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.motion.integrators.explicit_steps import Taylor
 from jourdain_jax.motion.model import Model, build, load_model
 from jourdain_jax.motion.options import Options
 from jourdain_jax.motion.put_on_rows import State

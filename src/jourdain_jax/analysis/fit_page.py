@@ -14,8 +14,8 @@ import numpy as np
 
 from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.resumed import RISE_95, Informed, Prediction, Profile
-from jourdain_jax.analysis.table import table
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
+from jourdain_jax.scene.printing import table
 
 _WIDTH, _HEIGHT = 460, 200  # pixels
 

@@ -17,8 +17,8 @@ from jourdain_jax.analysis.fit_page import fit_page, interval_widths
 from jourdain_jax.analysis.problem import LEAST_SQUARES
 from jourdain_jax.analysis.resumed import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
 from jourdain_jax.analysis.spread import FAR_BEYOND
-from jourdain_jax.analysis.table import table
 from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.printing import table
 
 
 def warnings_of(fit: Estimates) -> tuple[str, ...]:

@@ -33,7 +33,6 @@ from jourdain_jax.analysis.experiment import Data, Experiment, checked
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
-from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.reals import Scalar, array_module, compiled, described, holds, is_traced, largest
@@ -43,7 +42,7 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_names
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, table
 from jourdain_jax.scene.scene import Scene
 
 

@@ -20,7 +20,6 @@ from jaxtyping import Array, Complex, Float
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
 from jourdain_jax.analysis.instant import ByMatrices, instant_of, places_of
-from jourdain_jax.analysis.table import complex_numbers, matrix
 from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
     eliminated,
@@ -42,7 +41,7 @@ from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, users_level
 from jourdain_jax.scene.names import as_names, check_name
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
 
 _compiled = partial(compiled, options=RUN_SELDOM)

@@ -325,3 +325,21 @@ def _whole(arrays, treedef, rest):
     """Put a tree together from its parts."""
     left = iter(arrays)
     return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])
+
+
+def nan_is_a_mark():
+    """Return a context in which JAX does not look for NaN."""
+    return jax.debug_nans(False)
+
+
+def with_nan_as_a_mark(f: F) -> F:
+    """Return `f`, run without checks for NaN."""
+
+    @wraps(f)
+    def run(*arguments, **named):
+        if not jax.config.jax_debug_nans:
+            return f(*arguments, **named)
+        with nan_is_a_mark():
+            return f(*arguments, **named)
+
+    return run  # type: ignore[return-value]

@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.reals import nan_is_a_mark
 from jourdain_jax.ensembles.distributions import Distribution
 from jourdain_jax.ensembles.outputs import OfEvent
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
-from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import users_level

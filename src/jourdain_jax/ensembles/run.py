@@ -22,13 +22,12 @@ import numpy as np
 from tqdm import tqdm
 
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.calculus.reals import nan_is_a_mark, real_type
 from jourdain_jax.ensembles import memory
 from jourdain_jax.ensembles.statistics import Grid, Tally
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
-from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.trajectories.labelled import OF_LANES
 from jourdain_jax.scene.arguments import users_level
 from jourdain_jax.scene.parameters import parameters_of

@@ -1,4 +1,7 @@
-"""Constant rotation matrices from angles, quaternions and axes; and the combination of masses."""
+"""Constant rotation matrices from angles, quaternions and axes; the combination of masses; volumes and moments of inertia of
+uniform solids, with MJCF's sizes: radii and half lengths."""
+
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -40,3 +43,31 @@ def combined(masses: list[Mass]) -> Mass:
         d = one.centre - centre
         inertia += one.inertia + one.mass * (d @ d * np.eye(3) - np.outer(d, d))
     return Mass(total, centre, inertia)
+
+
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # numbers that say a size
+
+
+def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
+    """Volume of a solid, m^3."""
+    if kind in ("sphere", "ellipsoid"):
+        return 4 / 3 * math.pi * math.prod(np.broadcast_to(size, 3))
+    if kind == "box":
+        return 8 * math.prod(size)
+    cylinder = 2 * math.pi * size[0] ** 2 * size[1]
+    return cylinder + volume("sphere", size[:1]) if kind == "capsule" else cylinder
+
+
+def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
+    """Principal moments about the middle for a mass of 1 kg; the axis of cylinders and capsules is z."""
+    if kind in ("sphere", "ellipsoid", "box"):
+        squares = np.square(np.broadcast_to(size, 3))
+        return (np.sum(squares) - squares) / (3 if kind == "box" else 5)
+    radius, half = size
+    straight = np.array([(3 * radius**2 + 4 * half**2) / 12] * 2 + [radius**2 / 2])
+    if kind == "cylinder":
+        return straight
+    # two half balls, whose mass centres are 3 r/8 from their flat sides: 2 r^2/5 + h^2 + 3 h r/4
+    ends = np.array([0.4 * radius**2 + half**2 + 0.75 * half * radius] * 2 + [0.4 * radius**2])
+    share = volume("cylinder", size) / volume("capsule", size)
+    return share * straight + (1 - share) * ends

@@ -21,7 +21,7 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.roots import shortest
-from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.scene.scene import Scene
 

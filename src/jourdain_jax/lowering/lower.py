@@ -4,7 +4,7 @@ with dense matrices; the one with the fewest operations is kept. If lowering fai
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import islice
 
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_events, stops
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
@@ -21,7 +22,6 @@ from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
-from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.lowering.relations import jumps, relations, sided
 from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
@@ -306,3 +306,30 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: list[int]) -> list[
         else:
             same[call] = found
     return graph.substituted(outputs, same)
+
+
+def may_be_massless(scene: Scene, structure: Structure) -> bool:
+    """Return whether M is singular at the parameters of `scene`, or with zero for those traced ones that need
+    not be positive.
+
+    These are parameters declared `non_negative` and those whose default is zero; where privileged speeds serve, so that it costs nothing, all that are not
+    declared `positive`.
+    """
+    if structure.massless:
+        return True
+    without = _with_zeros(scene, every=structure.well_conditioned)
+    if without is None:
+        return False
+    try:
+        return structure_of(without).massless
+    except ValueError:  # all of them at once cannot be zero; some may
+        return True
+
+
+def _with_zeros(scene: Scene, every: bool) -> Scene | None:
+    """Return numbers for the scene's parameters, with all permitted zeros; None if there are none."""
+    may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or np.array_equal(f.default, 0)}
+    given, treedef = jax.tree_util.tree_flatten_with_path(scene)
+    zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]
+    leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(with_reference_parameters(scene)), strict=True)]
+    return jax.tree.unflatten(treedef, leaves) if any(zeros) else None

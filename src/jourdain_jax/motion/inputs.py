@@ -32,7 +32,7 @@ from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.calculus.reals import PerLane, as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, largest, real_type
-from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.arguments import ChangingInputs

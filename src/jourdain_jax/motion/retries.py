@@ -21,9 +21,8 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import known_numbers
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI8
+from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, Taylor
 from jourdain_jax.motion.integrators.radau import RadauIIA
-from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.motion.setup import Setup

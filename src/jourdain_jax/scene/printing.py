@@ -1,8 +1,8 @@
-"""Text of results in a console and in a notebook, with shapes in place of traced values."""
+"""Text of results in a console and in a notebook, with shapes in place of traced values; tables and matrices as text."""
 
 import dataclasses
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -93,3 +93,23 @@ def shapes_of(result) -> str:
     largest = max(shapes, key=lambda shape: (len(shape), shape), default=())
     name = type(result).__name__
     return f"{name}, being traced: {len(shapes)} arrays, the largest of shape {largest}; print it outside of `jax.jit`, or use `jax.debug.print`"
+
+
+def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return lines with the cells of all rows in columns, indented by two blanks."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
+    """Return a matrix under the names of its columns."""
+    shape, digits = np.shape(values), in_digits(np.ravel(values))
+    return table([(name, *column_names), *((row, *digits[k * shape[1] : (k + 1) * shape[1]]) for k, row in enumerate(row_names))])
+
+
+def complex_numbers(values) -> list[str]:
+    """Return texts such as `-0.5+2.1i`."""
+    values = np.asarray(values)
+    parts = in_digits(np.concatenate([values.real, values.imag]))
+    pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)
+    return [real if imag == "0" else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]

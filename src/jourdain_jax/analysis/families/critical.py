@@ -25,7 +25,6 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
-from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.reals import RUN_SELDOM, compiled, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
@@ -33,7 +32,7 @@ from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, s
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.parameters import parameters_of
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, complex_numbers, table
 from jourdain_jax.scene.scene import Scene
 
 Unknowns = Float[Array, "all_unknowns"]

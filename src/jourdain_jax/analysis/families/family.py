@@ -16,14 +16,13 @@ from jourdain_jax.analysis.families.periodic import OrbitEquations, PeriodicMoti
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import Modes, mode_names
 from jourdain_jax.analysis.steady import guessed
-from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, checked_known, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_name, check_names
 from jourdain_jax.scene.parameters import parameters_of
-from jourdain_jax.scene.printing import Printed, in_digits
+from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
 
 SHOWN = 1e-9  # sizes by which an unknown changes that is printed

@@ -30,7 +30,6 @@ from jourdain_jax.analysis.families.equations import Look, Motions, Vector, size
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import Modes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, places_of, unseen
-from jourdain_jax.analysis.table import complex_numbers
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import null_space_svd
@@ -46,7 +45,7 @@ from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, check_name, check_names
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, complex_numbers
 from jourdain_jax.scene.scene import Scene
 
 Unknowns = Float[Array, "unknowns"]

@@ -16,11 +16,10 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import checked_real, checked_whole, described, is_traced, known_numbers, real_type
+from jourdain_jax.calculus.reals import checked_real, checked_whole, described, is_traced, known_numbers, real_type, with_nan_as_a_mark
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.integrators.taylor import Taylor
-from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.motion.integrators.explicit_steps import Taylor
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, is_traced, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, is_traced, with_nan_as_a_mark, with_usual_promotion
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
@@ -20,7 +20,6 @@ from jourdain_jax.equations.reductions import NullSpaceSVD
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.inputs import Inputs, for_programs
-from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene

@@ -31,11 +31,10 @@ import numpy as np
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
-from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.retries import RERUN_FIELDS
 from jourdain_jax.motion.trajectories.over_times import Phases, Record, one_phase
 from jourdain_jax.motion.trajectories.trajectory import Trajectory

@@ -9,14 +9,13 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.markers import nan_where
-from jourdain_jax.calculus.reals import checked_real
+from jourdain_jax.calculus.reals import checked_real, nan_is_a_mark
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_bodies
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.inputs import inputs_at
-from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.put_on_rows import State, known_faults_at
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
