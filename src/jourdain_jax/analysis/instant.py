@@ -9,7 +9,7 @@ independent speeds alone: a dependent speed counts in phi only. Scenes without s
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, array_module, compiled, real_type
+from jourdain_jax.calculus.reals import Entries, array_module, compiled_quickly, real_type
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -155,7 +155,7 @@ class ByMatrices:
         return _by_matrices(scene, self.constant, t, q, u, f)
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
     at = places_of(scene)
 

@@ -15,7 +15,6 @@ F^-1, all others being estimated with them.
 Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -39,7 +38,7 @@ from jourdain_jax.calculus.reals import Scalar, array_module, compiled, describe
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_names
 from jourdain_jax.scene.printing import Printed, table
@@ -131,7 +130,7 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
         raise ValueError(f"{wrong[0]}, expected an `Experiment` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
     for sentence in oddities(scene, found, repeats):
-        warnings.warn(sentence, stacklevel=users_level())
+        warn(sentence)
     return found
 
 

@@ -8,8 +8,6 @@ coordinates: the first form with the privileged speeds changed to (pdot, the oth
 Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
-import warnings
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -32,19 +30,17 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Numbers, Scalar, array_module, compiled, holds, is_traced, largest
+from jourdain_jax.calculus.reals import Count, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, warn
 from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
-
-_compiled = partial(compiled, options=RUN_SELDOM)
 
 
 class Modes(eqx.Module):
@@ -208,7 +204,7 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
             f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at this state: it has a kink or jumps there, as dry "
             "friction does at rest. Linearize at a state beside it, or let the load change within a short range, as by `jnp.tanh`"
         )
-        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
+        warn(text, SensitivityWarning)
 
 
 def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[str, ...] | None, coordinates: tuple[str, ...] | None) -> Linearization:
@@ -278,7 +274,7 @@ def _relative(neglected, kept):
     return largest(neglected) / xp.where(size > 0, size, 1.0)
 
 
-@_compiled
+@compiled_quickly
 def _decomposed(found: Linearization) -> tuple[Array, Array, Array, Array]:
     """Return the contents of `Modes` for the second-order form."""
     values, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(found._companion()))
@@ -292,7 +288,7 @@ def _largest_one(shapes: Complex[Array, "parts modes"]) -> Complex[Array, "parts
     return shapes / jnp.take_along_axis(shapes, jnp.argmax(jnp.abs(shapes), axis=0)[None], axis=0)
 
 
-@_compiled
+@compiled_quickly
 def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
     """Return eigenvalues by ascending real part."""
     values = jnp.linalg.eigvals(matrix)

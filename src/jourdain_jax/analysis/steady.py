@@ -8,7 +8,6 @@ d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/roots.py
 """
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Unpack
 
 import equinox as eqx
@@ -20,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described, largest, real_type
+from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, compiled_quickly, described, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
@@ -138,7 +137,7 @@ class _Problem(eqx.Module):
         return v[rows], slopes, [largest(v[of_rows]), largest(v[y]), largest(D[y] @ along)]
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: int) -> SteadyMotion:
     guess, n, still = jnp.concatenate([q, u]), len(q), jax.lax.stop_gradient(problem)
     size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)

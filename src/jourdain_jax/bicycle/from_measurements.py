@@ -12,7 +12,6 @@ stiffness of the rod, and the place of a mass centre its moment of inertia about
 Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -23,7 +22,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled, real_type
+from jourdain_jax.calculus.reals import Scalar, compiled_quickly, real_type
 from jourdain_jax.scene.names import check_name
 
 PerHanging = Float[Array, "hangings"]
@@ -94,7 +93,7 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tup
     return tuple(warnings)
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
     """Return parameters and distances of upright lines, and their derivatives with respect to each reading,
     in the order of its means.

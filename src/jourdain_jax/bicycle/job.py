@@ -20,7 +20,7 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import compiled_quickly
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.trajectories.results import EVENT
@@ -147,7 +147,7 @@ def _speeds_and_matrices(row):
     return stability_speeds(*matrices, max_speed=MAX_SPEED), matrices
 
 
-_speeds = compiled(jax.vmap(_speeds_and_matrices), options=RUN_SELDOM)  # 2,000 samples: compiled in 6 s, not 18; run in 3.4 s, not 2.0
+_speeds = compiled_quickly(jax.vmap(_speeds_and_matrices))  # 2,000 samples: compiled in 6 s, not 18; run in 3.4 s, not 2.0
 
 
 _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=grid), (0, None)))

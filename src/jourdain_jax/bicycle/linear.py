@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.stability import BicycleMatrices
-from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
+from jourdain_jax.calculus.reals import Scalar, compiled_quickly
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.put_on_rows import State, state_of
 
@@ -47,4 +47,4 @@ def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
     return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
 
 
-_matrices = compiled(_linearised, options=RUN_SELDOM)  # the first call in 10 s of processor time, not in 23; the second in 6 ms
+_matrices = compiled_quickly(_linearised)  # the first call in 10 s of processor time, not in 23; the second in 6 ms

@@ -28,7 +28,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Scalar, compiled, real_type
+from jourdain_jax.calculus.reals import Flag, Scalar, compiled_quickly, real_type
 
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]
@@ -136,7 +136,7 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
     )
 
 
-_speeds = compiled(_stability_speeds, options=RUN_SELDOM)
+_speeds = compiled_quickly(_stability_speeds)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:

@@ -7,7 +7,7 @@ arrays combine as JAX's defaults have it in this package's own lines, also where
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from functools import lru_cache, wraps
+from functools import lru_cache, partial, wraps
 from types import ModuleType
 from typing import Any, TypeAlias, TypeVar
 
@@ -304,6 +304,9 @@ def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
 
     vars(run)["cache_clear"] = program.cache_clear
     return run
+
+
+compiled_quickly = partial(compiled, options=RUN_SELDOM)
 
 
 class _Kept(eqx.Module):

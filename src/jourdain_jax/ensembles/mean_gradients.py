@@ -8,7 +8,6 @@ and df/dx of a lane is the exact derivative of its motion, in forward mode. This
 one end to another (from an event to none) let f jump, their share is missing: it is named, and outputs that say which event happened have no such derivative.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,7 +23,7 @@ from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
@@ -148,5 +147,5 @@ def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, en
                 "end to another, the share of lanes that pass between them is missing; compare with differences of the mean"
             )
     for text in warned:
-        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
+        warn(text, SensitivityWarning)
     return MeanGradients(tuple(task.outputs), tuple(names), mean[:, 0], gradient, error, count[:, 0], failed, tuple(warned))

@@ -2,7 +2,6 @@
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,7 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.printing import Printed
 
@@ -257,7 +256,7 @@ def load_study(path: str | os.PathLike) -> StudyResult:
     found = StudyResult(Store(path))
     if found.left_out:
         text = "are left out: the receipts of their chunks are damaged, or of another study; run the study again, which computes them anew"
-        warnings.warn(f"{found.store.lanes_of(found.left_out)} {text}", stacklevel=users_level())
+        warn(f"{found.store.lanes_of(found.left_out)} {text}")
     return found
 
 

@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -29,7 +28,7 @@ from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.trajectories.labelled import OF_LANES
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.parameters import parameters_of
 
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
@@ -63,10 +62,9 @@ class Runner:
         found = Grid.of(np.asarray(self._first.outputs)[: len(self._first.lanes)]).as_dict()
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
-            warnings.warn(
+            warn(
                 f"the first {task.block} lanes of `{store.path}` come out with other bits here than where the study was begun (another machine, or other "
-                "versions); results are right, but not bit-equal to those of one machine",
-                stacklevel=users_level(),
+                "versions); results are right, but not bit-equal to those of one machine"
             )
         self.grid = Grid.from_dict(kept, len(task.outputs))
 
@@ -220,9 +218,7 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     now = versions()
     changed = [f"{name} {held} (now {now[name]})" for name, held in store.study["versions"].items() if now.get(name) != held]
     if changed:
-        warnings.warn(
-            f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=users_level()
-        )
+        warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits")
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
@@ -268,7 +264,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
         done, torn = store.done()
         if torn:
             some = ", ".join(map(str, torn[:10])) + (" ..." if len(torn) > 10 else "")
-            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}", stacklevel=users_level())
+            warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}")
         missing = sorted({*range(shard[0] - 1, store.chunks, shard[1])}.difference(done))
         known = _lanes(store, done)
         bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)

@@ -9,7 +9,6 @@ import os
 import pickle
 import signal
 import threading
-import warnings
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -20,7 +19,7 @@ from typing import Any
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 
 MOST_DEATHS = 3  # of processes on one chunk, before it is left out
 _NONE_BEGAN = (
@@ -88,7 +87,7 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
         waiting = [number for number in waiting if number not in left_out and store.receipt(number) is None]
     if left_out:
         said = f"{_died(store, sorted(left_out))}, which are left out; all others are kept, and the same call tries these again. {_ADVICE}"
-        warnings.warn(said, stacklevel=users_level())
+        warn(said)
 
 
 _ADVICE = (

@@ -3,7 +3,6 @@
 import difflib
 import os
 import re
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from jaxtyping import Float
 from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.names import as_labels, check_name, nearest
 
 Element = ElementTree.Element
@@ -129,7 +128,7 @@ class XmlFile:
         counted = {what: count for what, count in sorted(self._left_out.items()) if what not in self.ignore}
         listed = [f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()]
         if listed:
-            warnings.warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
+            warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this")
 
     def fault(self, what: str) -> ValueError:
         """Return the error of this file."""

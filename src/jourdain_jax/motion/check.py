@@ -6,14 +6,13 @@ bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all that is refused w
 scalar program    its rates and slopes against JAX's
 """
 
-import warnings
 from dataclasses import dataclass
 
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.lowering.comparison import DIFFERS
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import NotLowered
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines, warn
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -71,4 +70,4 @@ def _checked(scene: Scene, every_speed: bool | None) -> Checked:
 def warn_of_mistakes(scene: Scene, every_speed: bool) -> None:
     """Warn with the table where something looks wrong, once for each class and state."""
     if not (found := _checked(scene, every_speed)).passed:
-        warnings.warn(str(found), stacklevel=users_level())
+        warn(str(found))

@@ -6,7 +6,6 @@ they are saved, not after each step; one that has left them by more than errors 
 happened at the end of a step, located by the dense output: a value that falls and rises again within a step is none.
 """
 
-import warnings
 from functools import partial
 from typing import ClassVar
 
@@ -26,7 +25,7 @@ from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import Formulation, Instant, Integrated, VectorField
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.scene import Scene
 
 
@@ -162,7 +161,7 @@ def check(setup: Setup) -> None:
         )
     if reason_against_watching(setup):
         text = f"diffrax.{solver} does not watch the relations that loads or events of `{name}` have: it may step over them; the default solver does"
-        warnings.warn(text, stacklevel=users_level())
+        warn(text)
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:

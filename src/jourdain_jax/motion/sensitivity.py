@@ -31,7 +31,7 @@ from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.arguments import users_level
+from jourdain_jax.scene.arguments import warn
 
 
 class SensitivityWarning(UserWarning):
@@ -120,7 +120,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
             "its derivatives omit the shift of the time of the jump. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
             "there by an event and start another; the motion itself is right"
         )
-        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
+        warn(text, SensitivityWarning)
 
 
 def numbers_where_known(values):

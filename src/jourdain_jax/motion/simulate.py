@@ -5,7 +5,6 @@ The default state is the minimal one (coordinates and privileged speeds) where t
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
 """
 
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
@@ -32,7 +31,7 @@ from jourdain_jax.motion.setup import LONGEST, MEMORY, Setup, times_fit
 from jourdain_jax.motion.start import named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, users_level, vector_of_times
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, vector_of_times, warn
 from jourdain_jax.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -176,10 +175,7 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
     """
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
-        warnings.warn(
-            f"rtol = {rtol} needs more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
-            stacklevel=users_level(),
-        )
+        warn(f"rtol = {rtol} needs more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5")
     if isinstance(solver, Taylor):
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):

@@ -15,7 +15,7 @@ import numpy as np
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, at_once, compiled, described, is_traced, known_numbers, nothing_is_traced
+from jourdain_jax.calculus.reals import Number, Numbers, at_once, compiled_quickly, described, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -73,7 +73,7 @@ def _as_input_vector(scene: Scene, inputs, dtype):
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-_compiled_projection = compiled(put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
+_compiled_projection = compiled_quickly(put_onto_constraints)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(put_onto_constraints)
 
 

@@ -9,6 +9,7 @@ JAX_TRACEBACK_FILTERING=off shows all of them. Errors on whose way no user's met
 
 import sys
 import sysconfig
+import warnings
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -190,14 +191,12 @@ def shown_from_users_lines(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-def users_level() -> int:
-    """Return the `stacklevel` with which a warning, given where this is called, shows the user's line that
-    led there.
-    """
-    frame, level = sys._getframe(1), 1
+def warn(text: str, kind: type[Warning] = UserWarning) -> None:
+    """Issue a warning that shows the user's line which led here."""
+    frame, level = sys._getframe(), 1
     while frame.f_back is not None and not _is_users(frame):
         frame, level = frame.f_back, level + 1
-    return level
+    warnings.warn(text, kind, stacklevel=level)
 
 
 def _is_shortened(error: BaseException) -> bool:

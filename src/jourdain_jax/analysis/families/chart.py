@@ -4,7 +4,6 @@ cross the axis.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.families.critical import CriticalPoint, Special, followed_to, special_at
 from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, family
-from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Scalar, compiled
+from jourdain_jax.calculus.reals import Number, Scalar, compiled_quickly
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.printing import Printed
@@ -92,7 +91,7 @@ def stability_chart(
     return StabilityChart(values, tuple(boundaries), tuple(bands), middle)
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
     """Return the point of a scene with this value, the arguments of the program there, and the pseudo-inverse
     of the equations' derivatives.

@@ -11,7 +11,7 @@ R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It
 pseudo-inverse comes from Q R.
 """
 
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 
 import equinox as eqx
@@ -25,7 +25,7 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled, largest
+from jourdain_jax.calculus.reals import compiled_quickly, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
@@ -255,7 +255,7 @@ class Special(eqx.Module):
         return CriticalPoint(state_of(scene, of.t, q, u), varied, eigenvalue, condition, code, self.kind)
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _solution(special: Special, scene: Scene) -> CriticalPoint:
     """Return the point of a scene, differentiable twice."""
     lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)  # each takes as many steps as it needs

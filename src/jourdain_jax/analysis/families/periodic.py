@@ -17,7 +17,6 @@ A. D. Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Unpack
 
 import equinox as eqx
@@ -33,7 +32,7 @@ from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, pla
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, checked_whole, compiled, known_numbers, largest
+from jourdain_jax.calculus.reals import Flag, Number, Scalar, checked_whole, compiled_quickly, known_numbers, largest
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -276,7 +275,7 @@ class _Shooting(eqx.Module):
         return found[order[: count - (self.until is not None)]]
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     t, begun = start.t, jnp.concatenate([start.q, start.u])
     still, z, given = jax.lax.stop_gradient((problem, begun, period))
@@ -334,7 +333,7 @@ class OrbitEquations(Motions):
         return look.small[0]
 
 
-@partial(compiled, options=RUN_SELDOM)
+@compiled_quickly
 def _looked(problem: _Shooting, vary: tuple[str, ...], t, numbers: Unknowns) -> tuple[Array, Array, Array]:
     """R, its slopes by all numbers, and the multipliers."""
     x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
