@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, checked_known, described, largest
+from jourdain_jax.calculus.reals import Number, check_kind, checked_known, described, largest
 
 Numbers = Float[Array, "*batch"]
 
@@ -220,10 +220,11 @@ class Estimate:
             if not np.all(np.isfinite(guess)):
                 raise ValueError(f"`guess` of `Estimate` is {self.guess}, expected a finite number")
             object.__setattr__(self, "guess", tuple(guess.tolist()) if guess.ndim == 1 else float(checked_known(guess, "`guess` of `Estimate`", ())))
-        if self.range is not None and not isinstance(self.range, Range):
-            raise ValueError(f"`range` of `Estimate` is {described(self.range)}, expected `bounds(low, high)`, `positive()` or `unbounded()`")
-        if not isinstance(self.per_run, bool):
-            raise ValueError(f"`per_run` of `Estimate` is {described(self.per_run)}, expected True or False")
+        check_kind(
+            self.range, Range | None, "`range` of `Estimate`",
+            "`bounds(low, high)`, `positive()` or `unbounded()`"
+        )
+        check_kind(self.per_run, bool, "`per_run` of `Estimate`", "True or False")
         if self.prior is not None:
             _check_prior(self.prior)
 

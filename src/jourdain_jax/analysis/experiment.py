@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, holds, is_traced
+from jourdain_jax.calculus.reals import Number, array_module, check_kind, checked_unless_traced, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import as_names, check_names, nearest
@@ -85,8 +85,7 @@ class Experiment(eqx.Module):
         self.ts = vector_of_times(ts)
         _check_times(self.ts)
         for what, part in (("values", values), ("start", start), ("sensors", sensors or {}), ("events", events or {})):
-            if not isinstance(part, Mapping):
-                raise ValueError(f'`{what}` of `Experiment` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
+            check_kind(part, Mapping, f"`{what}` of `Experiment`", 'a dictionary by name, such as {"x": ...}')
         masked = {name for name, x in values.items() if isinstance(x, np.ma.MaskedArray) and x.dtype.kind in "iuf"}
         filled = {name: np.ma.filled(x.astype(float), np.nan) if name in masked else x for name, x in values.items()}
         self.values = _reals("values of channel", filled, "give numbers, NaN where a sample is missing")

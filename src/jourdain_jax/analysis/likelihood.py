@@ -34,7 +34,7 @@ from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Scalar, array_module, compiled, described, holds, is_traced, largest
+from jourdain_jax.calculus.reals import Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -122,8 +122,7 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
     Oddities of a run (`oddities`) cause warnings.
     """
     as_scene(scene)
-    if not isinstance(data, Experiment | Iterable):
-        raise ValueError(f"`data` is {described(data)}, expected an `Experiment` or a sequence of at least one")
+    check_kind(data, Experiment | Iterable, "`data`", "an `Experiment` or a sequence of at least one")
     runs = (data,) if isinstance(data, Experiment) else tuple(data)
     wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)] if runs else ["`data` is empty"]
     if wrong:

@@ -30,7 +30,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, checked_known, checked_real, described, is_traced, real_type
+from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -141,8 +141,7 @@ class Accelerometer(Instrument):
     gravity: Vector3  # m/s^2
 
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
-        if not isinstance(body, str):
-            raise ValueError(f"`body` of `Accelerometer` is {described(body)}, expected the name of a body")
+        check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
         self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice="give three components in the body's frame, m")
         self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
@@ -182,8 +181,7 @@ class LoadCell(Instrument):
     contact: str = eqx.field(static=True)
 
     def __init__(self, contact):
-        if not isinstance(contact, str):
-            raise ValueError(f"`contact` of `LoadCell` is {described(contact)}, expected the name of a contact")
+        check_kind(contact, str, "`contact` of `LoadCell`", "the name of a contact")
         self.contact = contact
 
     def check(self, scene: Scene, channel: str, where: str) -> None:

@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import Number, Scalar, array_module, checked_real, described, holds, is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -247,10 +247,11 @@ class Actuator(eqx.Module):
     hold: bool = eqx.field(static=True)
 
     def __init__(self, command: Sampled, *, gain: Stated = 1.0, bias: Stated = 0.0, delay: Stated = 0.0, lag: Stated = 0.0, hold: bool = False):
-        if not isinstance(command, Sampled):
-            raise ValueError(f"`command` of `Actuator` is {described(command)}, expected `jj.Sampled(ts, values)`")
-        if not isinstance(hold, bool):
-            raise ValueError(f"`hold` of `Actuator` is {described(hold)}, expected True (each value until the next) or False (linear between samples)")
+        check_kind(command, Sampled, "`command` of `Actuator`", "`jj.Sampled(ts, values)`")
+        check_kind(
+            hold, bool, "`hold` of `Actuator`",
+            "True (each value until the next) or False (linear between samples)"
+        )
         self.command, self.hold = command, hold
         self.gain, self.bias, self.delay, self.lag = _checked("Actuator", gain=gain, bias=bias, delay=delay, lag=lag)
 

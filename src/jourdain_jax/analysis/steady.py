@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, compiled_quickly, described, largest, real_type
+from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, check_kind, compiled_quickly, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
@@ -107,8 +107,10 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
     """t, q, u of a guess."""
     if isinstance(guess, State):
         return guess.t, guess.q, guess.u
-    if not isinstance(guess, Mapping):
-        raise ValueError(f"`guess` is {described(guess)}, expected a State or a dictionary of named values; those not named start from zero")
+    check_kind(
+        guess, Mapping, "`guess`",
+        "a State or a dictionary of named values; those not named start from zero"
+    )
     q, u, _ = scene.named(**guess)
     return jnp.asarray(t0, real_type()), q, u
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.reals import described, largest, rank_cutoff
+from jourdain_jax.calculus.reals import check_kind, largest, rank_cutoff
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 
@@ -123,8 +123,7 @@ def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tup
     """Return numbers of the privileged speeds with these names. ValueError for unknown names, and for others
     than `freedoms` speeds.
     """
-    if not isinstance(names, str | Iterable):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(names)}, expected names of speeds")
+    check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
     chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
     if len(set(chosen)) != len(chosen):
         raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(names))}); name independent ones")

@@ -16,7 +16,7 @@ import secrets
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import check_kind
 
 DEEPEST = 250  # levels of what is nested: a chain of so many bodies, as elements of MJCF
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
@@ -116,8 +116,7 @@ _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for
 
 def check_place(path: str | os.PathLike) -> None:
     """Raise a ValueError where a file cannot be written at `path`: its folder does not exist, or it is one itself."""
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    check_kind(path, str | os.PathLike, "`path`", "the name of a file")
     place, folder = os.fspath(path), os.path.dirname(path) or "."
     if not os.path.isdir(folder):
         raise ValueError(f"cannot write `{place}`: there is no folder `{folder}`; make it first")

@@ -189,6 +189,12 @@ def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None
         raise ValueError(f"{what} has shape {array.shape}, expected {expected}; {advice}")
 
 
+def check_kind(value, kind, what: str, expected: str) -> None:
+    """Raise a ValueError that describes a `value` which is no instance of this `kind`, a class or a union of classes."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{what} is {described(value)}, expected {expected}")
+
+
 def described(value) -> str:
     """Return a value in an error message: `None`, the text 'abc', the class `Skate`, a list."""
     if value is None:

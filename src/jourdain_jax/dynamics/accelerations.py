@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, checked_real, described, largest
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, check_kind, checked_real, largest
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
@@ -83,8 +83,10 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         known = reductions(scene)
         check_name(reduction, known, f"unknown reduction `{reduction}`")
         return known[reduction]
-    if not isinstance(reduction, Reduction | GibbsAppell):
-        raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
+    check_kind(
+        reduction, Reduction | GibbsAppell, "`reduction`",
+        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`"
+    )
     chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
     if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
@@ -94,8 +96,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
 
 def as_stabilisation(stabilisation) -> Baumgarte | None:
     """Return the Baumgarte terms, or None; a ValueError for anything else."""
-    if stabilisation is not None and not isinstance(stabilisation, Baumgarte):
-        raise ValueError(f"`stabilisation` is {described(stabilisation)}, expected `jj.Baumgarte(alpha, beta)` or None")
+    check_kind(stabilisation, Baumgarte | None, "`stabilisation`", "`jj.Baumgarte(alpha, beta)` or None")
     return stabilisation
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import check_kind
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_to_others, whatever_dies
@@ -16,8 +16,7 @@ from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     """What `run` takes as its workers; ValueError where `client` is no client of Dask, or the task cannot be sent to another process."""
     distributed = needed("distributed", "a cluster", "cluster")
-    if not isinstance(client, distributed.Client):
-        raise ValueError(f"`client` is {described(client)}, expected a `dask.distributed.Client`")
+    check_kind(client, distributed.Client, "`client`", "a `dask.distributed.Client`")
     sent = sent_to_others(task)
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, described
+from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, check_kind
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
 from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_rows
@@ -85,8 +85,7 @@ def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | Non
     """Return V in J at a `motion`: the potentials of the loads and of the scene. `loads`: the scene's loads
     at this motion, if already known.
     """
-    if not isinstance(motion, Motion):
-        raise ValueError(f"`motion` is {described(motion)}, expected a motion, such as `jj.motion_at(scene, t, q, u)`")
+    check_kind(motion, Motion, "`motion`", "a motion, such as `jj.motion_at(scene, t, q, u)`")
     V = jnp.zeros_like(motion.t)
     for load in loads_of(scene, motion) if loads is None else loads:
         if load.potential is not None:

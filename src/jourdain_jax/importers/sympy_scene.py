@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import Scalar, checked_real, described, largest, real_type
+from jourdain_jax.calculus.reals import Scalar, check_kind, checked_real, largest, real_type
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
@@ -122,8 +122,7 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81}, name="Pendulum")
         print(jj.simulate(Pendulum(), {"q": 0.3}, t1=1.0))
     """
-    if not isinstance(values, Mapping | None):
-        raise ValueError(f"`values` is {described(values)}, expected a dictionary: symbol -> number")
+    check_kind(values, Mapping | None, "`values`", "a dictionary: symbol -> number")
     checked = {str(x): float(checked_real(value, f"value of `{x}`", (), advice="give one number")) for x, value in (values or {}).items()}
     return _scene_class(*poses_of(mechanical_system(system, origin, checked)), name)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import check_kind, described
 from jourdain_jax.importers.formulas import sympy_package
 
 
@@ -64,8 +64,10 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
         raise ValueError(
             f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
         )
-    if not isinstance(origin, mechanics.Point):
-        raise ValueError(f"`origin` is {described(origin)}, expected the point of SymPy that is the origin of positions, such as Point('O')")
+    check_kind(
+        origin, mechanics.Point, "`origin`",
+        "the point of SymPy that is the origin of positions, such as Point('O')"
+    )
     frame, rates, loads, *several = read(system)
     q, u, bodies, configuration, velocity, auxiliary = map(tuple, several)
     pairs = tuple((load[0], load[1]) for load in loads)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes, shortened
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import check_kind
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.names import as_labels, check_name, nearest
@@ -40,8 +40,7 @@ class XmlFile:
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
         """The file at `path`, or the text itself; `table`: what elements may hold, the root first. ValueError where it cannot be read or holds more."""
-        if not isinstance(path, str | os.PathLike):
-            raise ValueError(f"`path` is {described(path)}, expected the path of a {format_name} file, or its text")
+        check_kind(path, str | os.PathLike, "`path`", f"the path of a {format_name} file, or its text")
         self.ignore, self.table = as_labels(ignore), table
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
         self.source = f"the {format_name} text" if text is not None else str(path)

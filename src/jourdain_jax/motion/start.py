@@ -15,7 +15,7 @@ import numpy as np
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Number, Numbers, at_once, compiled_quickly, described, is_traced, known_numbers, nothing_is_traced
+from jourdain_jax.calculus.reals import Number, Numbers, at_once, check_kind, compiled_quickly, described, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -100,8 +100,7 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
     model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
-    if near is not None and not isinstance(near, Mapping):
-        raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
+    check_kind(near, Mapping | None, "`near`", 'a dictionary of coordinates: near={"z": -0.4}')
     t = one_time(t0)
     with model.standing_in:
         return named_start(model, {**(given or {}), **values}, t, inputs_at(model.inputs(inputs), t), near=near or {})

@@ -11,7 +11,7 @@ import numpy as np
 from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.figures import pyplot
 from jourdain_jax.calculus.files import check_place
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import check_kind, described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -146,8 +146,7 @@ def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
     """Return name -> unit and its size in SI; KeyError for an unknown name, ValueError for an unknown unit,
     or one of something else.
     """
-    if not isinstance(units, Mapping | None):
-        raise ValueError(f'`units` is {described(units)}, expected a dictionary from names to units, such as {{"lean": "deg"}}')
+    check_kind(units, Mapping | None, "`units`", 'a dictionary from names to units, such as {"lean": "deg"}')
     kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
     kinds |= dict.fromkeys(ENERGIES, "energy") | {"t": "time"}
     found = {"t": ("s", 1.0)}

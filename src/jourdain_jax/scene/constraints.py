@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.held_rows import HeldRow
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
@@ -66,7 +66,6 @@ def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_seco
     identity by default). The rotation rows are `vee` of the antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.
     """
     for body, which in ((first, "first"), (second, "second")):
-        if not isinstance(body, BodyPose):
-            raise ValueError(f'the {which} body of a weld is {described(body)}, expected the pose of a body; write pose["name"]')
+        check_kind(body, BodyPose, f"the {which} body of a weld", 'the pose of a body; write pose["name"]')
     turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
     return jnp.concatenate([second.place(at_second) - first.place(at_first), vee(turn.T @ first.orientation.T @ second.orientation)])

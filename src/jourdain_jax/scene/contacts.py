@@ -11,7 +11,7 @@ from typing import Any, TypedDict, Unpack, get_args
 import equinox as eqx
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Parameter, Scalar, Vector, Vector3, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.grounds import Ground, Plane
@@ -78,8 +78,7 @@ class Contact(eqx.Module):
         self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
     ):
         """A contact of the `body` at its `point` with the tangent `plane` of a ground."""
-        if not isinstance(body, BodyPose | str):
-            raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
+        check_kind(body, BodyPose | str, "the body of a contact", 'the pose of a body; write pose["name"]')
         self.body = body if isinstance(body, str) else body.name
         if plane is not None and not isinstance(plane, Plane):
             advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
@@ -198,8 +197,7 @@ def rolling(
     arguments: as in `ball_contact`.
     """
     _checked_height(height)
-    if not isinstance(body, BodyPose):
-        raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
+    check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
         raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
     ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Speeds, described, real_type
+from jourdain_jax.calculus.reals import Speeds, check_kind, described, real_type
 from jourdain_jax.calculus.rotations import quaternion_rate
 from jourdain_jax.scene.names import Named, check_name
 
@@ -83,8 +83,7 @@ def quaternion(name: str) -> Quaternion:
 
     The speeds are the body components of the angular velocity (rad/s), `d name/dt = 1/2 name (0, omega)`.
     """
-    if not isinstance(name, str):
-        raise ValueError(f"the name of a quaternion is {described(name)}, expected a text, such as jj.quaternion('attitude')")
+    check_kind(name, str, "the name of a quaternion", "a text, such as jj.quaternion('attitude')")
     return Quaternion(name)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import described, has_unit, known_numbers
+from jourdain_jax.calculus.reals import check_kind, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.names import as_names, check_names
@@ -53,10 +53,11 @@ def check_description(scene, base: Any) -> None:
         raise ValueError(misspelt)
     for what in ("speeds", "inputs"):
         names = getattr(scene, what)
-        if names is not None and not isinstance(names, Names):
-            raise ValueError(f"`{what}` of `{kind.__name__}` is {described(names)}, expected names; write {what} = jj.{what}('a b c')")
-    if not isinstance(scene.modes, Modes):
-        raise ValueError(f"`modes` of `{kind.__name__}` is {described(scene.modes)}, expected jj.modes(gear=('first', 'second'))")
+        check_kind(
+            names, Names | None, f"`{what}` of `{kind.__name__}`",
+            f"names; write {what} = jj.{what}('a b c')"
+        )
+    check_kind(scene.modes, Modes, f"`modes` of `{kind.__name__}`", "jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
             f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but not the rates of its coordinates; "
@@ -142,6 +143,5 @@ def _is_ordered(pair: np.ndarray) -> bool:
 
 
 def _check_keys(kind: type, what: str, given, valid) -> None:
-    if not isinstance(given, dict):
-        raise ValueError(f"`{what}` of `{kind.__name__}` is {described(given)}, expected a dictionary of coordinate or speed names")
+    check_kind(given, dict, f"`{what}` of `{kind.__name__}`", "a dictionary of coordinate or speed names")
     check_names(as_names(given), valid, f"`{what}` of `{kind.__name__}` names `{{}}`, which is not a coordinate or speed")

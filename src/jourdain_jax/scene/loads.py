@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Scalar, Vector3, checked_real, described
+from jourdain_jax.calculus.reals import Scalar, Vector3, check_kind, checked_real, described
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import check_names
 
@@ -48,8 +48,7 @@ class Gravity(Load):
 def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
     if parts is None:
         return {}
-    if not isinstance(parts, dict):
-        raise ValueError(f'`{kind}` of a load is {described(parts)}, expected a dictionary by name, such as {{"disc": force}}')
+    check_kind(parts, dict, f"`{kind}` of a load", 'a dictionary by name, such as {"disc": force}')
     return {name: checked_real(value, f"load on `{name}`") for name, value in parts.items()}
 
 
@@ -128,8 +127,7 @@ def _motion(motion: Motion, what: str) -> Motion:
 
 
 def _as_point(point: Point, what: str) -> Point:
-    if not isinstance(point, Point):
-        raise ValueError(f'{what} is {described(point)}, expected a point: motion["name"].point(local) or jj.fixed_point(position)')
+    check_kind(point, Point, what, 'a point: motion["name"].point(local) or jj.fixed_point(position)')
     return point
 
 

@@ -10,7 +10,7 @@ from typing import get_args
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, checked_real, described
+from jourdain_jax.calculus.reals import Scalar, check_kind, checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.held_rows import HeldRow, JointFriction, held_rows
@@ -30,8 +30,10 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
     if not bodies:
         raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such as {{"disc": jj.RigidBody(...)}}')
     for name, body in bodies.items():
-        if not isinstance(body, get_args(Body)):
-            raise ValueError(f"body `{name}` of `{_name(scene)}` is {described(body)}, expected a `jj.Particle` or a `jj.RigidBody`")
+        check_kind(
+            body, get_args(Body), f"body `{name}` of `{_name(scene)}`",
+            "a `jj.Particle` or a `jj.RigidBody`"
+        )
     return bodies
 
 
@@ -59,8 +61,7 @@ def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
 
 def _checked_load(scene: Scene, i: int, load) -> Load:
     where = f"load {i} of `{_name(scene)}`"
-    if not isinstance(load, Load):
-        raise ValueError(f"{where} is {described(load)}, expected a load, such as jj.point_force(...) or jj.Load(forces=...)")
+    check_kind(load, Load, where, "a load, such as jj.point_force(...) or jj.Load(forces=...)")
     if isinstance(load, JointFriction):
         _declared(scene, load.rows, "loads", "joint_friction")
         return load
@@ -122,8 +123,10 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     """Rolling contacts by name."""
     contacts = _dictionary(scene, "contacts", (pose,), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
-        if not isinstance(contact, Contact):
-            raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or another contact")
+        check_kind(
+            contact, Contact, f"contact `{name}` of `{_name(scene)}`",
+            "a `jj.disc_contact(...)` or another contact"
+        )
         if (contact.friction is not None) != (name in scene.switching.contacts):
             raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside the method `contacts`; state `friction=` in that method")
     return contacts
@@ -136,8 +139,7 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
         event, where = given if isinstance(given, Event) else Event(given, stop=True), f"event `{name}` of `{_name(scene)}`"
         for what, changed in (("to", event.to), ("jump", event.jump)):
-            if not isinstance(changed, Mapping):
-                raise ValueError(f"`{what}` of {where} is {described(changed)}, expected a dictionary by name")
+            check_kind(changed, Mapping, f"`{what}` of {where}", "a dictionary by name")
         if event.stop and (event.to or event.jump):
             raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, or `stop`")
         check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")

@@ -190,23 +190,23 @@ def summary(trajectory: Record, message: str) -> str:
     rows = [
         ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}{lost}"),
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
-        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + left)] if int(trajectory.fallback) else []),
+        ("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + left if int(trajectory.fallback) else ""),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
-        *([("dense", dense)] if dense else []),
-        *([("relations", f"{int(trajectory.crossings)} crossings")] if int(trajectory.crossings) > 0 else []),
-        *([("relations", f"not watched: {trajectory.unwatched}")] if trajectory.unwatched else []),
-        *([("phases", _phases_text(trajectory))] if trajectory.phases.ts.size else []),
+        ("dense", dense),
+        ("relations", f"{int(trajectory.crossings)} crossings" if int(trajectory.crossings) > 0 else ""),
+        ("relations", f"not watched: {trajectory.unwatched}" if trajectory.unwatched else ""),
+        ("phases", _phases_text(trajectory) if trajectory.phases.ts.size else ""),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
         ("start", f"put onto the rows: coordinates changed by {moved[0]:.1e}, speeds by {moved[1]:.1e}; named values are kept"),
-        *([("inputs", ", ".join(inputs))] if inputs else []),
+        ("inputs", ", ".join(inputs)),
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     rows += [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join([f"Trajectory of {type(trajectory.scene).__name__}", *(f"  {name:<{width}}  {text}" for name, text in rows)])
+    width = max(len(name) for name, text in rows if text)
+    return "\n".join([f"Trajectory of {type(trajectory.scene).__name__}", *(f"  {name:<{width}}  {text}" for name, text in rows if text)])
 
 
 def _phases_text(trajectory: Record) -> str:

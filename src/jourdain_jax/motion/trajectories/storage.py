@@ -31,7 +31,7 @@ import numpy as np
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import described, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import check_kind, described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
@@ -219,8 +219,7 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
     """Header and arrays of a file of this kind, and the class of its scene."""
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    check_kind(path, str | os.PathLike, "`path`", "the name of a file")
     what = f"{kind} file written by `save`"
     try:
         with open(path, "rb") as file:

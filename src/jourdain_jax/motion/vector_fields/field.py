@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import event_resets, event_values, stored_by_inputs
-from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, described
+from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, check_kind, described
 from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -85,8 +85,10 @@ def as_formulation(formulation) -> Formulation:
     """Return the formulation, the default one for None; ValueError for anything else."""
     if formulation is None:
         return _DEFAULT
-    if not isinstance(formulation, Formulation):
-        raise ValueError(f"`formulation` is {described(formulation)}, expected `jj.Formulation(state, reduction, stabilisation)` or None")
+    check_kind(
+        formulation, Formulation, "`formulation`",
+        "`jj.Formulation(state, reduction, stabilisation)` or None"
+    )
     return formulation
 
 
