@@ -22,11 +22,12 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
 from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.calculus.reals import Entries, Scalar
 
 SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
-def chain(weight: Float[Array | np.ndarray, "times *rest"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Return for each sample of a channel the time index of its last present predecessor (itself if there is
     none), and the time between, s.
 
@@ -126,7 +127,7 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
-def log_density(r, weight, ts, tau) -> Float[Array, ""]:
+def log_density(r, weight, ts, tau) -> Scalar:
     """Logarithm of the density of `r` in units of sigma, `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`, without `log(sigma sqrt(2 pi))`; on JAX arrays.
 
     r, weight: (times, *channel); a weight of zero marks a sample that is missing.

@@ -32,7 +32,7 @@ from jourdain_jax.analysis.runs import run_of
 from jourdain_jax.analysis.spread import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.calculus.reals import described, largest
+from jourdain_jax.calculus.reals import Entries, described, largest
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import moving_jumps
@@ -42,8 +42,10 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
+Sentences = tuple[str, ...]
 
-def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[str, ...]:
+
+def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentences:
     """Return one sentence for each run whose motion, with these unknowns, meets an event before a sample that
     counts, or not the one that was observed, or crosses a jump of its loads.
     """
@@ -86,7 +88,7 @@ class Statistics:
     """Statistics of a minimum, besides its location."""
 
     scene: Scene  # with the estimates
-    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
+    starts: tuple[dict[str, Float[Entries, "..."]], ...]  # initial values of each run, with the estimates
     sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
     standard_errors: PerUnknown  # NaN where not identifiable
     low: PerUnknown  # ends of the 95 % intervals; NaN where not identifiable
@@ -98,15 +100,15 @@ class Statistics:
     whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # residuals, where their noise has a memory less what the sample before foretells
     sigma: dict[str, PerRepeat]  # of channels whose noise was estimated
     correlation_time: dict[str, PerRepeat]  # s, of channels where they were estimated; near zero: white
-    untold: tuple[str, ...]  # channels that do not tell their sigma, in any repeat
+    untold: Sentences  # channels that do not tell their sigma, in any repeat
     chi_square: PerRepeat  # sum of squared whitened residuals; NaN where the motion fails
     samples: Counts  # with a finite sigma
     degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
     of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
     from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
-    oddities: tuple[str, ...]  # sentences about what is odd in the runs
-    events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
-    too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
+    oddities: Sentences  # sentences about what is odd in the runs
+    events_met: Sentences  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
+    too_narrow: Sentences  # sentences about intervals that bounds make too narrow; none in a batch
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
@@ -293,14 +295,14 @@ class Estimates(Printed):
         return f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to {'this' if self.agreeing else 'a'} minimum"
 
     @property
-    def not_identifiable(self) -> tuple[str, ...]:
+    def not_identifiable(self) -> Sentences:
         """Undetermined combinations of unknowns, one sentence each."""
         if not np.isfinite(self.chi_square):
             return ()
         return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
 
     @property
-    def correlated(self) -> tuple[str, ...]:
+    def correlated(self) -> Sentences:
         """Pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first, one sentence each."""
         some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
         found = np.triu(self.correlation[np.ix_(some, some)], 1)
@@ -312,14 +314,14 @@ class Estimates(Printed):
         )
 
     @property
-    def weak(self) -> tuple[str, ...]:
+    def weak(self) -> Sentences:
         """Poorly determined shared unknowns and combinations, with a relative standard error of 0.1 or more,
         weakest first, one sentence each.
         """
         return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
 
     @property
-    def impossible(self) -> tuple[str, ...]:
+    def impossible(self) -> Sentences:
         """Bodies of the fitted scene that no distribution of mass can make, one sentence each."""
         q, _, _ = self.scene.named(**self.starts[0])
         return impossible_bodies(self.scene, q)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Number, array_module, check_kind, checked_unless_traced, holds, is_traced
+from jourdain_jax.calculus.reals import Entries, Number, array_module, check_kind, checked_unless_traced, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import as_names, check_names, nearest
@@ -62,8 +62,8 @@ class Experiment(eqx.Module):
     readings: dict[str, Reading]  # the sensors made ready; none before the run is `checked`, as of the next two
     drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
-    t0: Float[Array | np.ndarray, ""]  # s
-    correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
+    t0: Float[Entries, ""]  # s
+    correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
     unknown_correlation: tuple[str, ...] = eqx.field(static=True)  # channels
     ended_by: str = eqx.field(static=True)  # the event whose time was observed, among the channels; empty: none

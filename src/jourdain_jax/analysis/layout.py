@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import described, largest, real_type
+from jourdain_jax.calculus.reals import Entries, described, largest, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
@@ -104,7 +104,7 @@ class BodyInertia:
         l = [A[i, j] / A[j, j] for i, j in (_PRODUCTS[k] for k in self.products)]
         return D[np.array([self.axes.index(k) for k in range(max(self.axes) + 1)])], jnp.stack(l) if l else jnp.zeros(0, D.dtype)
 
-    def values(self, D: Float[Array | np.ndarray, "*members moments"], l: Float[Array | np.ndarray, "*members shears"]) -> list[Float[Array, "*members"]]:
+    def values(self, D: Float[Entries, "*members moments"], l: Float[Entries, "*members shears"]) -> list[Float[Array, "*members"]]:
         """Return the parameter of every entry."""
 
         def inertia(D, l):
@@ -291,7 +291,7 @@ class Layout:
         """Names of the dependent parameters: moments of inertia of bodies, and tied ones."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
 
-    def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
+    def scene(self, scene: Scene, shared: Float[Entries, "*members shared"]) -> Scene:
         """Return the scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
         found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))  # which leaf each parameter is
@@ -312,7 +312,7 @@ class Layout:
             found[getattr(names, tie.name)] = function(found)
         return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)])
 
-    def start(self, start: dict, *vectors: Float[Array | np.ndarray, "*members _"]) -> dict:
+    def start(self, start: dict, *vectors: Float[Entries, "*members _"]) -> dict:
         """Return the start of a run for these shared unknowns and its own."""
         return start | {name: x for name, x in self._of_kind("start", vectors) if name in start}
 

@@ -34,7 +34,7 @@ from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest
+from jourdain_jax.calculus.reals import Entries, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -203,7 +203,7 @@ class PlannedInformation(Printed, eqx.Module):
     """The information of planned runs about each unknown. `print` shows the expected standard errors."""
 
     matrix: Matrix  # F, in the units of the unknowns
-    values: Float[Array | np.ndarray, "unknowns"]  # at which it is taken
+    values: Float[Entries, "unknowns"]  # at which it is taken
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
     labels: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
@@ -329,7 +329,7 @@ def _sensitivities(
     return flat.T @ flat, J
 
 
-def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
+def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Entries, "places"]:
     """Return all unknowns at the values of the scene and the runs; parameters and starts may be traced."""
     (shared, local), layout = unknowns.split(unknowns.guess), unknowns.layout
     of_bodies = {label: x for body in layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}

@@ -42,6 +42,8 @@ from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
 
+Names = tuple[str, ...]
+
 
 class Modes(eqx.Module):
     """Free small motions `p(t) = shape exp(s t)`, one column per mode; the largest entry of a shape is 1."""
@@ -51,10 +53,10 @@ class Modes(eqx.Module):
     left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
     condition: Float[Array, "modes"]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
     scene: Scene
-    named: tuple[str, ...] | None = eqx.field(static=True)
+    named: Names | None = eqx.field(static=True)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the modes, in the order of the eigenvalues."""
         return mode_names(self.scene, self.named, np.asarray(self.eigenvalues))
 
@@ -72,9 +74,9 @@ class Linearization(Printed, eqx.Module):
     residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
     coupling: Scalar  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
     pivot: Scalar  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
-    states: tuple[str, ...] = eqx.field(static=True)  # names of the entries of x
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    coordinates: tuple[str, ...] = eqx.field(static=True)  # names of p
+    states: Names = eqx.field(static=True)  # names of the entries of x
+    inputs: Names = eqx.field(static=True)
+    coordinates: Names = eqx.field(static=True)  # names of p
     about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
 
     def _text(self) -> str:
@@ -102,7 +104,7 @@ class Linearization(Printed, eqx.Module):
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
         return _roots(self._companion())
 
-    def modes(self, names: tuple[str, ...] | None = None) -> Modes:
+    def modes(self, names: Names | None = None) -> Modes:
         """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative).
 
         `names`: of the modes in this order; default: the `mode_names` of the scene, or "mode 1", ...
@@ -110,7 +112,7 @@ class Linearization(Printed, eqx.Module):
         values, shapes, left, condition = _decomposed(self)
         return Modes(values, shapes, left, condition, self.about[0], names)
 
-    def sensitivities(self, mode: str, held: str | tuple[str, ...] = (), names: tuple[str, ...] | None = None) -> Sensitivities:
+    def sensitivities(self, mode: str, held: str | Names = (), names: Names | None = None) -> Sensitivities:
         """Return derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every
         parameter, as machine code: `small.sensitivities("weave")["c"]`.
 
@@ -143,11 +145,11 @@ class Linearization(Printed, eqx.Module):
 def linearize(
     scene: Scene | BuiltFor,
     state: State | dict | None,
-    coordinates: str | tuple[str, ...] | None = None,
+    coordinates: str | Names | None = None,
     *,
     inputs: Numbers | dict | None = None,
-    dependent: str | tuple[str, ...] | None = None,
-    privileged: str | tuple[str, ...] | None = None,
+    dependent: str | Names | None = None,
+    privileged: str | Names | None = None,
 ) -> Linearization:
     """Linearise the equations of motion about a steady `state`, with the residual of its steadiness.
 
@@ -207,7 +209,7 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
         warn(text, SensitivityWarning)
 
 
-def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[str, ...] | None, coordinates: tuple[str, ...] | None) -> Linearization:
+def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: Names | None, coordinates: Names | None) -> Linearization:
     v, D, mass = instant(scene, state.t, state.q, state.u, f)
     at, names = places_of(scene), perturbed_names(scene)
     q, known = state.q, not is_traced((D, state))
@@ -224,7 +226,7 @@ def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent
     return Linearization(**matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f))
 
 
-def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]) -> dict:
+def _matrices(scene: Scene, q, v, D, mass, independent: Names, y: tuple[int, ...], coordinates: Names) -> dict:
     """Return the contents of `Linearization`."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
@@ -249,7 +251,7 @@ def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tupl
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 
-def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coordinates: tuple[str, ...]):
+def _second_order(scene: Scene, A, B, mass, independent: Names, y, coordinates: Names):
     """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass` is that of the
     privileged speeds.
     """
@@ -303,7 +305,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
     return scene.speed_names.entries.index(speed)
 
 
-def _speeds_beside(scene: Scene, y, coordinates: tuple[str, ...]) -> np.ndarray:
+def _speeds_beside(scene: Scene, y, coordinates: Names) -> np.ndarray:
     """Return positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was

@@ -22,6 +22,8 @@ from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
+Names = tuple[str, ...]
+
 AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", "affine", "worst_pivot", "typical_pivot", "rank_losses")
 
 
@@ -37,32 +39,32 @@ class Report(Printed):
     """
 
     scene: str
-    coordinates: tuple[str, ...]
-    speeds: tuple[str, ...]
+    coordinates: Names
+    speeds: Names
     degrees_of_freedom: int
-    rows: tuple[str, ...]
+    rows: Names
     rank: int  # of the rows at generic states
-    redundant_rows: tuple[str, ...]  # may be omitted together; the others keep the rank at every probed state
-    integrable_rows: tuple[str, ...]  # holonomic by themselves
-    nonholonomic_rows: tuple[str, ...]  # by themselves
+    redundant_rows: Names  # may be omitted together; the others keep the rank at every probed state
+    integrable_rows: Names  # holonomic by themselves
+    nonholonomic_rows: Names  # by themselves
     frobenius_violations: dict[str, float]  # relative
     growth_vector: tuple[int, ...]  # empty for rows nonlinear in the speeds
     closed: bool  # further brackets bring nothing new
     bracket_depth: int
     holonomic_rows_together: int | None  # None where the growth vector is not closed
     rheonomic: bool  # anything depends on time by itself
-    depends_on_time: tuple[str, ...]  # what: rows, poses, inertias, coordinate rates, loads, potential
+    depends_on_time: Names  # what: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # rows are linear or affine in the speeds
-    cyclic_coordinates: tuple[str, ...]  # of dependent rates; they appear in no equation
-    ignorable_coordinates: tuple[str, ...]  # no privileged acceleration depends on them
-    privileged_velocities: tuple[str, ...]
+    cyclic_coordinates: Names  # of dependent rates; they appear in no equation
+    ignorable_coordinates: Names  # no privileged acceleration depends on them
+    privileged_velocities: Names
     privileged_by_user: bool
     lowering: str  # operations of the scalar program, and whether and how it is integrated, or why there is none
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
-    rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
+    rank_losses: Names  # probed configurations where the rows lose rank
     rank_at_start: int | None  # at the given start, or at the scene's example where that has another rank; None otherwise
-    events: tuple[str, ...]  # names
+    events: Names  # names
     domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
     conventions: str
 
@@ -192,7 +194,7 @@ def _span(bounds: tuple[float, float]) -> str:
     return f"{bounds[0]:.4g} to {bounds[1]:.4g}"
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def _listed(names: Names) -> str:
     return f"{len(names)}: {', '.join(names)}" if names else "none"
 
 

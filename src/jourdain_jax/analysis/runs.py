@@ -31,6 +31,7 @@ from jourdain_jax.analysis.quantities import Channel, StopEvent
 from jourdain_jax.analysis.sensors import Drive, Numbers, Reading, Times, grid, ideal, intervals, with_numbers
 from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
 from jourdain_jax.build.structure import Reference
+from jourdain_jax.calculus.reals import Entries, Scalar
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate
@@ -41,16 +42,16 @@ from jourdain_jax.scene.scene import Scene
 class Run(NamedTuple):
     """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
 
-    t0: Float[Array | np.ndarray, ""]
+    t0: Float[Entries, ""]
     ts: Times
-    grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is computed there
+    grid: Float[Entries, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is computed there
     values: dict[str, Numbers]
     weights: dict[str, Numbers]
     start: dict[str, Numbers]
     inputs: dict | Inputs | None
     sensors: dict[str, Reading]
     drives: dict[str, Drive]
-    correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
+    correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory
 
     def motion(self, scene: Scene, simulate: Callable, ts, options: AllOptions) -> Trajectory:
         """Return the motion at these times."""
@@ -80,7 +81,7 @@ class Run(NamedTuple):
             found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
         return found | ended(motion, filters, self.start, ts)
 
-    def stops(self, event: StopEvent, name: str, motion: Callable) -> Float[Array, ""]:
+    def stops(self, event: StopEvent, name: str, motion: Callable) -> Scalar:
         """When the motion stops at the event whose time is the channel `name`; samples may end long before it."""
         observed = jnp.max(jnp.where(self.weights[name] > 0, self.values[name] - self.t0, 0.0))
         return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))

@@ -33,14 +33,14 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type
+from jourdain_jax.calculus.reals import Entries, Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
 
 FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
-Numbers = Float[Array | np.ndarray, "..."]
-Times = Float[Array | np.ndarray, "times"]
+Numbers = Float[Entries, "..."]
+Times = Float[Entries, "times"]
 Knots = Float[Array, "knots"]
 Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
@@ -61,7 +61,7 @@ def intervals(t0, ts: Times, node) -> int:
     return int(np.ceil(count * float((ts[-1] - t0) / (end - t0)) - 1e-9))
 
 
-def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "grid"]:
+def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
     """Return so many intervals up to the last sample; those of a piece continue for at most one more, so that
     its next `node` is one of the times.
     """
@@ -88,13 +88,13 @@ _NODES, _WEIGHTS = gauss_legendre(10)
 
 
 def read(
-    values: Float[Array | np.ndarray, "grid *channel"],
-    grid: Float[Array | np.ndarray, "grid"],
+    values: Float[Entries, "grid *channel"],
+    grid: Float[Entries, "grid"],
     ts: Times,
     delay,
     lag=None,
     begin: Float[Array, "entries"] | None = None,
-) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"]]:
+) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"]]:
     """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s, at equal
     intervals, six or more), and y there; `lag` None: no lag.
 
@@ -327,7 +327,7 @@ class Reading(Response):
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
-    def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"] | None]:
+    def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
         """Return the reading at `ts` of a quantity with values `x` at these times, or on a grid; and y on the
         grid, from the initial value (None: at rest).
         """

@@ -30,6 +30,8 @@ from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, 
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
 
+SparseRows = list[dict[int, int]]  # of each row: variable -> node of its slope
+
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
 # What poses and rows decide, and a motion can hardly be integrated without: where calls compute it, states far off are asked. Of loads nothing is believed.
@@ -64,10 +66,10 @@ class LookedAt:
     """The graph of a class of scenes, with the probed quantities as nodes."""
 
     traced: TracedScene
-    rows: list[dict[int, int]]  # d phi/du, each row by the nodes of the speeds
-    velocities: list[dict[int, int]]  # d (v, omega)/du
+    rows: SparseRows  # d phi/du, each row by the nodes of the speeds
+    velocities: SparseRows  # d (v, omega)/du
     closures: list[int]  # geometric rows and unit norms
-    of_closures: list[dict[int, int]]  # their derivatives with respect to q
+    of_closures: SparseRows  # their derivatives with respect to q
     # what may be zero everywhere: "rows at rest" and "motion at rest" (velocities and rates of coordinates), at u = 0; rates in time by `TIMED`, while
     # coordinates, speeds and inputs are held (for loads and potentials: the motion); rates of the "inertia" along the motion, and along a generic change of
     # the inputs those of "rows of inputs", and of each load's potential, "potential 0", ...
@@ -118,7 +120,7 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
     return np.isin(nodes.traced.q, [n for row in nodes.of_closures for n in row])
 
 
-def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: list[dict[int, int]]) -> frozenset[str]:
+def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
     """Return the quantities that pass an operation of these kinds; "rank" for constraints, "nonlinear" for
     constraints with the speeds.
     """
@@ -212,7 +214,7 @@ class _AtStates:
         """Return numbers in the precision in use; probes are computed in double precision."""
         return np.asarray(x, real_type())
 
-    def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:
+    def _matrices(self, probes: Probes, entries: SparseRows, columns: list[int]) -> np.ndarray:
         """Return matrices with these entries by row, with a leading axis of states."""
         place = {n: k for k, n in enumerate(columns)}
         found = np.zeros((probes.count, len(entries), len(columns)))

@@ -24,6 +24,8 @@ from jourdain_jax.scene.identity import once_per_class, with_reference_parameter
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
+Matrix = dict[tuple[int, int], int]  # row and column -> node, of entries that are not zero
+
 
 @dataclass(frozen=True, eq=False)
 class RowProgram:
@@ -36,10 +38,10 @@ class RowProgram:
     u: tuple[int, ...]
     inputs: tuple[int, ...]
     g: tuple[int, ...]
-    G: dict[tuple[int, int], int]
+    G: Matrix
     phi: tuple[int, ...]
-    A: dict[tuple[int, int], int]
-    M: dict[tuple[int, int], int] | None  # lower triangle; None where it is too large to be written out
+    A: Matrix
+    M: Matrix | None  # lower triangle; None where it is too large to be written out
     right: int  # whether parameters and bodies are
     others: tuple[int, ...]  # coordinates of other states, projected onto the geometric rows, on which that depends too
 
@@ -117,12 +119,12 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     return node, given if any(depend_on(g, [node], given)) else []
 
 
-def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int, int], int]:
+def _entries(rows: list[dict[int, int]], variables: list[int]) -> Matrix:
     place = {n: k for k, n in enumerate(variables)}
     return {(i, place[n]): node for i, row in enumerate(rows) for n, node in row.items()}
 
 
-def _mass_matrix(nodes: LookedAt, u: list[int]) -> dict[tuple[int, int], int] | None:
+def _mass_matrix(nodes: LookedAt, u: list[int]) -> Matrix | None:
     """`M = d^2 T/du^2`, the lower triangle."""
     # products of entries of velocities: beyond, the mass matrix is not written out
     if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:

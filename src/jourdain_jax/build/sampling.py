@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jourdain_jax.build.assembling import Assembled, coordinate_bounds, random_states
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
-from jourdain_jax.calculus.reals import array_module, checked_whole
+from jourdain_jax.calculus.reals import Entries, array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 
@@ -70,7 +70,7 @@ def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> It
         yield t, vectors_named(scene, scene.example)[0] + near[:, None] * (q - (low + high) / 2), u
 
 
-def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
+def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
     """Yield configurations near q: of the `states` on the constraints (nearest in coordinates that are not
     `free` first), and elsewhere in the domain.
     """

@@ -28,6 +28,8 @@ from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 
+Names = tuple[str, ...]
+
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 
@@ -36,28 +38,28 @@ WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all pr
 class Structure:
     """Static facts about a scene."""
 
-    row_names: tuple[str, ...]
+    row_names: Names
     rank: int  # of the rows at generic states
     ranks: tuple[int, ...]  # at all probed states
-    redundant_rows: tuple[str, ...]  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: tuple[str, ...]  # those of them that no identity makes follow from the others: they may not, where no probe lies
-    rank_losses: tuple[str, ...]  # configurations among the probed ones with fewer independent rows, as text
+    redundant_rows: Names  # may be omitted together: the others keep the rank at every probed state
+    may_set_in: Names  # those of them that no identity makes follow from the others: they may not, where no probe lies
+    rank_losses: Names  # configurations among the probed ones with fewer independent rows, as text
     independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
     typical_pivot: float  # its median
     affine: bool  # rows are linear or affine in the speeds
     homogeneous: bool  # phi vanishes at u = 0
-    timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
+    timed: Names  # what depends on time by itself, out of `TIMED`
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
-    kinks: tuple[str, ...]  # what is not smooth, as sentences
-    odd_bodies: tuple[str, ...]  # bodies with moments of inertia that no distribution of mass has
-    odd_grounds: tuple[str, ...]  # grounds of contacts that move in another way than is stated
-    faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
+    kinks: Names  # what is not smooth, as sentences
+    odd_bodies: Names  # bodies with moments of inertia that no distribution of mass has
+    odd_grounds: Names  # grounds of contacts that move in another way than is stated
+    faults: Names  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows

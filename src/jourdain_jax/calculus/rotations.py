@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from jourdain_jax.calculus.reals import Matrix3, Number, Scalar, Vector, Vector3, checked_real, holds
+from jourdain_jax.calculus.reals import Entries, Matrix3, Number, Scalar, Vector, Vector3, checked_real, holds
 
 Attitude = Float[Array, "4"]
 
@@ -79,7 +79,7 @@ def vee(S: Matrix3) -> Vector3:
     return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
 
 
-def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Matrix3:
+def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> Matrix3:
     """Return the rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero
     (the formula divides by the squared norm).
 

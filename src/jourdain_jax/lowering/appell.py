@@ -24,6 +24,7 @@ from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import Accelerations, projected_coordinates
 from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian, matrix
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import NodeList
 from jourdain_jax.program.identity_test import equal, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
@@ -50,17 +51,17 @@ class Strategy:
 class Equations:
     """Nodes of the rates of the minimal state."""
 
-    qdot: list[int]
-    ydot: list[int]
-    z: list[int]  # the dependent speeds
-    pivots: list[int]  # must not vanish
-    guards: list[int] = field(default_factory=list)  # must stay positive
+    qdot: NodeList
+    ydot: NodeList
+    z: NodeList  # the dependent speeds
+    pivots: NodeList  # must not vanish
+    guards: NodeList = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`
-    events: list[int] = field(default_factory=list)  # values of the stop events
-    resets: list[int] = field(default_factory=list)  # of each: coordinates, speeds of the state and modes after it, and what loads store then
-    energies: list[int] = field(default_factory=list)  # kinetic and potential
-    directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
-    squares: list[int] = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
+    events: NodeList = field(default_factory=list)  # values of the stop events
+    resets: NodeList = field(default_factory=list)  # of each: coordinates, speeds of the state and modes after it, and what loads store then
+    energies: NodeList = field(default_factory=list)  # kinetic and potential
+    directions: NodeList = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
+    squares: NodeList = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
 
 
 class AppellOnGraph:
@@ -110,7 +111,7 @@ class AppellOnGraph:
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
         return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares)
 
-    def _of_state(self, resets: np.ndarray) -> list[int]:
+    def _of_state(self, resets: np.ndarray) -> NodeList:
         """Return the changes of a state by events, without dependent speeds."""
         first = len(self.traced.q)
         return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist() if resets.size else []
@@ -118,7 +119,7 @@ class AppellOnGraph:
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
-    def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[list[int], list[int]]:
+    def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[NodeList, NodeList]:
         """Coordinates put back onto quaternion norms and geometric rows; speeds put back onto velocity rows, none where these are eliminated.
 
         Contacts that are closed count as rows.
@@ -135,20 +136,19 @@ class AppellOnGraph:
             for first, wxyz in zip(self.traced.quaternions, self.traced.attitudes, strict=True):
                 n = g.dot(wxyz, wxyz)
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in wxyz]
-        speeds: list[int] = []
+        speeds: NodeList = []
         if self.kept and self.multiplied:
             forms = self._forms(most_terms)
             M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
             phi = [int(at.phi[s]) for s in self.multiplied]
             speeds = self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
         if len(at.held):  # contacts that are closed, first
-            u = self.traced.u.tolist()
-            held_q, held_u = np.split(at.held, [len(q)])
+            u, (held_q, held_u) = self.traced.u.tolist(), np.split(at.held, [len(q)])
             moved = g.substituted(moved, dict(zip(q, held_q.tolist(), strict=True)))
             speeds = g.substituted(held_u.tolist(), dict(zip(u, speeds or u, strict=True)))
         return moved, speeds
 
-    def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
+    def _power(self, k: "_Kinematics", ydot: NodeList) -> int:
         """Return the power of loads without a potential, of explicit time in potentials, of constraints that
         do work, of prescribed poses, and of changing masses.
 
@@ -175,14 +175,14 @@ class AppellOnGraph:
         u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
-    def _inertia_resultants(self, at: VelocityQuantities, b: int, a: list[int], alpha: list[int]) -> tuple[list[int], list[int]]:
+    def _inertia_resultants(self, at: VelocityQuantities, b: int, a: NodeList, alpha: NodeList) -> tuple[NodeList, NodeList]:
         """`m a` and `I alpha + omega x I omega` of body b."""
         g, inertia, omega = self.graph, at.inertia[b].tolist(), at.omega[b].tolist()
         momentum = [g.dot(row, omega) for row in inertia]
         gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
         return [g.mul(int(at.mass[b]), x) for x in a], [g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)]
 
-    def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> list[int]:
+    def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> NodeList:
         if by_determinants and 1 <= len(f) <= 3:
             try:
                 return forms.cramer(M, f)
@@ -190,7 +190,7 @@ class AppellOnGraph:
                 pass
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
-    def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[list[int], list[int], list[int]]:
+    def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[NodeList, NodeList, NodeList]:
         """Return dependent speeds and rates at the true coordinates: rates independent of held ones are copied, the others recomputed."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
@@ -220,7 +220,7 @@ class AppellOnGraph:
             squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}
         return NormalForms(self.graph, most_terms, self.probes.sign, squares)
 
-    def _equations(self, k: "_Kinematics", forms: NormalForms) -> tuple[list[list[int]], list[int]]:
+    def _equations(self, k: "_Kinematics", forms: NormalForms) -> tuple[list[NodeList], NodeList]:
         g, at = self.graph, k.at
         freedoms = range(len(self.independent))
         inertia = at.inertia.tolist()
@@ -324,29 +324,29 @@ class _Kinematics:
         self.z = self._simple([g.add(g.dot(B, self.y), b) for B, b in zip(self.B, self.b, strict=True)])
         self.known = dict(zip([self.u[d] for d in build.dependent], self.z, strict=True))
 
-    def rows_along_motion(self, rows: list[int]) -> tuple[list[list[int]], list[int]]:
+    def rows_along_motion(self, rows: NodeList) -> tuple[list[NodeList], NodeList]:
         """Jacobian in the speeds and drift of some rows, at the held coordinates."""
         raw = [int(self.build.traced.at.phi[s]) for s in rows]
         simple = self._at(raw)
         by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
         return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
-    def rates_along_motion(self, raw: list[int]) -> list[int]:
+    def rates_along_motion(self, raw: NodeList) -> NodeList:
         """Return rates of traced nodes along the motion, at the held coordinates."""
         return self._along(self._at(raw), raw, self.qdot)
 
     # helpers
 
-    def _at(self, nodes) -> list[int]:
+    def _at(self, nodes) -> NodeList:
         """Return nodes at the held coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
 
-    def _turned(self, R, w) -> list[int]:
+    def _turned(self, R, w) -> NodeList:
         if all(n == self.graph.zero for n in w):
             return list(w)
         return [self.graph.dot(R[3 * i : 3 * i + 3], w) for i in range(3)]
 
-    def _smaller(self, a, b) -> list[int]:
+    def _smaller(self, a, b) -> NodeList:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
     def _cut(self, levels) -> dict[int, int]:
@@ -362,7 +362,7 @@ class _Kinematics:
                     pairs[n] = v
         return pairs
 
-    def _along(self, nodes, raw, qdot) -> list[int]:
+    def _along(self, nodes, raw, qdot) -> NodeList:
         """Rate of `nodes` (at the held coordinates) along the motion; `raw`: the same before any coordinate was held."""
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
@@ -372,7 +372,7 @@ class _Kinematics:
             rates[k] = g.total([rates[k], *(g.mul(moving[n], d) for n, d in zip((n for n in self.held if n in by_held), slopes, strict=True))])
         return self._simple(rates)
 
-    def _velocities(self, replacement) -> tuple[list[int], list[int]]:
+    def _velocities(self, replacement) -> tuple[NodeList, NodeList]:
         """v and omega in a row, raw and simplified at the held coordinates."""
         at = self.build.traced.at
         raw = self.graph.substituted([*at.v.ravel().tolist(), *at.omega.ravel().tolist()], replacement)

@@ -12,14 +12,16 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes
 
+Rows = list[list[int]]  # of a matrix, entry by entry a node
+
 
 @dataclass(frozen=True)
 class Eliminated:
     """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish: along the motion, or for some parameters."""
 
-    solution: list[list[int]]
+    solution: Rows
     pivots: list[int]
-    forward: list[list[int]] = field(default_factory=list)  # of a symmetric system, `L^-1 right`
+    forward: Rows = field(default_factory=list)  # of a symmetric system, `L^-1 right`
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
@@ -38,7 +40,7 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
     return found
 
 
-def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:
+def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:
     """Solve a system; `right[row]` holds the right-hand sides of that row. With more rows than unknowns they have to agree.
 
     `far`: probes at full turns of all angles, made where a pivot has to be judged at them.
@@ -68,7 +70,7 @@ def quotient(graph: Graph, a: int, b: int) -> int:
     return graph.mul(a, graph.div(graph.one, b))
 
 
-def solve_symmetric(graph: Graph, M: list[list[int]], right: list[list[int]]) -> Eliminated:
+def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
     """`M^-1 right` for a symmetric positive definite M, as L D L'; `right` holds columns, and so does the solution. The pivots are D."""
     count = len(M)
     S, columns = [list(row) for row in M], [list(column) for column in right]

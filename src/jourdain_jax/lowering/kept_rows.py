@@ -10,7 +10,7 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
 from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
 from jourdain_jax.program.derivative import matrix
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, NodeList
 from jourdain_jax.program.polynomial import NormalForms
 
 
@@ -31,13 +31,13 @@ class KeptRows:
             return "all speeds in the state, their accelerations by privileged ones"
         return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")
 
-    def accelerations(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms: NormalForms) -> Accelerations:
+    def accelerations(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
         """Return the accelerations under all constraints, and the pivots."""
         if self.by_partition:
             return self._accelerations_by_partition(M, f, A, drift, forms)
         return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine)
 
-    def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
+    def projected_speeds(self, M: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
         """Return the speeds on `phi = 0`; if privileged speeds are used, unchanged."""
         A = matrix(self.graph, phi, u)
         if not self.by_partition:
@@ -48,10 +48,10 @@ class KeptRows:
             moved[k] = self.graph.add(u[k], dz)
         return moved
 
-    def _dependent(self, count: int) -> list[int]:
+    def _dependent(self, count: int) -> NodeList:
         return [k for k in range(count) if k not in self.independent]
 
-    def _accelerations_by_partition(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms: NormalForms) -> Accelerations:
+    def _accelerations_by_partition(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
         graph, speeds, dependent = self.graph, range(len(f)), self._dependent(len(f))
         right = [[*(graph.neg(row[k]) for k in self.independent), graph.neg(d)] for row, d in zip(A, drift, strict=True)]
         found = eliminate(graph, [[row[k] for k in dependent] for row in A], right, self.probes, self.far)

@@ -25,7 +25,7 @@ from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.relations import jumps, relations, sided
 from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.program.part import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -250,7 +250,7 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
             )
 
 
-def _divisors(graph: Graph, qdot: list[int]) -> list[int]:
+def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
     """Return divisors in the rates of coordinates, as in w/sin q; a choice by `where` keeps away from zero
     itself.
     """
@@ -277,19 +277,19 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
             yield Strategy(True, MOST_TERMS, held=held)
 
 
-def _relative(graph: Graph, probes: Probes, pivots: list[int]) -> list[int]:
+def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
     """Return pivots relative to their values, for the same parameters, at a probed state; signs of those that
     never vary.
     """
     return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
 
 
-def _operands(graph: Graph, call: int) -> list[int]:
+def _operands(graph: Graph, call: int) -> NodeList:
     """Return the scalar operands of a call, without those that other calls compute."""
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
-def _with_equal_calls_once(generic: IdentityProbes, outputs: list[int]) -> list[int]:
+def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeList:
     """Merge calls that compute equal values."""
     graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it

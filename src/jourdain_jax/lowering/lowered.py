@@ -19,6 +19,8 @@ from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
 
+Nodes = tuple[int, ...]  # numbers of nodes of the graph
+
 # Parts of a program that are nodes; `power` is another one.
 NODES = (
     *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
@@ -53,35 +55,35 @@ class Lowered:
     coordinates: tuple[str, ...]
     speeds: tuple[str, ...]
     inputs: tuple[str, ...]
-    independent: tuple[int, ...]
-    dependent: tuple[int, ...]
-    qdot: tuple[int, ...]  # nodes
-    ydot: tuple[int, ...]
-    z: tuple[int, ...]  # dependent speeds
-    pivots: tuple[int, ...]  # must keep their signs, relative to their size at a probed state; those that coordinate rates are divided by come first
+    independent: Nodes
+    dependent: Nodes
+    qdot: Nodes  # nodes
+    ydot: Nodes
+    z: Nodes  # dependent speeds
+    pivots: Nodes  # must keep their signs, relative to their size at a probed state; those that coordinate rates are divided by come first
     divisors: int  # how many those are
-    directions: tuple[int, ...]  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
-    squares: tuple[int, ...]  # of rows kept by multipliers by turns: what is left of one beside those before it, and its size; the ratio is a squared sine
-    guards: tuple[int, ...]  # must stay positive
+    directions: Nodes  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
+    squares: Nodes  # of rows kept by multipliers by turns: what is left of one beside those before it, and its size; the ratio is a squared sine
+    guards: Nodes  # must stay positive
     power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated)
-    events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
-    resets: tuple[int, ...]  # of each event: coordinates, speeds of the state, modes, and the rise of what loads store; none where all events stop the motion
+    events: Nodes  # values of the stop events, sorted by name; none where they have no scalar form
+    resets: Nodes  # of each event: coordinates, speeds of the state, modes, and the rise of what loads store; none where all events stop the motion
     stops: tuple[bool, ...]  # whether each event does
-    energies: tuple[int, ...]  # kinetic and potential
-    relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
-    event_relations: tuple[int, ...]  # and those that do so in stop events besides
-    sided: tuple[int, ...]  # of both, those whose branches go on beyond where the number vanishes (`lowering/sides.py`)
-    jumps: tuple[int, ...]  # of the relations, those at whose zeros rates may jump
-    projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
-    projected_u: tuple[int, ...]  # all speeds projected onto the constraints; none where dependent speeds are eliminated
-    at_start: tuple[int, ...]  # contacts that switch at the start of a motion: `switching.Begun`
+    energies: Nodes  # kinetic and potential
+    relations: Nodes  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
+    event_relations: Nodes  # and those that do so in stop events besides
+    sided: Nodes  # of both, those whose branches go on beyond where the number vanishes (`lowering/sides.py`)
+    jumps: Nodes  # of the relations, those at whose zeros rates may jump
+    projected_q: Nodes  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
+    projected_u: Nodes  # all speeds projected onto the constraints; none where dependent speeds are eliminated
+    at_start: Nodes  # contacts that switch at the start of a motion: `switching.Begun`
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
     left_out: tuple[str, ...]  # rows that follow from the others
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
-    fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
+    fixed: Nodes  # nodes that depend on parameters alone, computed once per motion
     sides: int  # how many of the last modes and events are of relations
 
     @property
@@ -217,7 +219,7 @@ class Lowered:
             return q, y
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
 
-    def watched(self, has_events: bool) -> tuple[int, ...]:
+    def watched(self, has_events: bool) -> Nodes:
         """Return the numbers whose signs are monitored over every step, in the rates and, if it `has_events`,
         in the events.
         """

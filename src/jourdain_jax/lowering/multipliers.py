@@ -21,24 +21,24 @@ from jourdain_jax.calculus.reals import largest, real_type, undecided
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, NodeList
 from jourdain_jax.program.polynomial import NormalForms
 
-Columns = list[list[int]]
+Columns = list[NodeList]
 
 
 class Accelerations(NamedTuple):
-    """Nodes of the solution, and of its pivots."""
+    """NodeList of the solution, and of its pivots."""
 
-    udot: list[int]
-    sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
-    margins: list[int]  # must stay positive: what is left of each entry, above its least
+    udot: NodeList
+    sines: NodeList  # one per row, between that row and those before it; or the pivots of privileged speeds
+    margins: NodeList  # must stay positive: what is left of each entry, above its least
     directions: Columns = []  # that rows must not leave within a step
-    squares: list[int] = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
+    squares: NodeList = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
 
 
 def accelerations_by_multipliers(
-    graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms, *, affine: bool
+    graph: Graph, M: Columns, f: NodeList, A: Columns, drift: NodeList, probes: Probes, forms: NormalForms, *, affine: bool
 ) -> Accelerations:
     """Return the accelerations under all constraints; `probes` give the typical sizes of entries; `affine`:
     whether constraints are affine in the speeds.
@@ -81,21 +81,21 @@ def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -
     return made
 
 
-def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:
+def projected_coordinates(graph: Graph, q: NodeList, closure: NodeList) -> NodeList:
     """Return one step of Gauss-Newton towards `closure = 0`."""
     G = matrix(graph, closure, q)
     correction = solve_symmetric(graph, _products(graph, G, G, NormalForms(graph, 0)), [closure]).solution[0]
     return _less(graph, q, G, correction)
 
 
-def projected_speeds(graph: Graph, M: Columns, A: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
+def projected_speeds(graph: Graph, M: Columns, A: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
     """Return the speeds on `phi = 0`, nearest in the metric of M."""
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
     return _less(graph, u, impulses, multipliers)
 
 
-def _less(graph: Graph, x: list[int], rows: Columns, factors: list[int]) -> list[int]:
+def _less(graph: Graph, x: NodeList, rows: Columns, factors: NodeList) -> NodeList:
     """`x - rows' factors`"""
     return [graph.sub(n, graph.dot(column, factors)) for n, *column in zip(x, *rows, strict=True)]
 

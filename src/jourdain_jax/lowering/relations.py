@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, NodeList
 
 MOST_WATCHED = 32  # of a scene
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
@@ -68,7 +68,7 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
     return args[0] if above == (op in ("abs", "max")) else graph.neg(args[0]) if op == "abs" else args[1]
 
 
-def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[list[int], list[int]]:
+def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
     """Return the outputs with these relations (of `switches`) as for a positive number, and as for a negative
     one.
     """
@@ -82,7 +82,7 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
     Numbers that depend on `modes` are omitted: modes have events of their own.
     """
-    found: list[list[int]] = []
+    found: list[NodeList] = []
     for outputs, counts in ((rates, _differ), (events, _may_dip)):
         of_outputs = {n: nodes for n, nodes in switches(graph, outputs).items() if not set(modes) & set(graph.reachable([n]))}
         kept = [n for n, nodes in of_outputs.items() if any(graph.op[k] in WHOLE for k, _ in nodes) or _counts(graph, n, nodes, outputs, counts, probes)]

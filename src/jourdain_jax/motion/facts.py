@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 
+Names = tuple[str, ...]
+
 
 @dataclass(frozen=True)
 class Rows:
     """Which rows hold the scene, and how far they are independent."""
 
-    names: tuple[str, ...]
+    names: Names
     rank: int  # at generic states
-    redundant: tuple[str, ...]  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: tuple[str, ...]  # redundant at every probed state, but by no identity
-    rank_losses: tuple[str, ...]  # probed configurations with fewer independent rows
+    redundant: Names  # may be omitted together: the others keep the rank at every probed state
+    may_set_in: Names  # redundant at every probed state, but by no identity
+    rank_losses: Names  # probed configurations with fewer independent rows
     affine: bool  # linear or affine in the speeds
     homogeneous: bool  # they hold at rest
 
@@ -20,8 +22,8 @@ class Rows:
 class Freedoms:
     """Which speeds are independent, and how well they determine the others."""
 
-    privileged: tuple[str, ...]
-    dependent: tuple[str, ...]
+    privileged: Names
+    dependent: Names
     chosen_by_user: bool
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes; 1 is best
     typical_pivot: float
@@ -36,7 +38,7 @@ class Freedoms:
 class Dependence:
     """Explicit dependence on time, and quantities that change along the motion."""
 
-    on_time: tuple[str, ...]  # rows, poses, inertias, coordinate rates, loads, potential
+    on_time: Names  # rows, poses, inertias, coordinate rates, loads, potential
     driven: bool  # bodies move while all speeds are zero
     varying_inertia: bool
     massless: bool  # nothing has inertia along some motion that the rows hold
@@ -47,5 +49,5 @@ class Conserved:
     """Conserved quantities of a motion."""
 
     energy: bool  # kinetic and potential energy together, without integrated work
-    ignorable: tuple[str, ...]  # coordinates that no acceleration depends on; empty where there is no scalar program
-    invariants: tuple[str, ...]  # as the scene states them
+    ignorable: Names  # coordinates that no acceleration depends on; empty where there is no scalar program
+    invariants: Names  # as the scene states them

@@ -18,7 +18,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.plausibility import elsewhere, faults_at
@@ -27,7 +27,7 @@ from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.derivatives import differentiated_as
-from jourdain_jax.calculus.reals import Flag, rank_cutoff, real_type
+from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, rank_cutoff, real_type
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -51,15 +51,15 @@ class State(Printed, eqx.Module):
     q and u in the units of the scene's coordinates and speeds (SI, rad).
     """
 
-    t: Float[Array, ""]  # s
+    t: Scalar  # s
     q: Float[Array, "coordinates"]
-    u: Float[Array, "speeds"]
-    moved_q: Float[Array, ""]  # largest change of a coordinate by the projection
-    moved_u: Float[Array, ""]  # largest change of a speed by the projection
-    residual: Float[Array, ""]  # what is left of rows and quaternion norms
+    u: Speeds
+    moved_q: Scalar  # largest change of a coordinate by the projection
+    moved_u: Scalar  # largest change of a speed by the projection
+    residual: Scalar  # what is left of rows and quaternion norms
     names: tuple[Names, Names] = eqx.field(static=True)
     # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
-    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
+    guess: Scalar = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
     def __getitem__(self, name: str):
         """Return a coordinate, speed, quaternion or angular velocity by name."""
@@ -89,11 +89,11 @@ def state_of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> S
 class Usual(eqx.Module):
     """Typical sizes of constraints and coordinates, and kinds of constraints."""
 
-    closures: Float[Array | np.ndarray, "closures"]
-    rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
-    width: Float[Array | np.ndarray, "coordinates"]  # of the domain
-    low: Float[Array | np.ndarray, "coordinates"]  # where a coordinate is found by the rows; infinite where it may be anywhere
-    high: Float[Array | np.ndarray, "coordinates"]
+    closures: Float[Entries, "closures"]
+    rows: Float[Entries, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
+    width: Float[Entries, "coordinates"]  # of the domain
+    low: Float[Entries, "coordinates"]  # where a coordinate is found by the rows; infinite where it may be anywhere
+    high: Float[Entries, "coordinates"]
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
     determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
     program: RowProgram | None = eqx.field(static=True)  # by which machine code puts a start onto them; None: XLA does
@@ -137,7 +137,7 @@ def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = 
     return differentiated_as(of_known, lambda known, *_: known)(known, *given)
 
 
-def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float[Array, "speeds"], Float[Array, "rows"]]:
+def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:
     """Return the speeds on the velocity constraints nearest to u, and the residual."""
     affine, determined = usual.affine, usual.determined
     if usual.program is not None and not usual.program.phi:
@@ -181,11 +181,11 @@ def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
 class Guess(NamedTuple):
     """Coordinates and speeds that are to be projected, and which of them may move."""
 
-    q: Float[Array | np.ndarray, "coordinates"]
-    u: Float[Array | np.ndarray, "speeds"]
-    free_q: Bool[Array | np.ndarray, "coordinates"]
-    free_u: Bool[Array | np.ndarray, "speeds"]
-    bounded: Bool[Array | np.ndarray, "coordinates"]  # which must end inside the domain that the scene states
+    q: Float[Entries, "coordinates"]
+    u: Float[Entries, "speeds"]
+    free_q: Bool[Entries, "coordinates"]
+    free_u: Bool[Entries, "speeds"]
+    bounded: Bool[Entries, "coordinates"]  # which must end inside the domain that the scene states
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
@@ -205,7 +205,7 @@ def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
     return put_onto_constraints(scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
 
 
-def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
+def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Flag]:
     """Return the start on the constraints, and whether its coordinates arrived, where they may be found; no
     search where `guesses` is None.
 
@@ -259,7 +259,7 @@ def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
     return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
-def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:
+def left_of(g: Float[Array, "closures"]) -> Scalar:
     """Return the largest significant residual of the geometric constraints: infinite for NaN, zero for
     round-off.
     """
@@ -267,7 +267,7 @@ def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:
     return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
-def _arrived(q, near_q, g, start: Guess) -> Bool[Array, ""]:
+def _arrived(q, near_q, g, start: Guess) -> Flag:
     """Return whether the rows are met, where coordinates may be found and without running far away."""
     # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
     close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
@@ -279,9 +279,9 @@ class _Put(NamedTuple):
 
     q: Float[Array, "coordinates"]
     g: Float[Array, "closures"]
-    guess: Int[Array, ""]
+    guess: Count
     begin: Float[Array, "coordinates"]  # where Newton's method began
-    met: Bool[Array, ""]  # whether it was worth while
+    met: Flag  # whether it was worth while
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:

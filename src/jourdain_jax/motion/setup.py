@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Flag, PerLane, Scalar, array_module
+from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module
 from jourdain_jax.motion.inputs import knots_between
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
@@ -31,10 +31,10 @@ _SHORT = 1e-9  # s, a span for motions that are not requested
 class Passed(eqx.Module):
     """The events after which a motion continued."""
 
-    ts: Float[Array | np.ndarray, "transitions *lanes"]  # since the start; infinite beyond the last one
-    events: Int[Array | np.ndarray, "transitions *lanes"]
-    lost: Float[Array | np.ndarray, "transitions *lanes"]  # J, by which the energy fell
-    modes: Float[Array | np.ndarray, "modes transitions *lanes"]  # after each
+    ts: Float[Entries, "transitions *lanes"]  # since the start; infinite beyond the last one
+    events: Int[Entries, "transitions *lanes"]
+    lost: Float[Entries, "transitions *lanes"]  # J, by which the energy fell
+    modes: Float[Entries, "modes transitions *lanes"]  # after each
 
     def times(
         self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
@@ -113,13 +113,13 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     scene: Scene
     start: State
     inputs: PyTree
-    t0: Float[Array | np.ndarray, "*lanes"]
-    t1: Float[Array | np.ndarray, "*lanes"]
-    ts: Float[Array | np.ndarray, "*lanes times"]
+    t0: Float[Entries, "*lanes"]
+    t1: Float[Entries, "*lanes"]
+    ts: Float[Entries, "*lanes times"]
     field: VectorField
     tolerances: tuple  # rtol, atol
-    dt0: Float[Array | np.ndarray, "*lanes"] | float
-    longest: Float[Array | np.ndarray, "*lanes"] | float  # step, s
+    dt0: Float[Entries, "*lanes"] | float
+    longest: Float[Entries, "*lanes"] | float  # step, s
     integrator: Integrator
     usual: Usual | None  # sizes by which the start is projected; None where it is on its constraints
     judged: bool  # whether parameters were known where the scene was probed, and so judged there, at many states

@@ -20,6 +20,10 @@ from collections.abc import Callable, Sequence
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
+DoubleDouble = tuple[Value, Value]  # head and rest
+
+Triple = tuple[Value, Value, Value]
+
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
     """Return a polynomial by Horner's rule, highest power first; of a long one, even and odd powers side by
@@ -34,13 +38,13 @@ def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
     return total
 
 
-def two_sum(a: Value | float, b: Value) -> tuple[Value, Value]:
+def two_sum(a: Value | float, b: Value) -> DoubleDouble:
     """a + b, for an a that is zero or no smaller than b."""
     head = a + b
     return head, (a - head) + b
 
 
-def two_product(w: Writer, a: Value, b: Value) -> tuple[Value, Value]:
+def two_product(w: Writer, a: Value, b: Value) -> DoubleDouble:
     """a b"""
     head = a * b
     return head, product_less(w, a, b, head)
@@ -54,13 +58,13 @@ def product_less(w: Writer, a: Value, b: Value, c: Value) -> Value:
     return (((a_high * b_high - c) + a_high * b_low) + a_low * b_high) + a_low * b_low
 
 
-def _halves(w: Writer, a: Value) -> tuple[Value, Value]:
+def _halves(w: Writer, a: Value) -> DoubleDouble:
     """Return two numbers of 26 and 27 bits, whose sum is a."""
     high = w.converted("bitcast", w.converted("bitcast", a, w.whole) & -(2**27), w.real)
     return high, a - high
 
 
-def quotient(w: Writer, a: tuple[Value, Value], b: tuple[Value, Value]) -> tuple[Value, Value]:
+def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """q and d of the quotient q - d of two numbers, each with its rest; of a zero it keeps the sign."""
     inverse = 1.0 / b[0]
     q = a[0] * inverse
@@ -103,7 +107,7 @@ ASIN = (
 )
 
 
-def sine_and_cosine(w: Writer, x: Value) -> tuple[Value, Value]:
+def sine_and_cosine(w: Writer, x: Value) -> DoubleDouble:
     """(sin x, cos x)"""
     s, c = _or_far(w, x, _sine_and_cosine(w, _reduced(w, x)), _FAR_SINE_AND_COSINE)
     return s, c
@@ -127,13 +131,13 @@ def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Cal
     return [w.load(place) for place in places]
 
 
-def _sine_and_cosine(w: Writer, angle: tuple[Value, Value, Value]) -> tuple[Value, Value]:
+def _sine_and_cosine(w: Writer, angle: Triple) -> DoubleDouble:
     (r, less), (most, more), quadrant = _waves(w, *angle)
     sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
     return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
 
 
-def _tangent(w: Writer, angle: tuple[Value, Value, Value]) -> Value:
+def _tangent(w: Writer, angle: Triple) -> Value:
     (r, less), (most, more), quadrant = _waves(w, *angle)
     sine, sine_rest = two_sum(r, -less)
     cosine, cosine_rest = two_sum(most, more - 0.5 * product_less(w, r, r, r * r))
@@ -147,7 +151,7 @@ _FAR_SINE_AND_COSINE = {"far_sine": lambda w, angle: _sine_and_cosine(w, angle)[
 _FAR_TANGENT = {"far_tangent": _tangent}
 
 
-def _reduced(w: Writer, x: Value) -> tuple[Value, Value, Value]:
+def _reduced(w: Writer, x: Value) -> Triple:
     """Return the remainder of an angle after whole quarter turns, its low part, and the number of turns."""
     shifted = w.fma(x, 2 / math.pi, WHOLE)
     turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
@@ -156,7 +160,7 @@ def _reduced(w: Writer, x: Value) -> tuple[Value, Value, Value]:
     return r, w.fma(turns, HALF_PI[2], w.fma(turns, HALF_PI[1], r - near)), quadrant
 
 
-def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[tuple[Value, Value], tuple[Value, Value], Value]:
+def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDouble, DoubleDouble, Value]:
     """(r, s), (m, c) and k: the angle that k quarter turns leave has the sine r - s, in which zeros keep their signs, and the cosine m + c."""
     square = r * r
     half = 0.5 * square
@@ -166,7 +170,7 @@ def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[tuple[Val
     return (r, less), (most, more), quadrant
 
 
-def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
+def _reduced_far(w: Writer, x: Value) -> Triple:
     """As `_reduced`, of large angles; NaN for others.
 
     x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
@@ -320,7 +324,7 @@ def arccosine(w: Writer, x: Value) -> Value:
     return _arc(w, halves, w.where(large, 2.0, w.number(-1.0)) * w.where(negative, -1.0, w.number(1.0)), s, rest)
 
 
-def _of_half(w: Writer, x: Value) -> tuple[Value, Value, Value]:
+def _of_half(w: Writer, x: Value) -> Triple:
     """Return whether |x| is above 1/2, and the arc whose sine is |x|, or there sqrt((1 - |x|)/2), in two
     parts.
     """

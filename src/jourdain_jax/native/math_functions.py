@@ -21,6 +21,8 @@ from jourdain_jax.native import angles
 from jourdain_jax.native.angles import WHOLE, polynomial, product_less, quotient, two_product, two_sum
 from jourdain_jax.native.ir import Value, Writer
 
+DoubleDouble = tuple[Value, Value]  # head and rest
+
 _LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # the first has 32 bits
 _THIRD = (1 / 3, 1.850371707708594e-17)
 EXP = (
@@ -90,7 +92,7 @@ def exponential(w: Writer, x: Value) -> Value:
     return _exponential(w, _within(w, x, -800.0, 800.0))
 
 
-def _mantissa(w: Writer, x: Value) -> tuple[Value, Value]:
+def _mantissa(w: Writer, x: Value) -> DoubleDouble:
     """k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for an x that is positive and finite."""
     small = x < 2.0**-1022
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
@@ -100,7 +102,7 @@ def _mantissa(w: Writer, x: Value) -> tuple[Value, Value]:
     return k, m
 
 
-def _logarithm(w: Writer, x: Value) -> tuple[Value, Value]:
+def _logarithm(w: Writer, x: Value) -> DoubleDouble:
     """log x in two parts, for x >= 0 or none."""
     k, m = _mantissa(w, x)
     f, d = m - 1.0, 1.0 + m
@@ -151,12 +153,12 @@ def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
     return w.where(w.magnitude(x) < 2.0**-54, x, _logarithm_of_more(w, x))
 
 
-def _sum(w: Writer, a: Value, b: Value | float) -> tuple[Value, Value]:
+def _sum(w: Writer, a: Value, b: Value | float) -> DoubleDouble:
     """Return a + b, both non-negative, in either order of size."""
     return two_sum(w.larger(a, w.literal(b, a.type)), w.smaller(a, w.literal(b, a.type)))
 
 
-def _root(w: Writer, head: Value, less: Value) -> tuple[Value, Value]:
+def _root(w: Writer, head: Value, less: Value) -> DoubleDouble:
     root = w.root(head)
     return root, w.where(root > 0.0, 0.5 * (less - product_less(w, root, root, head)) / root, 0.0)
 
@@ -258,7 +260,7 @@ def power(w: Writer, x: Value, exponent: float) -> Value:
     return exponential(w, logarithm(w, x) * exponent)
 
 
-def _quarter_less_one(w: Writer, x: Value) -> tuple[Value, Value]:
+def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
     """(e^x - 1)/4"""
     k, p, rest = _less_one(w, x)
     quarter = _power_of_two(w, k - 2)
@@ -267,7 +269,7 @@ def _quarter_less_one(w: Writer, x: Value) -> tuple[Value, Value]:
     return head, w.fma(quarter, rest, less + more)
 
 
-def _plus(a: float, head: Value, rest: Value) -> tuple[Value, Value]:
+def _plus(a: float, head: Value, rest: Value) -> DoubleDouble:
     """a + (head + rest), for an a no smaller than the head or a sum that is by far larger than a."""
     total, less = two_sum(a, head)
     return total, less + rest

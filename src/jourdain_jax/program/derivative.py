@@ -19,10 +19,10 @@ from jourdain_jax.calculus.derivatives import is_zero
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
-from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
+from jourdain_jax.program.graph import ARRAYS, Graph, NodeList, Unsupported
 
 
-def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> list[int]:
+def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> NodeList:
     """d output/ds for each output, where `direction[n]` is dn/ds; a node in `direction` is not looked into."""
     return [rates.get(0, graph.zero) for rates in directional_derivative(graph, outputs, {0: direction})]
 
@@ -56,7 +56,7 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
     return [tangents[n] for n in outputs]
 
 
-def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> list[int]:
+def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> NodeList:
     """sum_i w_i d output_i/d variable for each variable (nodes that are not looked into), in one sweep from the outputs back.
 
     The derivative of a branch that is not taken is zero, whatever its value: there a weight of zero counts,
@@ -101,7 +101,7 @@ def _part(graph: Graph, node: int, i: int, weight: int) -> int:
     return graph.mul(weight, slope)
 
 
-def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
+def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[NodeList]:
     """Return derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros
     among them.
     """
@@ -109,7 +109,7 @@ def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> l
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
-def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
+def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[NodeList]:
     """Return the Jacobian row by row, zeros among them."""
     variables = list(variables)
     return [[row.get(n, graph.zero) for n in variables] for row in jacobian(graph, outputs, variables)]
@@ -197,7 +197,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     return own
 
 
-def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, list[int], list[int]]:
+def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, NodeList, NodeList]:
     """Return the outputs on a new graph whose inputs are the variables: no simplification can look behind
     these.
     """

@@ -15,7 +15,7 @@ from jax import lax
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.calls import EMITTED
 from jourdain_jax.program.fused import fused
-from jourdain_jax.program.graph import ARRAYS, Graph
+from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
 PIECE = 128  # operations
@@ -41,7 +41,7 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
     return [values[n] for n in outputs]
 
 
-def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> list[int]:
+def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> NodeList:
     """Return the needed nodes, each soon after its arguments, with the longest chains of operations first.
 
     So chains are followed from their beginning, sums grow term by term, and little is carried from piece to piece.
@@ -64,7 +64,7 @@ def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], d
     return order
 
 
-def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) -> None:
+def _run_in_a_row(graph: Graph, nodes: NodeList, values: dict[int, jax.Array]) -> None:
     waves: dict = {}
     for node in nodes:
         op, args = graph.op[node], graph.args[node]
@@ -81,9 +81,9 @@ def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) 
             values[node] = FUNCTIONS[op](*given)
 
 
-def _fused_by_shape(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
+def _fused_by_shape(nodes: NodeList, values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
     """Return values of the nodes, with nodes of equal shape and type computed together."""
-    alike: dict[tuple, list[int]] = {}
+    alike: dict[tuple, NodeList] = {}
     for n in nodes:
         if jnp.issubdtype(jnp.result_type(values[n]), jnp.floating) and isinstance(values[n], jax.Array):
             alike.setdefault((values[n].shape, values[n].dtype), []).append(n)

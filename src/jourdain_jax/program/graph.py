@@ -19,6 +19,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
 ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
+NodeList = list[int]  # numbers of nodes
 _GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
@@ -131,7 +132,7 @@ class Graph:
             return None
         return self.product((left & right).elements())
 
-    def _factors(self, node: int) -> list[int]:
+    def _factors(self, node: int) -> NodeList:
         """Return factors of a product of few; the node itself otherwise."""
         factors, split = [node], True
         # 8 of a product that is looked at for squares of sines
@@ -259,7 +260,7 @@ class Graph:
         """Return a call of arrays."""
         return self._node("opaque", tuple(operands), call)
 
-    def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> list[int]:
+    def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> NodeList:
         """Results of a call, by number, given their shapes and types."""
         return [self._node("output", (call,), (k, *shape)) for k, shape in shapes.items()]
 
@@ -268,7 +269,7 @@ class Graph:
         _, shape, _ = self.value[output]
         return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
 
-    def entries_of(self, array: int) -> list[int]:
+    def entries_of(self, array: int) -> NodeList:
         """Return the entries of an array, or of a result of a call."""
         return list(self.args[array]) if self.op[array] == "array" else self.entries(array).ravel().tolist()
 
@@ -287,7 +288,7 @@ class Graph:
             new[node] = self.const(of.value[node]) if of.is_const(node) else self.again(node, [new[a] for a in of.args[node]], of)
         return new
 
-    def calls(self, nodes: Iterable[int]) -> list[int]:
+    def calls(self, nodes: Iterable[int]) -> NodeList:
         """Return the calls that the nodes need."""
         return [n for n in self.reachable(nodes) if self.op[n] == "opaque"]
 
@@ -303,7 +304,7 @@ class Graph:
         """sum a_i b_i"""
         return self.total(self.mul(x, y) for x, y in zip(a, b, strict=True))
 
-    def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> list[int]:
+    def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> NodeList:
         """Return the outputs with some nodes replaced by others."""
         outputs = list(outputs)
         if not replacement:
@@ -320,11 +321,11 @@ class Graph:
 
     # what is in the graph
 
-    def reachable(self, outputs: Iterable[int]) -> list[int]:
+    def reachable(self, outputs: Iterable[int]) -> NodeList:
         """Return all nodes that the outputs need, in an order in which they can be computed."""
         return self.needed(outputs, known=())
 
-    def needed(self, outputs: Iterable[int], known) -> list[int]:
+    def needed(self, outputs: Iterable[int], known) -> NodeList:
         """Return the nodes needed for the outputs if the nodes in `known` are known, in order."""
         args = self.args
         seen = {node for node in outputs if node not in known}
@@ -348,7 +349,7 @@ class Graph:
         """Return whether a node is a truth value."""
         return self.op[node] in _TRUTHS or (self.op[node] == "select" and self.is_truth(self.args[node][1]))
 
-    def with_quotients(self, outputs: Iterable[int]) -> list[int]:
+    def with_quotients(self, outputs: Iterable[int]) -> NodeList:
         """Return the outputs with `a (1/b)` as one division, where `1/b` is used only once."""
         outputs = list(outputs)
         uses = Counter(a for node in self.reachable(outputs) for a in self.args[node])
@@ -363,7 +364,7 @@ class Graph:
                 new[node] = self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
         return [new[n] for n in outputs]
 
-    def _divides_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
+    def _divides_once(self, node: int, uses: dict[int, int], outputs: NodeList) -> bool:
         """Return whether a node is a varying reciprocal with one use."""
         reciprocal = self.op[node] == "div" and self.args[node][0] == self.one and self.varies[node]
         return reciprocal and uses[node] == 1 and node not in outputs

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from operator import and_
 
-from jourdain_jax.program.graph import ARRAYS, Graph
+from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
 Monomial = tuple[int, ...]  # atoms in order, repeated as often as they occur
 Polynomial = dict[Monomial, float]
@@ -53,7 +53,7 @@ class NormalForms:
             self._simplified[node] = self._smaller(node)
         return self._simplified[node]
 
-    def all_simplified(self, nodes: Iterable[int]) -> list[int]:
+    def all_simplified(self, nodes: Iterable[int]) -> NodeList:
         """Return every node `simplified`."""
         return [self.simplified(n) for n in nodes]
 
@@ -130,7 +130,7 @@ class NormalForms:
             p = self.product(p, function(atom))
         return p
 
-    def _rooted(self, p: Polynomial) -> tuple[list[int], Polynomial] | None:
+    def _rooted(self, p: Polynomial) -> tuple[NodeList, Polynomial] | None:
         """Return atoms to take out of the root, and the rest; None if there are none."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
@@ -283,7 +283,7 @@ class NormalForms:
         divisor = self.rebuilt({tuple((Counter(m) - common).elements()): c / scale for m, c in q.items()})
         return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)
 
-    def cramer(self, M: list[list[int]], f: list[int]) -> list[int]:
+    def cramer(self, M: list[NodeList], f: NodeList) -> NodeList:
         """`M^-1 f` by determinants, in normal form; for up to three unknowns."""
         A, b = [[self.expanded(x) for x in row] for row in M], [self.expanded(x) for x in f]
         determinant = self._determinant(A)

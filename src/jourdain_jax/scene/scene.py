@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Speeds, array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
+from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -221,7 +221,7 @@ class Scene(eqx.Module):
         return jnp.asarray(q), jnp.asarray(u), given
 
 
-def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Array | np.ndarray, "coordinates"], Float[Array | np.ndarray, "speeds"], tuple[str, ...]]:
+def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], tuple[str, ...]]:
     """As `Scene.named`; on NumPy where all numbers are known."""
     q, u, given = entries_named(scene, values)
     return _vector(q), _vector(u), given
@@ -280,7 +280,7 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
     return list(names.entries[first : first + length])
 
 
-def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
+def _vector(entries: list) -> Float[Entries, "entries"]:
     if array_module(entries) is jnp:
         return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
     return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile

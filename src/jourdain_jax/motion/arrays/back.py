@@ -13,8 +13,9 @@ from typing import NamedTuple
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
+from jourdain_jax.calculus.reals import Count
 from jourdain_jax.motion.arrays.loop import Going, Loop, numbers
 from jourdain_jax.motion.integrators.event_search import MOST_STEPS
 from jourdain_jax.motion.integrators.explicit_steps import Method
@@ -35,10 +36,10 @@ class _Record(NamedTuple):
     """
 
     going: Going
-    tries: Int[Array, ""]
+    tries: Count
     window: Float[Array, "slots rows *lanes"]
     checkpoints: PyTree
-    every: Int[Array, ""]
+    every: Count
 
 
 def cotangents(

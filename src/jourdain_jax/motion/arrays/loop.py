@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.motion.arrays.functions import Functions
 from jourdain_jax.motion.arrays.implicit import tried_by_equations
 from jourdain_jax.motion.arrays.writer import ArrayWriter, Pointer, Rows
@@ -32,7 +33,7 @@ class Going(NamedTuple):
     """Hold a motion on its way."""
 
     y: Float[Array, "y *lanes"]  # with its tangents
-    rows: dict[int, Float[Array, "*lanes"]]  # the others that steps change
+    rows: dict[int, PerLane]  # the others that steps change
     log: list[Float[Array, "transitions *lanes"]]
     passed: Int[Array, "*lanes"]  # how many times were saved
 
@@ -163,7 +164,7 @@ class Loop(NamedTuple):
         return Found.of(self.form, ys, end, going.passed.astype(end.dtype)[None])
 
 
-def at_number(x: Float[Array, "times *lanes"], i) -> Float[Array, "*lanes"]:
+def at_number(x: Float[Array, "times *lanes"], i) -> PerLane:
     """Return the time number `i` of each lane."""
     return x[i] if x.ndim == 1 else jnp.take_along_axis(x, i[None], 0)[0]
 

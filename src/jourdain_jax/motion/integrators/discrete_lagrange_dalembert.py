@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.calculus.reals import Scalar, Speeds
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import speeds_are_rates
@@ -39,7 +40,7 @@ from jourdain_jax.scene.validated import gauge_of, loads_of
 RULES = ("midpoint", "trapezoidal")
 
 
-def lagrangian(scene: Scene, t, q, u, inputs) -> Float[Array, ""]:
+def lagrangian(scene: Scene, t, q, u, inputs) -> Scalar:
     """`L = T - V - dS/dt` in J, for speeds that are the coordinate rates; S is the scene's gauge."""
     T, V = energies_at(scene, motion_at(scene, t, q, u, inputs))
     if gauge_of(scene, pose_at(scene, t, q)) is None:
@@ -47,7 +48,7 @@ def lagrangian(scene: Scene, t, q, u, inputs) -> Float[Array, ""]:
     return T - V - jax.jvp(lambda t, q: gauge_of(scene, pose_at(scene, t, q)), (t, q), (jnp.ones_like(t), u))[1]
 
 
-def momentum(scene: Scene, t, q, u, inputs) -> Float[Array, "speeds"]:
+def momentum(scene: Scene, t, q, u, inputs) -> Speeds:
     """`dL/dqdot`, kg m/s or kg m^2/s."""
     return jax.grad(lambda u: lagrangian(scene, t, q, u, inputs))(u)
 
@@ -55,12 +56,12 @@ def momentum(scene: Scene, t, q, u, inputs) -> Float[Array, "speeds"]:
 class Interval(eqx.Module):
     """The span of one step, and the quadrature rule."""
 
-    t0: Float[Array, ""]
-    h: Float[Array, ""]  # its length, s
+    t0: Scalar
+    h: Scalar  # its length, s
     rule: str = eqx.field(static=True)
 
     @property
-    def t1(self) -> Float[Array, ""]:
+    def t1(self) -> Scalar:
         """Its end."""
         return self.t0 + self.h
 
@@ -72,7 +73,7 @@ class Interval(eqx.Module):
         return (f(self.t0, q0, v) + f(self.t1, q1, v)) / 2
 
 
-def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) -> Float[Array, ""]:
+def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) -> Scalar:
     """`L_d(q_0, q_1)` in J s."""
     return over.h * over.mean(lambda t, q, v: lagrangian(scene, t, q, v, inputs(t)), q0, q1)
 
@@ -105,7 +106,7 @@ def _has_forces(scene: Scene, t, q) -> bool:
     return any(load.potential is None for load in loads_of(scene, motion_at(scene, t, q, jnp.zeros_like(q))))
 
 
-def _force(scene: Scene, t, q, u, inputs) -> Float[Array, "speeds"]:
+def _force(scene: Scene, t, q, u, inputs) -> Speeds:
     """`Q = sum beta' F + gamma' L + Q_direct` of the loads without a potential."""
     motion, partial = motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u)
     loads = resultants(scene, motion, conservative=False)
@@ -185,7 +186,7 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
     return jnp.concatenate([p - p0 - A0.T @ impulse, _kept(scene, rows)])
 
 
-def _projected(args, over: Interval, q0, q1) -> Float[Array, "speeds"]:
+def _projected(args, over: Interval, q0, q1) -> Speeds:
     """Return speeds on the rows with the momentum at the end of the interval, but for a constraint impulse:
     linear in both.
     """

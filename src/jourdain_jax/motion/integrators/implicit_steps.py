@@ -12,9 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.reals import Number, checked_unless_traced
+from jourdain_jax.calculus.reals import Flag, Number, Scalar, checked_unless_traced
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -24,7 +24,7 @@ class Solution(NamedTuple):
 
     change: PyTree  # of the state; zero where the equations of the step were not solved
     error: PyTree | None  # None: the method has no estimate
-    solved: Bool[Array, ""]  # whether they were
+    solved: Flag  # whether they were
 
 
 class ImplicitMethod(eqx.Module):
@@ -41,7 +41,7 @@ class ImplicitMethod(eqx.Module):
         return type(self).__name__
 
     @abc.abstractmethod
-    def solve(self, args: tuple, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Solution:
+    def solve(self, args: tuple, t: Scalar, y: PyTree, h: Scalar) -> Solution:
         """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards); `args`: as in `integrands.py`."""
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
@@ -73,7 +73,7 @@ def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbe
     return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))
 
 
-def even_step(longest: Float[Array, ""], rest: Float[Array, ""]) -> Float[Array, ""]:
+def even_step(longest: Scalar, rest: Scalar) -> Scalar:
     """Return the first of the fewest equal steps no longer than `longest` that cover a `rest`; a ratio 1e-9
     above a whole number counts as that number.
     """

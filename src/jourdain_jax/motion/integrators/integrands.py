@@ -15,7 +15,7 @@ from jourdain_jax.motion.inputs import seen_from_within
 from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorField, Watched
 
 
-def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
+def state_norm(y: Integrated) -> PerLane:
     """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
 
     NaN counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last

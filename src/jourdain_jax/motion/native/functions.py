@@ -21,20 +21,20 @@ from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, NodeList
 
 
 class Outputs(NamedTuple):
     """Nodes with their tangents, on a graph of their own where they have some."""
 
     graph: Graph
-    values: list[int]
-    tangents: list[list[int]]  # one after the other
-    variables: list[int]  # for those of the scene's program
-    states: list[list[int]]  # inputs for the tangents of the state
-    known: list[int]  # for those of the numbers known that have some, all of the first tangent first
-    times: list[int]  # for those of time
-    slopes: list[int]  # and for how fast inputs given by samples change with it
+    values: NodeList
+    tangents: list[NodeList]  # one after the other
+    variables: NodeList  # for those of the scene's program
+    states: list[NodeList]  # inputs for the tangents of the state
+    known: NodeList  # for those of the numbers known that have some, all of the first tangent first
+    times: NodeList  # for those of time
+    slopes: NodeList  # and for how fast inputs given by samples change with it
 
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
@@ -182,7 +182,7 @@ class Pulled(NamedTuple):
     """Cotangents of the state and of the requested numbers, on a graph of their own."""
 
     own: Outputs
-    found: list[int]
+    found: NodeList
     weights: dict[int, int]  # row of what is pulled -> input for its cotangent
 
     @property
@@ -225,7 +225,7 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
         _write_one_pulled(w, form, "pull_moved", _moved(form, asked))
 
 
-def steps_of(form: Form) -> dict[str, list[int]]:
+def steps_of(form: Form) -> dict[str, NodeList]:
     """Return the parts of a step: rates, the whole state after either part of a projection, stop events."""
     program, (_, _, y, _) = form.program, form.split(form.program.variables)
     q, u = y[: form.coordinates], y[form.coordinates :]
@@ -247,7 +247,7 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
     return Pulled(own, cotangents(own.graph, pulled.values(), weights.values(), _varying(form, own, asked)), weights)
 
 
-def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> list[int]:
+def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> NodeList:
     """List the nodes of the state, of its tangent, and of the requested numbers."""
     fixed, _, y, inputs = form.split(own.variables)
     return [*y, *(n for part in own.states for n in part), *([*fixed, *inputs][i] for i in asked)]

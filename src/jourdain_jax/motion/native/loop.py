@@ -53,6 +53,8 @@ from jourdain_jax.native.ffi import (
 )
 from jourdain_jax.native.ir import Value
 
+Loop = Callable[[Start], Found]
+
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a
 # kernel's
 # own memory (`ffi.py`), on a GPU where that is what all lanes share, and how many rows of times there are
@@ -293,7 +295,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[Start], Found]:
+def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
     """Return the kernel of the integrated form, by a tableau, or by Taylor series up to an order."""
     steps = method if order is None else TaylorSteps(order)
 
@@ -321,10 +323,10 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[St
 OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
 
 
-def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
+def flow(form: Form, method: Method, order: int | None) -> Loop:
     """Return the motion by a kernel; `order`: of Taylor series, in place of the tableau."""
 
-    def motion(form: Form) -> Callable[[Start], Found]:
+    def motion(form: Form) -> Loop:
         # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
         too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
         return kernel(form, method, None if too_many else order)
@@ -337,7 +339,7 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
     return differentiated(motion, form, check)
 
 
-def differentiated(motion: Callable[[Form], Callable[[Start], Found]], form: Form, check: Callable[[Form, Start], None]) -> Callable[[Start], Found]:
+def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
     """Return the motion of a form, whose derivative is the motion of the state with one more tangent of each
     part; `check`: whether there is such a one.
     """

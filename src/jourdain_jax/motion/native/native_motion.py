@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
-from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.calculus.reals import Scalar, real_type
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
@@ -42,6 +42,8 @@ from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import on_its_own
 from jourdain_jax.program.graph import Unsupported
+
+Unknowns = Float[Array, "z"]
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
@@ -69,7 +71,7 @@ def _each(part, shape: tuple[int, ...]) -> list:
     return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
 
 
-def moved(rates: Callable[[Float[Array, "z"]], Float[Array, "z"]]) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
+def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
     """Return z as a function of z and of a zero displacement of time along its `rates`."""
 
     def moving_with_time(slope: Callable) -> Callable:
@@ -100,7 +102,7 @@ def moved(rates: Callable[[Float[Array, "z"]], Float[Array, "z"]]) -> Callable[[
     return with_rules(lambda z, d: z, Rules(push, pull))
 
 
-def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
+def _rates(form: Form) -> Callable[[Unknowns], Unknowns]:
     """Return rates of z: the state, time, the known numbers, and the slopes of samples; zero except for the
     first two and samples.
     """
@@ -261,7 +263,7 @@ def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
     return tuple(jax.lax.stop_gradient(jnp.asarray(channel.value, real_type())) for channel in inputs.channels if isinstance(channel, Mode))
 
 
-def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Float[Array, ""], ...]:
+def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scalar, ...]:
     """Tolerances and limits of steps, as a `Start` has them."""
     control = *setup.tolerances, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots)
     return tuple(jnp.asarray(x, real_type()) for x in control)

@@ -7,8 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.motion.integrators.event_search import RUNNING
 from jourdain_jax.motion.native.layout import PROGRESS, Form
+
+Numbers = tuple[PerLane, ...]  # one each
 
 
 def constant_rows(form: Form) -> dict[int, float]:
@@ -26,15 +29,15 @@ class Start(NamedTuple):
     """
 
     of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
-    control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
+    control: Numbers  # rtol, atol, shortest, longest and first step, most steps
     goals: Float[Array, "times *lanes"]  # since the start
-    origin: Float[Array, "*lanes"]  # the time of the start
+    origin: PerLane  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
     known: tuple[tuple[Array, ...], ...]  # numbers; for a loop on arrays the stored arguments of rates, lanes first
-    modes: tuple[Float[Array, "*lanes"], ...] = ()
+    modes: Numbers = ()
     plain: tuple[Array, ...] = ()  # `known` without lanes where all share it, for kernels of a GPU
 
-    def numbers(self) -> tuple[Float[Array, "*lanes"], ...]:
+    def numbers(self) -> Numbers:
         """Return the rows at the start, after the state, that are not `constant_rows`; without lanes where
         all share them.
         """
@@ -53,7 +56,7 @@ class Found(NamedTuple):
 
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
-    t: tuple[Float[Array, "*lanes"], ...]  # of the end, since the start
+    t: Numbers  # of the end, since the start
     log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
     rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, the number of goals that were reached one after the other, and of transitions
     # their number, events, energies lost and modes

@@ -24,7 +24,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, NodeList
 
 RESTS = 1e-3  # of the absolute tolerance of states: far less than errors of steps, and more than round-off
 
@@ -34,11 +34,11 @@ class Reset(NamedTuple):
 
     own: Outputs  # without values
     event: int  # input: which one it is
-    work: list[int]  # inputs: the work and its tangents; none where it is not integrated
-    state: list[int]  # after it, with its tangents
-    modes: list[int]
+    work: NodeList  # inputs: the work and its tangents; none where it is not integrated
+    state: NodeList  # after it, with its tangents
+    modes: NodeList
     lost: int  # energy
-    times: list[int]  # of the event, with its tangents
+    times: NodeList  # of the event, with its tangents
 
     @property
     def graph(self) -> Graph:
@@ -46,7 +46,7 @@ class Reset(NamedTuple):
         return self.own.graph
 
     @property
-    def found(self) -> list[int]:
+    def found(self) -> NodeList:
         """All rows, as `Form.rows_of_transition` has them."""
         return [*self.state, *self.modes, self.lost, *self.times]
 

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, lanes_of
-from jourdain_jax.calculus.reals import Flag, real_type
+from jourdain_jax.calculus.reals import Flag, Scalar, Speeds, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
 from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.motion.native.operands import Operands
@@ -289,14 +289,14 @@ class Beside:
     numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
-    def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
+    def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
         """As `Lowered.fixed_values`."""
         parameters = entries(scene, self.needed)
         if not self.program.fixed or not parameters:  # nothing to hand over, or nothing requested
             return self.program.fixed_values(scene)
         return entries_of(self.fixed(jnp.concatenate(parameters)))
 
-    def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Speeds, Scalar]:
         """As `Lowered.speeds_and_pivot`."""
         of = self.speeds or self.program.all_speeds
         return of(fixed, t, q, y, inputs), smallest_pivot(self.numbers(fixed, t, q, y, inputs)[:-2])

@@ -16,18 +16,20 @@ from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record,
 from jourdain_jax.motion.trajectories.results import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.motion.vector_fields.field import reason_for_matrices
 
+OverTimes = Float[Array, "*lanes times"]
+
 
 class Energies(eqx.Module):
     """Energies along a motion, in J. `balance` is constant for a right motion: T + V, less the work done where some is tracked."""
 
-    kinetic: Float[Array, "*lanes times"]
-    potential: Float[Array, "*lanes times"]
-    work: Float[Array, "*lanes times"] | None
-    lost: Float[Array, "*lanes times"] | None = None  # by events until then; None where no event lets a motion continue
+    kinetic: OverTimes
+    potential: OverTimes
+    work: OverTimes | None
+    lost: OverTimes | None = None  # by events until then; None where no event lets a motion continue
 
     @property
     @with_nan_as_a_mark
-    def balance(self) -> Float[Array, "*lanes times"]:
+    def balance(self) -> OverTimes:
         """T + V - W + D; W is the work of forces without potential and of constraints that do work, D the
         energy lost in events.
         """
@@ -103,7 +105,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
     )
 
 
-def lost_of(trajectory: Record) -> Float[Array, "*lanes times"] | None:
+def lost_of(trajectory: Record) -> OverTimes | None:
     """Return the energy lost in events until each saved time, J; None without events at which the motion
     continues.
     """
