@@ -16,7 +16,7 @@ from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sen
 from jourdain_jax.calculus.reals import Entries, Number, array_module, check_kind, checked_unless_traced, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
-from jourdain_jax.scene.names import as_names, check_names, nearest
+from jourdain_jax.scene.names import Labels, as_names, check_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
 
 _NO_INPUTS = Inputs(())
@@ -64,8 +64,8 @@ class Experiment(eqx.Module):
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Entries, ""]  # s
     correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
-    unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
-    unknown_correlation: tuple[str, ...] = eqx.field(static=True)  # channels
+    unknown_sigma: Labels = eqx.field(static=True)  # channels; their sigma here is 1
+    unknown_correlation: Labels = eqx.field(static=True)  # channels
     ended_by: str = eqx.field(static=True)  # the event whose time was observed, among the channels; empty: none
 
     def __init__(

@@ -37,7 +37,7 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import Labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _NODES, _WEIGHTS = gauss_legendre(5)
@@ -103,7 +103,7 @@ class _Filter:
         self.coordinates = others(dependent_coordinates(scene, self.begin, (), None), count)
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
-    def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Scalar:
+    def log_likelihood(self, unknown: Labels, sigma: Float[Array, "unknown"]) -> Scalar:
         """Return the log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)
@@ -245,7 +245,7 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speed
     return jnp.stack(list(found.values())) if found else jnp.zeros(0)
 
 
-def _begun(run: Experiment, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
+def _begun(run: Experiment, names: Labels) -> Float[Array, "2 unknown"]:
     """Means and standard deviations of these start values."""
     given: dict[str, Any] = dict(run.unknown_start)  # estimates with priors
     known = [(given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0) for name in names]

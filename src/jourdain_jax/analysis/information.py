@@ -37,6 +37,7 @@ from scipy.special import stdtrit
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described, largest, real_type
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
 
@@ -162,7 +163,7 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
     return Vt[S > 1e-6]  # directions of held places alone are none
 
 
-def hidden_combinations(directions, least_part, size, values, labels: tuple[str, ...]) -> tuple[str, ...]:
+def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Labels:
     """Return each direction that does not show, in words. `directions`: rows, changes of theta / size,
     orthonormal; parts below `least_part` are none.
 
@@ -176,7 +177,7 @@ def hidden_combinations(directions, least_part, size, values, labels: tuple[str,
     return tuple(_in_words(row, relative, relative & ~shared, values, labels) for row in basis)
 
 
-def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> str:
+def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels) -> str:
     """Return the direction in words. `power`: the power of the unknown that may stay constant along this
     direction and all others.
     """
@@ -257,8 +258,8 @@ def standard_errors(
 
 
 def weak_combinations(
-    covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]
-) -> tuple[str, ...]:
+    covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: Labels
+) -> Labels:
     """Return the directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
 
     They are those of the unknowns that runs share, where there are any.

@@ -33,7 +33,7 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -287,7 +287,7 @@ class Layout:
         return {place.name for place in self.shared if place.kind == "scene"} | set(self.following)
 
     @property
-    def following(self) -> tuple[str, ...]:
+    def following(self) -> Labels:
         """Names of the dependent parameters: moments of inertia of bodies, and tied ones."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
 

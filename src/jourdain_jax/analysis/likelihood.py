@@ -40,12 +40,12 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_op
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import UnknownNameError, as_names, check_names
+from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_names
 from jourdain_jax.scene.printing import Printed, table
 from jourdain_jax.scene.scene import Scene
 
 
-def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[str, ...]:
+def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Labels:
     """Return one sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`:
     values have a leading axis, and the first one counts.
     """
@@ -133,7 +133,7 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
     return found
 
 
-def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], tuple[str, ...]]) -> tuple[str, ...]:
+def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
     """Return channels with an unknown value; ValueError if it is None in one run and given in another."""
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
@@ -205,8 +205,8 @@ class PlannedInformation(Printed, eqx.Module):
     matrix: Matrix  # F, in the units of the unknowns
     values: Float[Entries, "unknowns"]  # at which it is taken
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
-    labels: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+    labels: Labels = eqx.field(static=True)
+    units: Labels = eqx.field(static=True)
 
     @property
     def covariance(self) -> Matrix:
@@ -228,7 +228,7 @@ class PlannedInformation(Printed, eqx.Module):
         return -_log_det(self.matrix, tuple(self.labels.index(name) for name in asked))
 
     @property
-    def not_identifiable(self) -> tuple[str, ...]:
+    def not_identifiable(self) -> Labels:
         """Combinations of unknowns that the planned runs do not determine, one sentence each."""
         directions, size = self._hidden
         return hidden_combinations(directions, np.sqrt(_CUTOFF), size, np.asarray(self.values), self.labels)

@@ -38,11 +38,9 @@ from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, warn
-from jourdain_jax.scene.names import as_names, check_name
+from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
-
-Names = tuple[str, ...]
 
 
 class Modes(eqx.Module):
@@ -53,11 +51,11 @@ class Modes(eqx.Module):
     left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
     condition: Float[Array, "modes"]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
     scene: Scene
-    named: Names | None = eqx.field(static=True)
+    named: Labels | None = eqx.field(static=True)
 
     @property
-    def names(self) -> Names:
-        """Names of the modes, in the order of the eigenvalues."""
+    def names(self) -> Labels:
+        """Labels of the modes, in the order of the eigenvalues."""
         return mode_names(self.scene, self.named, np.asarray(self.eigenvalues))
 
 
@@ -74,9 +72,9 @@ class Linearization(Printed, eqx.Module):
     residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
     coupling: Scalar  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
     pivot: Scalar  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
-    states: Names = eqx.field(static=True)  # names of the entries of x
-    inputs: Names = eqx.field(static=True)
-    coordinates: Names = eqx.field(static=True)  # names of p
+    states: Labels = eqx.field(static=True)  # names of the entries of x
+    inputs: Labels = eqx.field(static=True)
+    coordinates: Labels = eqx.field(static=True)  # names of p
     about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
 
     def _text(self) -> str:
@@ -104,7 +102,7 @@ class Linearization(Printed, eqx.Module):
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
         return _roots(self._companion())
 
-    def modes(self, names: Names | None = None) -> Modes:
+    def modes(self, names: Labels | None = None) -> Modes:
         """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative).
 
         `names`: of the modes in this order; default: the `mode_names` of the scene, or "mode 1", ...
@@ -112,7 +110,7 @@ class Linearization(Printed, eqx.Module):
         values, shapes, left, condition = _decomposed(self)
         return Modes(values, shapes, left, condition, self.about[0], names)
 
-    def sensitivities(self, mode: str, held: str | Names = (), names: Names | None = None) -> Sensitivities:
+    def sensitivities(self, mode: str, held: str | Labels = (), names: Labels | None = None) -> Sensitivities:
         """Return derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every
         parameter, as machine code: `small.sensitivities("weave")["c"]`.
 
@@ -145,11 +143,11 @@ class Linearization(Printed, eqx.Module):
 def linearize(
     scene: Scene | BuiltFor,
     state: State | dict | None,
-    coordinates: str | Names | None = None,
+    coordinates: str | Labels | None = None,
     *,
     inputs: Numbers | dict | None = None,
-    dependent: str | Names | None = None,
-    privileged: str | Names | None = None,
+    dependent: str | Labels | None = None,
+    privileged: str | Labels | None = None,
 ) -> Linearization:
     """Linearise the equations of motion about a steady `state`, with the residual of its steadiness.
 
@@ -209,7 +207,7 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
         warn(text, SensitivityWarning)
 
 
-def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: Names | None, coordinates: Names | None) -> Linearization:
+def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: Labels | None, coordinates: Labels | None) -> Linearization:
     v, D, mass = instant(scene, state.t, state.q, state.u, f)
     at, names = places_of(scene), perturbed_names(scene)
     q, known = state.q, not is_traced((D, state))
@@ -226,7 +224,7 @@ def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent
     return Linearization(**matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f))
 
 
-def _matrices(scene: Scene, q, v, D, mass, independent: Names, y: tuple[int, ...], coordinates: Names) -> dict:
+def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: tuple[int, ...], coordinates: Labels) -> dict:
     """Return the contents of `Linearization`."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
@@ -251,7 +249,7 @@ def _matrices(scene: Scene, q, v, D, mass, independent: Names, y: tuple[int, ...
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 
-def _second_order(scene: Scene, A, B, mass, independent: Names, y, coordinates: Names):
+def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates: Labels):
     """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass` is that of the
     privileged speeds.
     """
@@ -305,7 +303,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
     return scene.speed_names.entries.index(speed)
 
 
-def _speeds_beside(scene: Scene, y, coordinates: Names) -> np.ndarray:
+def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     """Return positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was

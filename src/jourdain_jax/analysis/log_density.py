@@ -31,7 +31,7 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import reference_parameters
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 
 Point = Float[Array, "unknowns"]
@@ -54,13 +54,13 @@ class LogDensity(eqx.Module):
     prior_height: float  # logarithm of what all priors are at most
     centre: Float[np.ndarray, "unknowns"]
     factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
-    labels: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+    labels: Labels = eqx.field(static=True)
+    units: Labels = eqx.field(static=True)
     layout: Layout = eqx.field(static=True)
     runs: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # numbers of those of each group
     places: tuple[int, ...] = eqx.field(static=True)  # of those unknowns that are no sigmas
-    sigmas: tuple[str, ...] = eqx.field(static=True)  # channels whose sigma is unknown, which come after those
-    with_memory: tuple[str, ...] = eqx.field(static=True)  # channels whose correlation time is, last among the unknowns
+    sigmas: Labels = eqx.field(static=True)  # channels whose sigma is unknown, which come after those
+    with_memory: Labels = eqx.field(static=True)  # channels whose correlation time is, last among the unknowns
     ranges: tuple[Range, ...] = eqx.field(static=True)  # of all unknowns
 
     def __call__(self, z: Point) -> Scalar:

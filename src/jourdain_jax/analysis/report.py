@@ -19,10 +19,9 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_users_lines
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-
-Names = tuple[str, ...]
 
 AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", "affine", "worst_pivot", "typical_pivot", "rank_losses")
 
@@ -39,32 +38,32 @@ class Report(Printed):
     """
 
     scene: str
-    coordinates: Names
-    speeds: Names
+    coordinates: Labels
+    speeds: Labels
     degrees_of_freedom: int
-    rows: Names
+    rows: Labels
     rank: int  # of the rows at generic states
-    redundant_rows: Names  # may be omitted together; the others keep the rank at every probed state
-    integrable_rows: Names  # holonomic by themselves
-    nonholonomic_rows: Names  # by themselves
+    redundant_rows: Labels  # may be omitted together; the others keep the rank at every probed state
+    integrable_rows: Labels  # holonomic by themselves
+    nonholonomic_rows: Labels  # by themselves
     frobenius_violations: dict[str, float]  # relative
     growth_vector: tuple[int, ...]  # empty for rows nonlinear in the speeds
     closed: bool  # further brackets bring nothing new
     bracket_depth: int
     holonomic_rows_together: int | None  # None where the growth vector is not closed
     rheonomic: bool  # anything depends on time by itself
-    depends_on_time: Names  # what: rows, poses, inertias, coordinate rates, loads, potential
+    depends_on_time: Labels  # what: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # rows are linear or affine in the speeds
-    cyclic_coordinates: Names  # of dependent rates; they appear in no equation
-    ignorable_coordinates: Names  # no privileged acceleration depends on them
-    privileged_velocities: Names
+    cyclic_coordinates: Labels  # of dependent rates; they appear in no equation
+    ignorable_coordinates: Labels  # no privileged acceleration depends on them
+    privileged_velocities: Labels
     privileged_by_user: bool
     lowering: str  # operations of the scalar program, and whether and how it is integrated, or why there is none
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
-    rank_losses: Names  # probed configurations where the rows lose rank
+    rank_losses: Labels  # probed configurations where the rows lose rank
     rank_at_start: int | None  # at the given start, or at the scene's example where that has another rank; None otherwise
-    events: Names  # names
+    events: Labels  # names
     domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
     conventions: str
 
@@ -194,7 +193,7 @@ def _span(bounds: tuple[float, float]) -> str:
     return f"{bounds[0]:.4g} to {bounds[1]:.4g}"
 
 
-def _listed(names: Names) -> str:
+def _listed(names: Labels) -> str:
     return f"{len(names)}: {', '.join(names)}" if names else "none"
 
 

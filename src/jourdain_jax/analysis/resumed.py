@@ -42,7 +42,7 @@ from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.spread import RISE_95, side
 from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.calculus.reals import largest
-from jourdain_jax.scene.names import UnknownNameError, check_name
+from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
 from jourdain_jax.scene.printing import Printed
 
 
@@ -155,7 +155,7 @@ def _by_channel(fit: Estimates, data: Experiment, residuals: dict[str, np.ndarra
 class Informed:
     """Shares of the samples for some unknowns."""
 
-    labels: tuple[str, ...]
+    labels: Labels
     of_samples: tuple[dict[str, Float[np.ndarray, "unknowns times"]], ...]  # of each run, by channel: all components of the channel together
     times: tuple[Float[np.ndarray, "times"], ...]  # s
 
@@ -226,7 +226,7 @@ class Profile(Printed):
     high: float
     is_closed: tuple[bool, bool]  # whether the data set them
     kind: str  # "bounded", "one-sided" or "flat"
-    notes: tuple[str, ...]  # what else was seen
+    notes: Labels  # what else was seen
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""

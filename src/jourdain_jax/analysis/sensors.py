@@ -37,6 +37,7 @@ from jourdain_jax.calculus.reals import Entries, Number, Scalar, array_module, c
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import Labels
 
 FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
 Numbers = Float[Entries, "..."]
@@ -294,8 +295,8 @@ class Response(eqx.Module):
     """The numbers of a sensor or actuator of one run, first guesses for estimated ones."""
 
     numbers: dict[str, Numbers | float]
-    unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
-    used: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are not those of an ideal sensor
+    unknown: Labels = eqx.field(static=True)  # names of numbers that are estimated
+    used: Labels = eqx.field(static=True)  # names of numbers that are not those of an ideal sensor
 
     @property
     def is_late(self) -> bool:
@@ -363,7 +364,7 @@ class Drive(Response):
         return eqx.tree_at(lambda i: i.channels[self.index], inputs, self.signal())
 
 
-def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str, ...]]:
+def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
     """Return its numbers (first guesses for estimated ones), names of the estimated ones, and names of all
     that matter.
     """

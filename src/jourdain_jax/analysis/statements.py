@@ -34,6 +34,7 @@ from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
@@ -114,7 +115,7 @@ class Verification(Printed, eqx.Module):
 
     scene: str = eqx.field(static=True)
     checks: tuple[Check, ...]
-    not_applicable: tuple[str, ...] = eqx.field(static=True)  # reductions that do not apply at this state
+    not_applicable: Labels = eqx.field(static=True)  # reductions that do not apply at this state
     mistakes: str = eqx.field(static=True, default="")  # the table of `jj.check`
 
     @property
@@ -194,7 +195,7 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
     return value, change, jnp.max(jnp.abs(value), initial=1.0)
 
 
-def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: tuple[str, ...], seed: int) -> list[Check]:
+def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int) -> list[Check]:
     """Along one random direction: admissible (`Z`) in the coordinates, free in the speeds, relative in the parameters; for every reduction.
 
     None where no reduction applies.

@@ -24,7 +24,7 @@ from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines
-from jourdain_jax.scene.names import as_names, check_names
+from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -55,11 +55,11 @@ def steady(
     scene: Scene | BuiltFor,
     guess: "State | dict",
     *,
-    held: str | tuple[str, ...] = (),
-    moving: str | tuple[str, ...] | None = None,
+    held: str | Labels = (),
+    moving: str | Labels | None = None,
     t0: Number = 0.0,
     inputs: Numbers | dict | None = None,
-    privileged: str | tuple[str, ...] | None = None,
+    privileged: str | Labels | None = None,
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> SteadyMotion:

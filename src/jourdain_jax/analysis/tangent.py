@@ -19,11 +19,11 @@ from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.put_on_rows import State
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 
 
-def perturbed_names(scene: Scene) -> tuple[str, ...]:
+def perturbed_names(scene: Scene) -> Labels:
     """Return names of `ds`: plain coordinates, and three turns in body axes per quaternion:
     `attitude_turn_x`, `..._y`, `..._z`.
     """
@@ -91,7 +91,7 @@ def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray,
     return rows / xp.where(length > 0, length, 1.0)
 
 
-def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
+def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> tuple[int, ...]:
     """Return indices of the independent speeds: the named ones, else the scene's own choice, else the
     engine's.
     """
@@ -116,7 +116,7 @@ def _scaled_rows(scene: Scene, t, q, u, f):
 
 
 def dependent_coordinates(
-    scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None, G: Float[np.ndarray, "rows coordinates"] | None = None
+    scene: Scene, state: State, named: Labels, dependent: Labels | None, G: Float[np.ndarray, "rows coordinates"] | None = None
 ) -> Int[np.ndarray, "dependent"]:
     """Return indices of the perturbations `ds` that follow from the geometric constraints: the named ones,
     else well conditioned ones.

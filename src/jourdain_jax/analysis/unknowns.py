@@ -19,7 +19,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import BodyInertia, Kind, Layout, Place, PossibleInertia, inertia_of_body, tied_by
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.names import as_names, check_name
+from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -38,8 +38,8 @@ class Unknowns:
     guess: Places
     fixed: Bool[np.ndarray, "places"]  # known, and there to give all runs one shape
     ranges: tuple[Range, ...]
-    labels: tuple[str, ...]  # of those that are not fixed
-    units: tuple[str, ...]
+    labels: Labels  # of those that are not fixed
+    units: Labels
     prior_mean: Places  # zero where nothing is known beforehand
     prior_weight: Places  # W; zero where nothing is
     whitening: Float[np.ndarray, "shared shared"]  # M, of priors of shared ones: see `estimate.whitening`

@@ -23,7 +23,7 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.reals import Scalar, compiled_quickly, real_type
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 
 PerHanging = Float[Array, "hangings"]
 Values = dict[str, Scalar]
@@ -71,11 +71,11 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
     )
 
 
-def _misses(readings: Readings) -> tuple[str, ...]:
+def _misses(readings: Readings) -> Labels:
     return tuple(f"miss {part}{k}" for part, numbers in readings.hangings.items() for k in numbers)
 
 
-def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tuple[str, ...]:
+def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Labels:
     """Return a sentence for each part whose upright lines do not meet within their sigmas."""
     names, warnings = _misses(readings), []
     for part in readings.hangings:

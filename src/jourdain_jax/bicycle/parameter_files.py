@@ -19,7 +19,7 @@ from jourdain_jax.calculus import files
 from jourdain_jax.calculus.files import read_text, shortened
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 
 from .parameters import PARAMETER_NAMES, doubts, violations
 
@@ -36,9 +36,9 @@ class MeasuredBicycle:
     values: dict[str, float]  # every name of PARAMETER_NAMES, in that order
     sigmas: dict[str, float]  # the same names; zero where the file gives none
     path: str
-    without_sigma: tuple[str, ...]  # names whose sigma the file does not give
-    ignored: tuple[str, ...]  # names in the file that the Whipple bicycle does not use
-    warnings: tuple[str, ...]  # sentences: odd values, taken as they are
+    without_sigma: Labels  # names whose sigma the file does not give
+    ignored: Labels  # names in the file that the Whipple bicycle does not use
+    warnings: Labels  # sentences: odd values, taken as they are
     covariance: Float[np.ndarray, "parameters parameters"] | None = None  # in the order of `values`; None: not known, and sigmas count as independent
 
     @property
@@ -216,7 +216,7 @@ def _check_known(name: str, where: str) -> None:
         check_name(name, PARAMETER_NAMES, f"{where}: unknown parameter `{shortened(name)}`")
 
 
-def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:
+def _ignored_but_telling(values: dict[str, float]) -> Labels:
     """Return warnings where an ignored value contradicts the symmetry that the model assumes."""
     found = [
         f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0

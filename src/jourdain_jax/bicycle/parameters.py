@@ -13,10 +13,11 @@ from jax import Array
 from jaxtyping import Bool
 
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.scene.names import Labels
 
 # name -> unit, meaning and sign, in the order of the paper's table; arrays of parameters keep this order
 PARAMETERS: dict[str, Mapping] = {field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")}
-PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
+PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
@@ -37,7 +38,7 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
     return broken
 
 
-def doubts(values: Mapping[str, float]) -> tuple[str, ...]:
+def doubts(values: Mapping[str, float]) -> Labels:
     """Return oddities of one bicycle's values that still can be simulated: one sentence each.
 
     A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the other two.

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
+from jourdain_jax.scene.names import Labels
 
 _FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
@@ -40,8 +41,8 @@ class Readings:
     means: dict[str, float]
     sigmas: dict[str, float]
     hangings: dict[str, tuple[int, ...]]
-    without_sigma: tuple[str, ...]
-    unused: tuple[str, ...]
+    without_sigma: Labels
+    unused: Labels
 
     @property
     def by_table(self) -> bool:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import random_states
-from jourdain_jax.calculus.reals import Flag, Scalar, largest
+from jourdain_jax.calculus.reals import Flag, Scalar, at_index, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -34,6 +34,7 @@ from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import Cylinder, Sphere
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
@@ -343,12 +344,12 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     return found
 
 
-def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
+def impossible_bodies(scene: Scene, q) -> Labels:
     """Bodies that no distribution of mass can make, one sentence each; bodies without thickness whose other moments are zero are passed over.
 
     m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
-    stated = {kind: jax.tree.map(lambda x: x[None], _weights(scene, q)[kind]) for kind in ("mass", "inertia")}
+    stated = {kind: at_index(_weights(scene, q)[kind], None) for kind in ("mass", "inertia")}
     return sentences(scene, stated, "faults") + sentences(scene, stated, "moments")
 
 
@@ -357,7 +358,7 @@ def _weights(scene: Scene, q) -> Numbers:
     return {kind: of for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items() if kind in ("mass", "inertia")}
 
 
-def sentences(scene: Scene, numbers: Numbers, group: str) -> tuple[str, ...]:
+def sentences(scene: Scene, numbers: Numbers, group: str) -> Labels:
     """Return one sentence for each fault that a group of the table finds at many states, about the first that shows it. What is not finite shows no other."""
     found = []
     for check in (check for check in CHECKS if check.group == group):

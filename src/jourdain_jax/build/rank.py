@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.reals import check_kind, largest, rank_cutoff
-from jourdain_jax.scene.names import as_names
+from jourdain_jax.calculus.reals import at_index, check_kind, largest, rank_cutoff
+from jourdain_jax.scene.names import Labels, as_names
 from jourdain_jax.scene.scene import Scene
 
 
@@ -45,8 +45,8 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
 
 
 def contradictions(
-    who: str, names: tuple[str, ...], A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
-) -> tuple[str, ...]:
+    who: str, names: Labels, A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
+) -> Labels:
     """Return which rows no speeds meet together at any of some random states, as a sentence.
 
     A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
@@ -69,8 +69,8 @@ def contradictions(
 
 
 def redundant_rows(
-    found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], Scaled]
-) -> tuple[str, ...]:
+    found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: Labels, far: Callable[[], Scaled]
+) -> Labels:
     """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
     state, and does not come near to losing it.
 
@@ -89,7 +89,7 @@ def redundant_rows(
         if ranks_of(found.A[:, rest], errors) != ranks:
             continue
         if everywhere is None:
-            everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
+            everywhere = jax.tree.map(lambda *x: np.concatenate(x), at_index(found, generic), far())
         if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)

@@ -20,15 +20,14 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import is_traced, largest
+from jourdain_jax.calculus.reals import at_index, is_traced, largest
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
-
-Names = tuple[str, ...]
 
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
@@ -38,28 +37,28 @@ WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all pr
 class Structure:
     """Static facts about a scene."""
 
-    row_names: Names
+    row_names: Labels
     rank: int  # of the rows at generic states
     ranks: tuple[int, ...]  # at all probed states
-    redundant_rows: Names  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: Names  # those of them that no identity makes follow from the others: they may not, where no probe lies
-    rank_losses: Names  # configurations among the probed ones with fewer independent rows, as text
+    redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
+    may_set_in: Labels  # those of them that no identity makes follow from the others: they may not, where no probe lies
+    rank_losses: Labels  # configurations among the probed ones with fewer independent rows, as text
     independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
     typical_pivot: float  # its median
     affine: bool  # rows are linear or affine in the speeds
     homogeneous: bool  # phi vanishes at u = 0
-    timed: Names  # what depends on time by itself, out of `TIMED`
+    timed: Labels  # what depends on time by itself, out of `TIMED`
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
-    kinks: Names  # what is not smooth, as sentences
-    odd_bodies: Names  # bodies with moments of inertia that no distribution of mass has
-    odd_grounds: Names  # grounds of contacts that move in another way than is stated
-    faults: Names  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
+    kinks: Labels  # what is not smooth, as sentences
+    odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
+    odd_grounds: Labels  # grounds of contacts that move in another way than is stated
+    faults: Labels  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
@@ -236,7 +235,7 @@ def _probed_structure(scene: Scene) -> Structure:
         if (np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2)))[generic].any():
             break
     on_rows = usable_states(scene, found, generic)
-    numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
+    numbers = at_index(found.numbers, on_rows)
     rough, (grounds, bodies, faults) = kinks(scene, found.q[on_rows & generic], u), (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
     A = found.A * speed_scales(found.M)[:, None]
     usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
@@ -248,12 +247,12 @@ def _probed_structure(scene: Scene) -> Structure:
         raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone tell no rank
     typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
     beyond = found.A_beyond[generic]
-    t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
+    t, u, generic, found = at_index((t, u, generic, found), usable)
     scaled = scaled_states(found, typical)
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
-        _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
+        _check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
     candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     by_user = scene.privileged
     independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
@@ -353,7 +352,7 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
         turned[:, first : first + 4] = q[:, first : first + 4]
     found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
     good = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    return jax.tree.map(lambda x: x[good], scaled_states(found, typical))
+    return at_index(scaled_states(found, typical), good)
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

@@ -232,6 +232,11 @@ def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
 
 
+def at_index(tree, index):
+    """Return `x[index]` of all arrays `x` of a tree."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
 def array_module(x) -> ModuleType:
     """Return `jax.numpy` where something in `x` is traced, otherwise NumPy."""
     return jnp if is_traced(x) else np

@@ -7,7 +7,7 @@ Column k of `R` is body axis k in the inertial frame. With x ahead, y to the lef
 to the right, and one of `rot_y` pitches the nose down and rolls a wheel ahead.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,15 +34,19 @@ def _angle(angle: Number) -> Scalar:
     return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
 
 
+def _turned(angle: Number, rows: Callable) -> Matrix3:
+    """Return the matrix of these rows of cosine, sine, zero and one."""
+    angle = _angle(angle)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack(row) for row in rows(c, s, jnp.zeros_like(c), jnp.ones_like(c))])
+
+
 def rot_x(angle: Number) -> Matrix3:
     """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the x axis.
 
     With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
-    angle = _angle(angle)
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    o, i = jnp.zeros_like(c), jnp.ones_like(c)
-    return jnp.stack([jnp.stack([i, o, o]), jnp.stack([o, c, -s]), jnp.stack([o, s, c])])
+    return _turned(angle, lambda c, s, o, i: [[i, o, o], [o, c, -s], [o, s, c]])
 
 
 def rot_y(angle: Number) -> Matrix3:
@@ -50,10 +54,7 @@ def rot_y(angle: Number) -> Matrix3:
 
     With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
-    angle = _angle(angle)
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    o, i = jnp.zeros_like(c), jnp.ones_like(c)
-    return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
+    return _turned(angle, lambda c, s, o, i: [[c, o, s], [o, i, o], [-s, o, c]])
 
 
 def rot_z(angle: Number) -> Matrix3:
@@ -61,10 +62,7 @@ def rot_z(angle: Number) -> Matrix3:
 
     With z up a positive angle turns to the left. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
-    angle = _angle(angle)
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    o, i = jnp.zeros_like(c), jnp.ones_like(c)
-    return jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, i])])
+    return _turned(angle, lambda c, s, o, i: [[c, -s, o], [s, c, o], [o, o, i]])
 
 
 def skew(v: Vector3) -> Matrix3:

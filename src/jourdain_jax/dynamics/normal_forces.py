@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import largest, rank_cutoff
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 
 
 class Wrenches(eqx.Module):
@@ -25,7 +25,7 @@ class Wrenches(eqx.Module):
     torque: Float[Array, "*rows bodies 3"]  # N m
 
 
-def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
+def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
     """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
     determined.
 
@@ -100,7 +100,7 @@ def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance)
     return largest(changes, 0) <= tolerance * size
 
 
-def _carried(contact: Contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
+def _carried(contact: Contact, name: str, bodies: Labels) -> tuple[int, ...]:
     """Return numbers of the bodies that a contact holds up."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
     return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

@@ -28,7 +28,7 @@ from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import contact_response, resultants, switching_forces
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
-from jourdain_jax.scene.names import Named, UnknownNameError, check_name
+from jourdain_jax.scene.names import Labels, Named, UnknownNameError, check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of
 
@@ -43,8 +43,8 @@ class RowReactions(eqx.Module):
     torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
     direct: Float[Array, "*times rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
     determined: Bool[Array, "*times rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
-    row_names: tuple[str, ...] = eqx.field(static=True)
-    body_names: tuple[str, ...] = eqx.field(static=True)
+    row_names: Labels = eqx.field(static=True)
+    body_names: Labels = eqx.field(static=True)
 
     def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
         """Force on one body (N), by row."""

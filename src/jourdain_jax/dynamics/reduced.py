@@ -32,6 +32,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, of_bodies
 from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.scene.identity import once_per_values
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 8
@@ -56,7 +57,7 @@ class Dependence(eqx.Module):
     privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is a privileged velocity
 
 
-def cyclic_coordinates(scene: Scene) -> tuple[str, ...]:
+def cyclic_coordinates(scene: Scene) -> Labels:
     """Dependent coordinates that appear neither in B, b, beta, gamma, R I R' nor in the impressed forces.
 
     None where rows are nonlinear in the speeds. A quaternion is never cyclic: its own rate depends on it.
@@ -67,7 +68,7 @@ def cyclic_coordinates(scene: Scene) -> tuple[str, ...]:
     return _named(scene, ~found.cyclic_quantities & ~found.privileged)
 
 
-def ignorable_coordinates(scene: Scene) -> tuple[str, ...]:
+def ignorable_coordinates(scene: Scene) -> Labels:
     """Return coordinates that the privileged accelerations do not depend on; a quaternion is named whole.
 
     None where rows are nonlinear in the speeds.
@@ -77,7 +78,7 @@ def ignorable_coordinates(scene: Scene) -> tuple[str, ...]:
     return _named(scene, ~dependence(scene).accelerations)
 
 
-def _named(scene: Scene, chosen) -> tuple[str, ...]:
+def _named(scene: Scene, chosen) -> Labels:
     """Return names of the chosen coordinates; of a quaternion its own name where all four are chosen, none
     otherwise.
     """
@@ -183,12 +184,12 @@ def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
 class ReducedCoordinates:
     """Which coordinates the reduced equations keep, and in which groups the dropped ones are recovered."""
 
-    kept: tuple[str, ...]
-    dropped: tuple[tuple[str, ...], ...]  # groups, in the order of their recovery
-    privileged: tuple[str, ...]  # the speeds y
+    kept: Labels
+    dropped: tuple[Labels, ...]  # groups, in the order of their recovery
+    privileged: Labels  # the speeds y
 
     @property
-    def recovered(self) -> tuple[str, ...]:
+    def recovered(self) -> Labels:
         """All dropped coordinates in the order of their recovery."""
         return tuple(name for group in self.dropped for name in group)
 

@@ -17,7 +17,7 @@ from jourdain_jax.calculus.reals import checked_known, checked_whole, described,
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.rounded_functions import correlated
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
-from jourdain_jax.scene.names import check_names, nearest
+from jourdain_jax.scene.names import Labels, check_names, nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
@@ -132,7 +132,7 @@ class Design(Printed):
             raise ValueError(f"no quantities have these correlations: the matrix\n{matrix}\nis not positive definite; make them smaller") from None
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Labels:
         """Names of what varies, in order."""
         return tuple(self.variables)
 

@@ -24,7 +24,7 @@ from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import Labels, check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
@@ -42,14 +42,14 @@ class MeanGradients(Printed):
     - `lanes`: how many lanes each output has; `failed`: how many motions failed and are left out; `warnings`: what may be wrong with the numbers.
     """
 
-    outputs: tuple[str, ...]
-    names: tuple[str, ...]
+    outputs: Labels
+    names: Labels
     mean: np.ndarray
     gradient: np.ndarray
     standard_error: np.ndarray
     lanes: np.ndarray
     failed: int
-    warnings: tuple[str, ...]
+    warnings: Labels
 
     def of(self, output: str, name: str) -> float:
         """The derivative of the mean of `output` with respect to `name`; ValueError for unknown names."""

@@ -19,7 +19,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.printing import Printed
 
 LEVELS = (0.025, 0.5, 0.975)
@@ -68,12 +68,12 @@ class StudyResult(Printed):
         return self.store.lanes
 
     @property
-    def outputs(self) -> tuple[str, ...]:
+    def outputs(self) -> Labels:
         """Names of the outputs."""
         return self.store.outputs
 
     @property
-    def varied(self) -> tuple[str, ...]:
+    def varied(self) -> Labels:
         """Names of varying quantities: parameters, and start values with `_at_start`."""
         return tuple(self.store.study["varied"])
 

@@ -17,7 +17,7 @@ from jourdain_jax.importers.scene_class import identifier
 from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Push, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Element, Part, XmlFile
-from jourdain_jax.scene.names import as_labels, nearest
+from jourdain_jax.scene.names import Labels, as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 Place = tuple[Vector, Matrix]  # position and rotation
@@ -78,7 +78,7 @@ class _Reader:
         self.moving: set[str | None] = set()  # names of links
         self.start: dict[str, float] = {}
 
-    def tree(self, free: tuple[str, ...]) -> Tree:
+    def tree(self, free: Labels) -> Tree:
         """Return the whole mechanism."""
         for section in self.file.root.findall("worldbody"):
             name = "world" if not self.links else f"world {len(self.links) + 1}"

@@ -15,7 +15,7 @@ from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push,
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -190,7 +190,7 @@ def _mesh(path: str) -> Any:
     return Visual.from_file(path)
 
 
-def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...]) -> type[Scene]:
+def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     """Return the class of scenes of a mechanism. ValueError, which names the `source`, if nothing moves, a
     moving part has no mass, or moments are impossible.
 
@@ -247,7 +247,7 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     return found
 
 
-def _check_masses(tree: Tree, source: str, ignore: tuple[str, ...]) -> None:
+def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
     """Raise a ValueError for a joint that carries no mass, and for impossible moments of inertia; of links
     fixed to each other together.
     """

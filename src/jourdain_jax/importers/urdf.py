@@ -15,7 +15,7 @@ from jourdain_jax.importers.placing import about
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
-from jourdain_jax.scene.names import as_labels, check_names, nearest
+from jourdain_jax.scene.names import Labels, as_labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
@@ -114,7 +114,7 @@ class _Reader:
             if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in ("hinge", "slide"):
                 raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; {nearest(name, self.joints)}")
 
-    def tree(self, base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
+    def tree(self, base: str, motors: Labels, free: Labels) -> Tree:
         """Return the whole mechanism."""
         above: dict[str, tuple[str, str]] = {}  # link -> its joint and its parent
         for name, joint in self.joints.items():

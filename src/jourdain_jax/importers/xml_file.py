@@ -16,7 +16,7 @@ from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes,
 from jourdain_jax.calculus.reals import check_kind
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import as_labels, check_name, nearest
+from jourdain_jax.scene.names import Labels, as_labels, check_name, nearest
 
 Element = ElementTree.Element
 LARGEST = 100_000_000  # bytes of a file
@@ -32,7 +32,7 @@ class Holds:
     idle: str = ""  # attributes and children that move nothing here, and are passed over
     listed: str = ""  # children that move nothing here, and are listed in a warning
     off: Mapping[str, str] = field(default_factory=dict)  # attributes that would move something -> values with which they do not
-    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # attributes -> the values that they may have
+    words: Mapping[str, Labels] = field(default_factory=dict)  # attributes -> the values that they may have
 
 
 class XmlFile:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.structure import Structure
-from jourdain_jax.calculus.reals import largest, real_type
+from jourdain_jax.calculus.reals import at_index, largest, real_type
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.dense_rates import dense_rates
 from jourdain_jax.lowering.elimination import pivots_ok
@@ -66,7 +66,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     large = builder.graph.operations(rates_of(found)) > 5000
     # above so many operations, 6 of the probes are compared
     chosen = np.flatnonzero(usable)[:6] if large else np.arange(probes.count)
-    states = jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs))
+    states = at_index((parameters, t, q, u, inputs), chosen)
     qdot, ydot, events = dense_rates(scene, structure, independent, *states)
     expected, values = np.concatenate([qdot, ydot], axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]

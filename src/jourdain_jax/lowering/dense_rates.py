@@ -20,6 +20,7 @@ from jourdain_jax.build.assembling import speed_scales, typical_lengths
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
+from jourdain_jax.calculus.reals import at_index
 from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
@@ -47,7 +48,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
     functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
     # 4096 states times directions are computed at once
     size = -(-len(t) // (1 + u.size // 4096))
-    found = [_rates(functions, structure, independent, *jax.tree.map(lambda x, i=i: x[i : i + size], states)) for i in range(0, len(t), size)]
+    found = [_rates(functions, structure, independent, *at_index(states, slice(i, i + size))) for i in range(0, len(t), size)]
     return tuple(map(np.concatenate, zip(*found, strict=True)))
 
 

@@ -17,6 +17,7 @@ from jourdain_jax.lowering import export
 from jourdain_jax.program.derivative import differentiable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
 Nodes = tuple[int, ...]  # numbers of nodes of the graph
@@ -49,12 +50,12 @@ class Lowered:
 
     traced: Variables
     scene_name: str
-    parameters: tuple[str, ...]  # names of the scene's leaves
-    units: tuple[str, ...]  # of them, empty where none is stated
+    parameters: Labels  # names of the scene's leaves
+    units: Labels  # of them, empty where none is stated
     conventions: str  # the scene's own words on its axes
-    coordinates: tuple[str, ...]
-    speeds: tuple[str, ...]
-    inputs: tuple[str, ...]
+    coordinates: Labels
+    speeds: Labels
+    inputs: Labels
     independent: Nodes
     dependent: Nodes
     qdot: Nodes  # nodes
@@ -78,8 +79,8 @@ class Lowered:
     projected_u: Nodes  # all speeds projected onto the constraints; none where dependent speeds are eliminated
     at_start: Nodes  # contacts that switch at the start of a motion: `switching.Begun`
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
-    left_out: tuple[str, ...]  # rows that follow from the others
-    held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
+    left_out: Labels  # rows that follow from the others
+    held: Labels  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
@@ -239,7 +240,7 @@ class Lowered:
         return dict(zip(self.variables, (*fixed, t, *q, *y, *inputs), strict=True))
 
     @property
-    def calls(self) -> tuple[str, ...]:
+    def calls(self) -> Labels:
         """Reasons for each call of JAX in the rates and stop events: a part of a load or event without a
         scalar form.
         """

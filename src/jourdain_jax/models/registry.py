@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from importlib import import_module
 
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import Labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
 PLACES = {  # models by the module of this package that holds their classes, which is imported on first use
@@ -56,6 +56,6 @@ def known_model(name: str) -> type[Scene]:
     return MODELS[name]
 
 
-def counts_of(kind: type[Scene]) -> tuple[str, ...]:
+def counts_of(kind: type[Scene]) -> Labels:
     """Return names of the whole numbers that decide the structure of a scene, such as a number of links."""
     return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))

@@ -23,7 +23,7 @@ from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs
 from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.parameters import parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -137,7 +137,7 @@ class WhippleBicycle(Scene):
             "front": disc_contact(pose["front wheel"], self.rF, axis="y", height="row"),
         }
 
-    def mode_names(self, eigenvalues: np.ndarray) -> tuple[str, ...]:
+    def mode_names(self, eigenvalues: np.ndarray) -> Labels:
         """Return names of the four modes: weave is the complex pair, or where all are real the two of one
         sign that meet at a higher speed, which grow when riding forward; of the others castering is the
         faster one, capsize the slower. None of another number of modes.

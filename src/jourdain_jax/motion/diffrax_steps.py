@@ -17,6 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
+from jourdain_jax.calculus.reals import at_index
 from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
@@ -112,7 +113,7 @@ class Diffrax(eqx.Module, Integrator):
             throw=False,
         )
         (found_ts, (t_end,)), (ys, last) = solution.ts, solution.ys
-        y_end = jax.tree.map(lambda x: x[0], last)
+        y_end = at_index(last, 0)
         code = jnp.asarray(results.STEP_TOO_SMALL)
         for told, own in (
             (diffrax.RESULTS.successful, results.SUCCESS),

@@ -2,18 +2,18 @@
 
 from dataclasses import dataclass
 
-Names = tuple[str, ...]
+from jourdain_jax.scene.names import Labels
 
 
 @dataclass(frozen=True)
 class Rows:
     """Which rows hold the scene, and how far they are independent."""
 
-    names: Names
+    names: Labels
     rank: int  # at generic states
-    redundant: Names  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: Names  # redundant at every probed state, but by no identity
-    rank_losses: Names  # probed configurations with fewer independent rows
+    redundant: Labels  # may be omitted together: the others keep the rank at every probed state
+    may_set_in: Labels  # redundant at every probed state, but by no identity
+    rank_losses: Labels  # probed configurations with fewer independent rows
     affine: bool  # linear or affine in the speeds
     homogeneous: bool  # they hold at rest
 
@@ -22,8 +22,8 @@ class Rows:
 class Freedoms:
     """Which speeds are independent, and how well they determine the others."""
 
-    privileged: Names
-    dependent: Names
+    privileged: Labels
+    dependent: Labels
     chosen_by_user: bool
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes; 1 is best
     typical_pivot: float
@@ -38,7 +38,7 @@ class Freedoms:
 class Dependence:
     """Explicit dependence on time, and quantities that change along the motion."""
 
-    on_time: Names  # rows, poses, inertias, coordinate rates, loads, potential
+    on_time: Labels  # rows, poses, inertias, coordinate rates, loads, potential
     driven: bool  # bodies move while all speeds are zero
     varying_inertia: bool
     massless: bool  # nothing has inertia along some motion that the rows hold
@@ -49,5 +49,5 @@ class Conserved:
     """Conserved quantities of a motion."""
 
     energy: bool  # kinetic and potential energy together, without integrated work
-    ignorable: Names  # coordinates that no acceleration depends on; empty where there is no scalar program
-    invariants: Names  # as the scene states them
+    ignorable: Labels  # coordinates that no acceleration depends on; empty where there is no scalar program
+    invariants: Labels  # as the scene states them

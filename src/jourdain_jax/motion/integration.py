@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, in_default_precision
+from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, at_index, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
@@ -198,7 +198,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
-    saved, treedef = jax.tree.flatten(jax.tree.map(lambda x: x[1:], found))
+    saved, treedef = jax.tree.flatten(at_index(found, slice(1, None)))
     passed = jnp.where(jnp.isfinite(transitions), transitions, jnp.nan)
     whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot, passed
     marked = left(asked, [beyond] * len(saved) + [failed] * 4 + [jnp.zeros_like(failed)], [*saved, *whole])

@@ -33,7 +33,7 @@ from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, Vect
 from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import found_before, once_per_values
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -152,7 +152,7 @@ class Model(BuiltFor, Printed):
         return lowered(self.reference.scene, every_speed=self.state == "full")
 
     @property
-    def events(self) -> tuple[str, ...]:
+    def events(self) -> Labels:
         """Names of the events."""
         return names_of_events(self.scene)
 
@@ -168,7 +168,7 @@ class Model(BuiltFor, Printed):
         return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> Labels:
         """Sentences on points to check."""
         said, rows = [], self.rows
         if rows.rank_losses:

@@ -19,7 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import known_numbers
+from jourdain_jax.calculus.reals import at_index, known_numbers
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, Taylor
 from jourdain_jax.motion.integrators.radau import RadauIIA
@@ -72,7 +72,7 @@ def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, 
         # all lanes come to the host where one may run again
         known = jax.tree.map(np.asarray, lanes) if again.size else lanes
         for i in again:
-            found[i] = _next_retry(field, jax.tree.map(lambda x, i=i, known=known: x[i], known), begun[i], options)
+            found[i] = _next_retry(field, at_index(known, i), begun[i], options)
     return found
 
 

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.markers import tap_cotangents, tap_tangents
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import at_index, is_traced
 from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -112,7 +112,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
         return
-    names = jax.tree.map(lambda x: x[0], motions.scene) if motions.q.ndim > 2 else motions.scene
+    names = at_index(motions.scene, 0) if motions.q.ndim > 2 else motions.scene
     if moving_jumps(field, names, motions.inputs, scene_varies, bool(np.all(crossings >= 0))):
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (

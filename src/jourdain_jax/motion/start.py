@@ -25,13 +25,13 @@ from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time, shown_from_users_lines
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import Labels, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 
 _NOTHING: Mapping = MappingProxyType({})
 
 
-def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
+def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: Labels = ()) -> State:
     """Return the state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds
     M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
@@ -133,7 +133,7 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
     return _moved_if_near(model, state, inputs) if contradict else state
 
 
-def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple[tuple, bool]:
+def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
     """Return marks of coordinates and speeds left to the constraints, for given values and guesses as in
     `Guess`; and whether given values may contradict each other.
 
@@ -170,7 +170,7 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
     return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
-def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: tuple[str, ...]) -> None:
+def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> None:
     if (known_numbers(state.residual) < contradiction(start.q.dtype)).all():
         return
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"

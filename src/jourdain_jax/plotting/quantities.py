@@ -16,7 +16,7 @@ from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import UnknownNameError, check_name
+from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 UNITS = {  # by what is measured in them, in those of SI
@@ -78,7 +78,7 @@ def plot(
     return figure, axes
 
 
-def _plot_motions(motions: list, names: tuple[str, ...], units, labels: list[str], bands: list[float], title: str | None, axes):
+def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands: list[float], title: str | None, axes):
     scenes = [_scene(one) for one in motions]
     names = names or scenes[0].coordinate_names.entries
     values = [[_values(one, name, bands) for name in names] for one in motions]
@@ -103,7 +103,7 @@ def _plot_motions(motions: list, names: tuple[str, ...], units, labels: list[str
     return axes[0].figure, axes
 
 
-def _plot_family(family: Family, names: tuple[str, ...], units, title: str | None, axes):
+def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
     """Return every further name against the first one: stable parts in full, others dashed, special points
     marked.
     """

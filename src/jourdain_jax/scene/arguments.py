@@ -34,7 +34,7 @@ from jourdain_jax.calculus.reals import (
     real_type,
     with_usual_promotion,
 )
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 
 F = TypeVar("F", bound=Callable)
@@ -128,7 +128,7 @@ def as_speeds(scene: Scene, u, what: str = "u") -> Speeds:
     return _as_vector(scene, what, u, as_scene(scene).speed_names.entries)
 
 
-def _as_vector(scene: Scene, what: str, x, names: tuple[str, ...]) -> Array:
+def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
     if isinstance(x, jax.Array) and x.shape == (len(names),) and x.dtype == real_type() and not x.weak_type:
         return x  # as it should be, in a twentieth of the time of what follows
     listed = ", ".join(names)

@@ -16,6 +16,7 @@ from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.grounds import Ground, Plane
 from jourdain_jax.scene.motion_state import BodyPose
+from jourdain_jax.scene.names import Labels
 
 _HEIGHTS = ("coordinates", "row")
 IMPACTS = ("moreau", "newton", "poisson", "energetic")
@@ -66,7 +67,7 @@ class Contact(eqx.Module):
     point: Vector3  # m, inertial frame
     plane: Plane
     height: str = eqx.field(static=True)  # "coordinates" or "row"
-    carried: tuple[str, ...] | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
+    carried: Labels | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
     distance: Scalar | None  # m; None: the point's height above the plane
     shape: Shape | None  # what rolls, for pictures
     ground: Ground | None  # what it rolls on, for pictures; None: the plane
@@ -116,7 +117,7 @@ class Rolling(Slipping, total=False):
     centre: Vector | None  # m, body frame, of what rolls
     ground: Ground | None
     height: str
-    carried: tuple[str, ...] | None
+    carried: Labels | None
 
 
 def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Contact:
@@ -235,7 +236,7 @@ def _checked_height(height: str) -> str:
     return height
 
 
-def _checked_carried(carried, body: str) -> tuple[str, ...] | None:
+def _checked_carried(carried, body: str) -> Labels | None:
     if carried is None:
         return None
     names = () if isinstance(carried, str) or not isinstance(carried, Iterable) else tuple(carried)

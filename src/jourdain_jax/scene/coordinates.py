@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Speeds, check_kind, described, real_type
 from jourdain_jax.calculus.rotations import quaternion_rate
-from jourdain_jax.scene.names import Named, check_name
+from jourdain_jax.scene.names import Labels, Named, check_name
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Quaternion:
 class Names:
     """Names of the entries of a flat vector, with runs of entries that may be reached together."""
 
-    entries: tuple[str, ...]
+    entries: Labels
     groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
 
     def view(self, array: Float[Array, "*shape"]) -> Named:

@@ -13,22 +13,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, described, is_traced
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import Labels, check_name, nearest
 
 
 @dataclass(frozen=True)
 class Modes:
     """Names of modes, and of the values of each."""
 
-    pairs: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    pairs: tuple[tuple[str, Labels], ...] = ()
 
     @property
-    def values(self) -> dict[str, tuple[str, ...]]:
+    def values(self) -> dict[str, Labels]:
         """Mode -> names of its values."""
         return dict(self.pairs)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Labels:
         """The modes, in order."""
         return tuple(name for name, _ in self.pairs)
 

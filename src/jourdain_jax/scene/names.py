@@ -6,6 +6,8 @@ from collections.abc import Iterable
 import equinox as eqx
 from jaxtyping import Array, Float
 
+Labels = tuple[str, ...]
+
 
 class UnknownNameError(KeyError):
     """A name that does not exist; unlike a plain KeyError it prints its message without quotes."""
@@ -34,14 +36,14 @@ def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: ty
         check_name(name, valid, what.replace("{}", str(name)), error)
 
 
-def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
+def as_names(names: "str | Iterable[str]") -> Labels:
     """Return names as a tuple; in a text they are separated by spaces, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
         raise ValueError(f"`{names}` was given, expected names in one text or several")
     return tuple(names.split() if isinstance(names, str) else names)
 
 
-def as_labels(labels: "str | Iterable[str]") -> tuple[str, ...]:
+def as_labels(labels: "str | Iterable[str]") -> Labels:
     """Return names of another tool as a tuple, which may have blanks: a text is one."""
     return (labels,) if isinstance(labels, str) else as_names(labels)
 
@@ -71,6 +73,6 @@ class Named(eqx.Module):
     def __contains__(self, name: str) -> bool:
         return name in self.keys()
 
-    def keys(self) -> tuple[str, ...]:
+    def keys(self) -> Labels:
         """Return the names, in order."""
         return tuple(slot for slot, _, _ in self.slots)

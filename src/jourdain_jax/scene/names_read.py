@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.scene.names import Labels
 
 _VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
 _CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_custom_jvp)
@@ -150,7 +151,7 @@ def _attribute(x, name: str):
         return None
 
 
-def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[], list]], ...]:
+def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[], list]], ...]:
     """Return the names that a function loads itself, with their sources: its globals, and the variables of
     enclosing functions; None if not yet set.
     """
@@ -161,7 +162,7 @@ def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[], list]
 
 
 @lru_cache(maxsize=4096)
-def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
+def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]:
     """Return names used by code, including attributes, or only by some instructions; inner functions
     included.
     """

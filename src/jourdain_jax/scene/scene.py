@@ -23,7 +23,7 @@ from jourdain_jax.scene.held_rows import HeldRow
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.modes import Event, Modes
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Labels, Named, nearest
 from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
@@ -60,7 +60,7 @@ class Scene(eqx.Module):
     speeds: ClassVar[Names | None] = None
     inputs: ClassVar[Names] = Names(())
     modes: ClassVar[Modes] = Modes()
-    privileged: ClassVar[tuple[str, ...] | None] = None
+    privileged: ClassVar[Labels | None] = None
     domain: ClassVar[dict[str, tuple[float, float]]] = {}
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
@@ -210,7 +210,7 @@ class Scene(eqx.Module):
                 raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}")
         return replace(self, **changes)
 
-    def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, tuple[str, ...]]:
+    def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
         """Return q and u with the named `values`, the rest at the reference (zero; the identity for
         quaternions); and the given names.
 
@@ -221,13 +221,13 @@ class Scene(eqx.Module):
         return jnp.asarray(q), jnp.asarray(u), given
 
 
-def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], tuple[str, ...]]:
+def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
     """As `Scene.named`; on NumPy where all numbers are known."""
     q, u, given = entries_named(scene, values)
     return _vector(q), _vector(u), given
 
 
-def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str, ...]]:
+def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
     """As `Scene.named`, with entries of q and u in lists."""
     coordinates, speeds = scene.coordinate_names, scene.speed_names
     q, u = scene.coordinates.reference().tolist(), [0.0] * len(speeds)
@@ -243,7 +243,7 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str,
     return q, u, tuple(given)
 
 
-def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) -> list[str]:
+def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str]:
     """Return the other parts of a quaternion that is named in part, put to zero: otherwise its attitude would
     be any one that has these parts.
     """

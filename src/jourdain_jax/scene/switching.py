@@ -25,6 +25,7 @@ from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.held_rows import held_rows
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
@@ -38,13 +39,13 @@ EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
 class Switching:
     """The contacts with friction of a scene, and their declarations."""
 
-    contacts: tuple[str, ...] = ()
+    contacts: Labels = ()
     coordinates: Coordinates | None = None
     inputs: Names | None = None
     modes: Modes | None = None
 
     @property
-    def events(self) -> tuple[str, ...]:
+    def events(self) -> Labels:
         """Names of the events, by contact."""
         return tuple(f"{name} {what}" for name in self.contacts for what in EVENTS_OF_CONTACT)
 

@@ -30,7 +30,7 @@ from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_class
-from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.names import Labels, as_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, table
 from jourdain_jax.scene.scene import Scene
@@ -54,7 +54,7 @@ class Sensitivities(Printed, eqx.Module):
     condition: float  # |y' x| of unit left and right vectors: zero at a double root, where there is no derivative
     by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
     code: int
-    held: tuple[str, ...] = eqx.field(static=True)  # what tells the motion apart and keeps its value
+    held: Labels = eqx.field(static=True)  # what tells the motion apart and keeps its value
 
     def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
         """Return the derivative by a parameter."""
@@ -67,7 +67,7 @@ class Sensitivities(Printed, eqx.Module):
 
 
 @of_known_numbers
-def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | tuple[str, ...]) -> Sensitivities:
+def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels) -> Sensitivities:
     """Return derivatives of the eigenvalue s of small motions about a steady state, all by two reverse
     passes.
     """
@@ -104,7 +104,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     return Sensitivities(mode, s, condition, by_parameter, FOUND if single else SINGULAR, tuple(equations.unknowns[k] for k in fixed))
 
 
-def _held(equations: SteadyEquations, look: Look, named: tuple[str, ...]) -> list[int]:
+def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
     """Return unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise speeds
     in order, then coordinates.
     """

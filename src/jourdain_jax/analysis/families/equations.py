@@ -21,7 +21,7 @@ from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, place
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.scene import Scene
 
 Vector = Float[np.ndarray, "unknowns"]
@@ -46,11 +46,11 @@ class Motions(ABC):
     crossing: Callable[[complex], str]  # what it is that a mode begins or ceases to grow
     t: Scalar  # s, at the start
     scene: Scene
-    vary: tuple[str, ...]  # parameters among the unknowns
+    vary: Labels  # parameters among the unknowns
     given: np.ndarray  # all numbers, those of the unknowns at the guess
     by_name: dict[str, int]  # where coordinates, speeds and what varies are among them
     places: Int[np.ndarray, "unknowns"]  # where the unknowns are
-    unknowns: tuple[str, ...]
+    unknowns: Labels
     size: Vector
     start: Vector  # the guess
     held: Int[np.ndarray, "held"]  # numbers of unknowns that keep their values at the start
@@ -97,7 +97,7 @@ class SteadyEquations(Motions):
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
 
     def __init__(
-        self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: tuple[str, ...] = (), held: tuple[str, ...] = ()
+        self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: Labels = (), held: Labels = ()
     ) -> None:
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
         names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)

@@ -20,7 +20,7 @@ from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, checked_known, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_scene, of_known_numbers, shown_from_users_lines
-from jourdain_jax.scene.names import UnknownNameError, as_names, check_name, check_names
+from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_name, check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
@@ -35,7 +35,7 @@ class FamilyPoint(Printed):
     kind: str
     state: State
     eigenvalues: Modes  # 1/s, in the columns of the family; of a periodic motion multipliers
-    modes: tuple[str, ...]  # names of the modes concerned
+    modes: Labels  # names of the modes concerned
     values: dict[str, float]  # of coordinates, speeds, and the parameter that varies
     tangent: Vector  # of the curve, along its unknowns
     about: str  # what the eigenvalues are
@@ -67,7 +67,7 @@ class Family(Printed):
     equations: Motions
     points: tuple[Point, ...]
     ends: tuple[str, str]  # why the curve ends at its first and at its last point
-    mode_names: tuple[str, ...]
+    mode_names: Labels
     special: tuple[FamilyPoint, ...] = ()
 
     def __len__(self) -> int:
@@ -164,8 +164,8 @@ def family(
     *,
     until: Mapping[str, float] | None = None,
     vary: str | None = None,
-    held: str | tuple[str, ...] = (),
-    names: tuple[str, ...] | None = None,
+    held: str | Labels = (),
+    names: Labels | None = None,
     inputs: Numbers | dict | None = None,
     max_points: int = 4000,
 ) -> Family:

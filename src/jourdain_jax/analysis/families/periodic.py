@@ -43,7 +43,7 @@ from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options,
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import as_names, check_name, check_names
+from jourdain_jax.scene.names import Labels, as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed, complex_numbers
 from jourdain_jax.scene.scene import Scene
 
@@ -92,7 +92,7 @@ def periodic(
     period: Number,
     *,
     until: str | None = None,
-    held: str | tuple[str, ...] = (),
+    held: str | Labels = (),
     shift: Mapping[str, Number] | None = None,
     pieces: int = 4,
     options: Options | None = None,
@@ -161,7 +161,7 @@ class _Shooting(eqx.Module):
     until: int | None = eqx.field(static=True)
     kept: tuple[int, ...] = eqx.field(static=True)  # numbers of z that matter
     free: tuple[int, ...] = eqx.field(static=True)  # and of those that are unknown at the start
-    shifted: tuple[str, ...] = eqx.field(static=True)  # names of what the user says to move
+    shifted: Labels = eqx.field(static=True)  # names of what the user says to move
 
     @property
     def sizes(self) -> Float[np.ndarray, "states"]:
@@ -309,7 +309,7 @@ class OrbitEquations(Motions):
     growth = staticmethod(lambda modes: np.abs(modes) - 1)
     crossing = staticmethod(lambda mode: "pair on the unit circle" if mode.imag else f"multiplier {np.sign(mode.real):.0f}")
 
-    def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: tuple[str, ...], held: tuple[str, ...]) -> None:
+    def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: Labels, held: Labels) -> None:
         self.scene, self.vary, self.problem, self.t = scene, vary, replace(orbit.by, scene=scene), orbit.state.t
         names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
         pieces = [f"{name} in piece {k + 1}" if k else name for k in range(orbit.by.pieces) for name in names]
@@ -334,7 +334,7 @@ class OrbitEquations(Motions):
 
 
 @compiled_quickly
-def _looked(problem: _Shooting, vary: tuple[str, ...], t, numbers: Unknowns) -> tuple[Array, Array, Array]:
+def _looked(problem: _Shooting, vary: Labels, t, numbers: Unknowns) -> tuple[Array, Array, Array]:
     """R, its slopes by all numbers, and the multipliers."""
     x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
     moved = lambda values: replace(problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True))))  # noqa: E731

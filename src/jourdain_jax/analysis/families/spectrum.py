@@ -5,6 +5,7 @@ from jaxtyping import Complex, Float
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import largest
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
 optimize = module_on_first_use("scipy.optimize")
@@ -38,7 +39,7 @@ def are_partners(before, now, k: int, j: int) -> bool:
     return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
 
 
-def mode_names(scene: Scene, names: tuple[str, ...] | None, values: Modes) -> tuple[str, ...]:
+def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
     """Return names of the columns: as stated by the user, by the scene, or by number."""
     named = getattr(scene, "mode_names", None)
     names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from jourdain_jax.calculus.reals import at_index
 from jourdain_jax.motion.arrays.back import cotangents
 from jourdain_jax.motion.arrays.functions import ArrayForm, split
 from jourdain_jax.motion.arrays.loop import Loop
@@ -125,7 +126,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
     if blocks == 1:
         return block(given)
     index = jnp.minimum(jnp.arange(blocks * at_once), count - 1).reshape(blocks, at_once)
-    found = jax.lax.map(block, jax.tree.map(lambda x: x[index], given))
+    found = jax.lax.map(block, at_index(given, index))
     return jax.tree.map(lambda x: x.reshape(blocks * at_once, *x.shape[2:])[:count], found)
 
 

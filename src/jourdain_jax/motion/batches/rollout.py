@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import checked_real, checked_whole, described, is_traced, known_numbers, real_type, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import at_index, checked_real, checked_whole, described, is_traced, known_numbers, real_type, with_nan_as_a_mark
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.explicit_steps import Taylor
@@ -58,7 +58,7 @@ class Rollout(Printed, eqx.Module):
         """Return the motion of sample `index` as a `Trajectory`; IndexError if there is none."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
-        lane = jax.tree.map(lambda x: x[index], self.lanes)
+        lane = at_index(self.lanes, index)
         for way, how in self.reruns:
             if np.any(known_numbers(lane.fallback) == way):
                 return dataclasses.replace(lane, **dict(zip(RERUN_FIELDS, how, strict=True)))
@@ -200,7 +200,7 @@ def rollout(
         return Rollout(lanes)
 
     def run_some(options: AllOptions, index: np.ndarray) -> Trajectory:
-        return run(options, *jax.tree.map(lambda x: x[index], (varied, parameters)))
+        return run(options, *at_index((varied, parameters), index))
 
     pieces = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))

@@ -13,7 +13,7 @@ from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.parameters import parameters_of
 
 OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion, type, what stands for nothing, attributes
@@ -78,7 +78,7 @@ def to_pandas(record: Record):
     return pandas.DataFrame({name: values.ravel() for name, values in _columns(record).items()}, index=index)
 
 
-def _lanes(record: Record) -> tuple[str, ...]:
+def _lanes(record: Record) -> Labels:
     return ("lane",) * (record.q.ndim - 2)
 
 

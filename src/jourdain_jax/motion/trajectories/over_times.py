@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, is_traced, with_nan_as_a_mark, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, with_nan_as_a_mark, with_usual_promotion
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
@@ -21,6 +21,7 @@ from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.inputs import Inputs, for_programs
 from jourdain_jax.scene.modes import Modes
+from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
@@ -33,7 +34,7 @@ class Phases(eqx.Module, Printed):
     events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
     modes: Float[Array, "modes phases"]  # numbers of their values in each phase
     lost: Float[Array, "transitions"]  # J, by which T + V fell at each event
-    event_names: tuple[str, ...] = eqx.field(static=True)
+    event_names: Labels = eqx.field(static=True)
     named: Modes = eqx.field(static=True)
 
     @property
@@ -61,7 +62,7 @@ class Phases(eqx.Module, Printed):
         return jnp.sum(jnp.where(ahead <= 0, self.lost[..., None, :], 0.0), axis=-1)
 
 
-def one_phase(event_names: tuple[str, ...]) -> Phases:
+def one_phase(event_names: Labels) -> Phases:
     """Return the phases of a motion with one of them, without modes."""
     none = jnp.zeros(0)
     return Phases(none, none.astype(jnp.int32), jnp.zeros((0, 1)), none, event_names, Modes())
@@ -97,7 +98,7 @@ class Record(eqx.Module):
     solver: str = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
     unwatched: str = eqx.field(static=True)  # why steps do not watch relations, in words; empty where they do, or there are none
-    event_names: tuple[str, ...] = eqx.field(static=True)
+    event_names: Labels = eqx.field(static=True)
 
 
 @with_usual_promotion
@@ -106,7 +107,7 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
 
     `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
-    first = lambda: jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # noqa: E731  of a batch, the first
+    first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))  # noqa: E731  of a batch, the first
     by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs  # accelerations depend on the rates of the inputs
     known = not is_traced((f, record))
     # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)

@@ -31,7 +31,7 @@ import numpy as np
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import check_kind, described, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import at_index, check_kind, described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
@@ -120,7 +120,7 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
     """
     header, arrays, kind = _read(path, scene, "trajectory")
     lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
-    return jax.tree.map(lambda x: x[0], lanes)
+    return at_index(lanes, 0)
 
 
 @with_nan_as_a_mark
@@ -147,7 +147,7 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     except _NEEDS_NUMBERS:  # a class that looks at them when a scene is made
         each = [_trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()}) for i in range(len(arrays["result"]))]
         lanes = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _check_scene(path, jax.tree.map(lambda x: x[0], lanes.scene))
+    _check_scene(path, at_index(lanes.scene, 0))
     return lanes
 
 

@@ -24,7 +24,7 @@ from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import UnknownNameError, check_name, nearest
+from jourdain_jax.scene.names import Labels, UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import Printed
 
@@ -166,7 +166,7 @@ class Trajectory(Record, Printed):
 
     @property
     @of_known_numbers
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> Labels:
         """Reasons to doubt the motion, the most serious first; empty if there are none. The printed summary
         shows them.
 
@@ -179,12 +179,12 @@ class Trajectory(Record, Printed):
         return (*failure, *warnings_of(diagnose(self), self))
 
     @property
-    def wrong_parameters(self) -> tuple[str, ...]:
+    def wrong_parameters(self) -> Labels:
         """Names of the scene's parameters that are not finite or have the wrong sign."""
         return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
 
     @property
-    def faults(self) -> tuple[str, ...]:
+    def faults(self) -> Labels:
         """Return known causes of a failure, as texts for messages.
 
         Parameters that are not finite or have the wrong sign, otherwise impossible values of bodies, contacts

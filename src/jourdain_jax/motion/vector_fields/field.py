@@ -29,7 +29,7 @@ from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import values
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.scene import Scene
 
 _STATES = ("auto", "minimal", "full")
@@ -155,7 +155,7 @@ class VectorField(eqx.Module):
     projects_speeds: bool = eqx.field(static=True)
     rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/integration.py`)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
-    event_names: tuple[str, ...] = eqx.field(static=True)  # sorted
+    event_names: Labels = eqx.field(static=True)  # sorted
     stops: tuple[bool, ...] = eqx.field(static=True)  # whether each event ends the motion
 
     @property
