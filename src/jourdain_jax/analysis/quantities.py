@@ -37,7 +37,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
-from jourdain_jax.scene.identity import once_per_values
+from jourdain_jax.scene.identity import once_per_class, once_per_values
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.names_read import now_read_by
@@ -92,19 +92,15 @@ def _traced(function: Callable, scene: Scene) -> Channel:
     return Channel(Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
 
 
-def motion_shape(scene: Scene) -> Motion:
-    """Return a motion of this scene with shapes in place of numbers."""
-    return _motion_shape(*_kind(scene))
-
-
 def _kind(scene: Scene):
     leaves, treedef = jax.tree.flatten(scene)
     return treedef, tuple((x.shape, x.dtype) for x in leaves)
 
 
-@lru_cache(maxsize=64)
-def _motion_shape(treedef, shapes) -> Motion:
-    scene = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+@once_per_class
+def motion_shape(scene: Scene) -> Motion:
+    """Return a motion of this scene with shapes in place of numbers."""
+    scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), scene)
     q, u = (jax.ShapeDtypeStruct((len(names),), real_type()) for names in (scene.coordinate_names, scene.speed_names))
     return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
 

@@ -28,7 +28,6 @@ _FORM = "`name = reading+/-sigma`, or several readings with commas between, for 
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
 _WHOLE_FORK, _SPLIT_FORK = ("mH", "TcH1"), ("mG", "mS", "h6", "h7", "d5", "d6", "l", "TcG1", "TcS1")
 _ALWAYS = ("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "TcF1", "TtR1", "TtF1", "mP", "lP", "dP", "TtP1", "TcB1")
-_FEWEST = 3  # hangings, for three numbers in the plane of symmetry
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,8 @@ def read_readings(path: str | Path) -> Readings:
     needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
     missing = [name for name in needed if name not in means]
-    for part, found in hangings.items():
-        missing += [f"{what}{part}{k + 1}" for k in range(len(found), _FEWEST) for what in ("alpha", "a", "Tt")]
+    for part, found in hangings.items():  # three, for three numbers in the plane of symmetry
+        missing += [f"{what}{part}{k + 1}" for k in range(len(found), 3) for what in ("alpha", "a", "Tt")]
     if missing:
         raise ValueError(
             f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and add a line {_FORM} for each."

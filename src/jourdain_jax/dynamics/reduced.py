@@ -35,7 +35,6 @@ from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
-PROBES = 8
 DEPENDS = 1e-9  # change relative to the size of the quantity; larger means that the quantity depends on the coordinate
 
 
@@ -102,7 +101,7 @@ def dependence(scene: Scene) -> Dependence:
     affine in the speeds.
     """
     generator = np.random.default_rng(0)
-    t, q, u = sample_states(scene, PROBES)
+    t, q, u = sample_states(scene, 8)
     q = q + generator.uniform(-0.1, 0.1, q.shape)
     shifts = generator.uniform(0.05, 0.1, q.shape)
     values, one_speed = _probe(scene, t, q, u, shifts)

@@ -36,7 +36,7 @@ from jourdain_jax.motion.native import native_motion, values
 from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.put_on_rows import State, coordinates_elsewhere, projected
 from jourdain_jax.motion.setup import Begun, Passed, Plain, Setup, Solved, times_fit
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories import diagnostics, results
 from jourdain_jax.motion.trajectories.over_times import Phases
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import ByProgram, Instant, Integrated
@@ -291,7 +291,6 @@ def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
 
 
 MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
-DRIFTED = 1e-2  # of the energy that moves
 
 
 def conserves(setup: Setup) -> bool:
@@ -320,7 +319,7 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
     T, V = at.T
     E, error = T + V, jnp.sum(jnp.abs(off - at) + jnp.finfo(at.dtype).eps * jnp.abs(at), axis=1)
     most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # passes over NaN
-    return most[4] + most[5] > jnp.fmax(DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
+    return most[4] + most[5] > jnp.fmax(diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
 
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:

@@ -259,9 +259,6 @@ def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowe
     return program, program.watched(has_events)
 
 
-TOGETHER = 8  # lanes, where the loop is one function
-
-
 def width(program: Lowered) -> int:
     """Return how many lanes of a lowered scene run in lockstep.
 
@@ -270,4 +267,4 @@ def width(program: Lowered) -> int:
     for loops that touch little memory (see `jourdain_jax`); otherwise every operation is started on its own, and many lanes must share that cost.
     """
     # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
-    return TOGETHER if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30
+    return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

@@ -25,7 +25,6 @@ from jourdain_jax.scene.scene import Scene
 
 MEMORY = 2**32  # bytes, where no model states others
 LONGEST = 1 / 16  # of the span: the longest step, by default
-_SHORT = 1e-9  # s, a span for motions that are not requested
 
 
 class Passed(eqx.Module):
@@ -133,7 +132,8 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
         shares = {"ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype), "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
-        return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), _SHORT * x) for name, x in shares.items()})
+        # 1e-9 s: of motions that are not requested
+        return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x) for name, x in shares.items()})
 
     @property
     def reason_against_machine_code(self) -> str:

@@ -22,7 +22,6 @@ from jourdain_jax.native.ir import Value, Writer
 
 _TARGET = "jourdain_jax_on_gpu"
 MOST_KERNELS = 4096  # of a process
-MOST_SLOTS = 4096  # of a thread
 _NUMBER, _FUNCTION, _WORDS = range(3)  # words of a kernel in the table; the number of words
 _BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
 
@@ -143,7 +142,7 @@ def lowered(
     # of all threads, and no more than an eighth of the device: so many slots
     slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
     blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # no grid is without blocks
-    each = min(MOST_SLOTS, slots // blocks)
+    each = min(4096, slots // blocks)  # of a thread
     scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,), dtype=np.dtype(np.float64), weak_type=False)
     # an array without lanes has one axis, whose layout is the same either way
     own = [aval.shape[: len(batch)] == batch and k >= samples for k, aval in enumerate(ctx.avals_in)]

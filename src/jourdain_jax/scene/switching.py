@@ -12,7 +12,6 @@ The mechanics of it: `equations/switching.py`.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from types import CodeType
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.held_rows import held_rows
+from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels
@@ -87,16 +87,11 @@ def _words(code: CodeType) -> set[str]:
     return found
 
 
+@once_per_class
 def switching_of(scene) -> Switching:
     """Return the contacts of a scene that switch."""
     leaves, structure = jax.tree.flatten(scene)
-    return _switching(structure, tuple(np.shape(x) for x in leaves))
-
-
-@lru_cache(maxsize=256)
-def _switching(structure, shapes: tuple[tuple[int, ...], ...]) -> Switching:
-    """`structure`, `shapes`: of the scene."""
-    names: dict[str, tuple[str, ...]] = {}
+    names: dict[str, Labels] = {}
 
     def look(leaves) -> None:
         scene = jax.tree.unflatten(structure, leaves)
@@ -112,7 +107,7 @@ def _switching(structure, shapes: tuple[tuple[int, ...], ...]) -> Switching:
         names.update({name: MODES_OF_CONTACT for name, c in contacts.items() if c.friction is not None})
         names.update(dict.fromkeys(held_rows(scene.velocity_constraints(motion), scene.loads(motion)), MODES_OF_ROW))
 
-    leaves = [jax.ShapeDtypeStruct(shape, real_type()) for shape in shapes]
+    leaves = [jax.ShapeDtypeStruct(np.shape(x), real_type()) for x in leaves]
     jax.eval_shape(look, leaves)
     if not names:
         return NONE_SWITCHES

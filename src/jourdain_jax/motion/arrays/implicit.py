@@ -39,9 +39,8 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
     fault = w.where(solved, RUNNING * 1.0, float(results.UNSOLVED_STEP))
     if form.projects and method.even:
         w.run("onto_rows", y, aim.t_1, y1, told)
-        fault = w.where(
-            solved & (w.load(told, 1) > results.MOST_PROJECTED), float(results.OFF_CONSTRAINTS), fault
-        )
+        # half of the change by the step
+        fault = w.where(solved & (w.load(told, 1) > 0.5), float(results.OFF_CONSTRAINTS), fault)
     elif form.projects:
         project(w, form, p, aim.t_1, y1, error)
     size = w.number(0.0) if method.even else norm(w, form, p, error, y1)

@@ -18,7 +18,6 @@ from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, n
 from jourdain_jax.native.ir import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
-FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
 
 
 class Slot(NamedTuple):
@@ -128,7 +127,8 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
     """As many slots as a third of the memory has for each thread: the record, of up to twice as many, is there beside half of itself while it grows."""
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)
-    slots, first = w.literal(most, "i64"), w.literal(min(FIRST_SLOTS, most) * size, "i64")
+    # memory for 64 at first, then for twice as many, and so on
+    slots, first = w.literal(most, "i64"), w.literal(min(64, most) * size, "i64")
     record, bytes_there = w.room(type="ptr"), w.room(type="i64")
     w.store(first, bytes_there)
     w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), first), record)

@@ -39,8 +39,6 @@ from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitor
 from jourdain_jax.motion.trajectories import results
 
 NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
-LEAST_SHARE = 0.5  # of the slope of a row nonlinear in the speeds, along what it was: a step in which less is left is tried again
-NEAR_SINE, AMPLIFIED = 0.1, 16.0  # below it rows are about to lose rank; the number of round-offs over its square that count as noise
 
 
 IDLE = -9.0  # code of a place that has no lane, or one that has saved all its times
@@ -252,7 +250,8 @@ def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Numbe
 
 def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
     """Return whether some row nearly depends on its predecessors."""
-    return any_of([left < NEAR_SINE**2 * size for left, size in squares])
+    # a sine below 0.1
+    return any_of([left < 0.1**2 * size for left, size in squares])
 
 
 def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Number, y: Number) -> None:
@@ -272,7 +271,8 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
     along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
     width = max(form.speeds, 1)
     rows = [range(k, k + width) for k in range(0, form.turning, width)]
-    lasting = [along(row, now) > LEAST_SHARE * along(row, first) for row in rows]
+    # half of it: a step in which less is left is tried again
+    lasting = [along(row, now) > 0.5 * along(row, first) for row in rows]
     return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
 
 
@@ -292,7 +292,8 @@ def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: 
     free = w.room(form.y)
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
-    amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
+    # 16 round-offs over the square of the sine count as noise
+    amplified = None if rank is None else w.where(rank.near, w.smaller(16.0 * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
 
         def along_rows() -> None:

@@ -7,7 +7,6 @@ SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGU
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = 10, 11, 12, 13, 14, 15, 16, 17
 TOO_MANY_TRANSITIONS, IMPACT_GAINS_ENERGY, PAINLEVE, CONTACTS_UNDECIDED, LIES_FLAT, STICKS = 18, 19, 20, 21, 22, 23
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
-MOST_PROJECTED = 0.5  # of the change by a step
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
