@@ -180,12 +180,6 @@ def _window(x, starts, sizes) -> tuple[slice, ...]:
     return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 
 
-def _dynamic_update_slice(equation, x, update, *starts):
-    x = x.copy()
-    x[_window(x, starts, update.shape)] = update
-    return x
-
-
 def _pad(equation, x, fill):
     out = np.full(equation.outvars[0].aval.shape, fill)
     places, kept = [], []
@@ -276,20 +270,6 @@ def gathered(equation, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
     return np.moveaxis(found, range(indices.ndim - 1, found.ndim), _integers(numbers.offset_dims))
 
 
-def scattered(equation, x: np.ndarray, indices: np.ndarray, updates: np.ndarray) -> np.ndarray | None:
-    """`x` with `updates` in the places `x[..., indices, ...]`."""
-    numbers = equation.params["dimension_numbers"]
-    axes, lanes = _integers(numbers.scatter_dims_to_operand_dims), _integers(numbers.operand_batching_dims)
-    window = _integers(numbers.update_window_dims)
-    whole = [updates.shape[axis] for axis in window] == [n for axis, n in enumerate(x.shape) if axis not in (*axes, *lanes)]
-    places = _places(x, axes, lanes, _integers(numbers.scatter_indices_batching_dims), indices)
-    if not whole or set(_integers(numbers.inserted_window_dims)) != set(axes) or places is None:
-        return None
-    result = np.array(x)
-    np.moveaxis(result, (*lanes, *axes), range(len(places)))[places] = np.moveaxis(updates, window, range(indices.ndim - 1, updates.ndim))
-    return result
-
-
 def _places(x: np.ndarray, axes, lanes, lanes_of_indices, indices: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Index arrays for the axes `(*lanes, *axes)` of x; None where one is out of bounds."""
     sizes = np.array([x.shape[axis] for axis in axes], int)
@@ -329,11 +309,8 @@ RULES: dict[str, Callable] = {
     "reduce_or": _reduced(np.bitwise_or.reduce),
     "optimization_barrier": lambda e, *xs: list(xs),
     "dynamic_slice": lambda e, x, *starts: x[_window(x, starts, e.params["slice_sizes"])],
-    "dynamic_update_slice": _dynamic_update_slice,
     "iota": _iota,
     "pad": _pad,
     "gather": gathered,
-    "scatter": scattered,
     "platform_index": _platform,
-    "argmax": lambda e, x: np.argmax(x, axis=e.params["axes"][0]).astype(e.params["index_dtype"]),
 }
