@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff
+from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, tiny_of
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -272,10 +272,10 @@ def _inertia(motion: Motion) -> dict[str, Scalar]:
     values = {}
     for name, moving in motion.bodies.items():
         body = moving.body
-        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(jnp.abs(body.mass), jnp.finfo(body.mass.dtype).tiny)
+        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(jnp.abs(body.mass), tiny_of(body.mass))
         if not isinstance(body, RigidBody):
             continue
-        size = largest(body.inertia) + jnp.finfo(body.inertia.dtype).tiny
+        size = largest(body.inertia) + tiny_of(body.inertia)
         moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
         values[f"body `{name}`: its inertia is not symmetric"] = largest(body.inertia - body.inertia.T) / size
         values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
@@ -308,7 +308,7 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
         total = resultants(scene, motion, loads=(loads[i],))
         # Q = beta' F + gamma' L + Q_direct
         Q = jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque) + total.direct
-        size = largest(Q) + largest(slope) + jnp.finfo(q.dtype).tiny
+        size = largest(Q) + largest(slope) + tiny_of(q)
         values[f"{_name(i, loads[i])}: its potential does not give its force"] = largest(Z.T @ (Q + slope)) / size
     return values
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, check_kind, compiled_quickly, largest, real_type
+from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
@@ -143,7 +143,7 @@ class _Problem(eqx.Module):
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: int) -> SteadyMotion:
     guess, n, still = jnp.concatenate([q, u]), len(q), jax.lax.stop_gradient(problem)
     size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)
-    eps = float(np.finfo(guess.dtype).eps)
+    eps = float(eps_of(guess))
     round_off = eps**0.5
     z = smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps)
     of_rows, first, _ = left = jnp.stack(problem(z)[2])

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, array_module, rank_cutoff
+from jourdain_jax.calculus.reals import Entries, array_module, rank_cutoff, tiny_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
@@ -138,7 +138,7 @@ def dependent_coordinates(
     G, q = (known.closure_slopes[:, :count], known.coordinates) if G is None else (G[None], np.asarray(state.q)[None])
     S, B = perturbations(scene)
     G = G @ np.stack([S + B @ x for x in q[: len(G)]])
-    G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), np.finfo(G.dtype).tiny)
+    G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), tiny_of(G))
     cutoff = rank_cutoff(G.dtype)
     rank = max(int(np.linalg.matrix_rank(block, tol=cutoff)) for block in G)
     free = others([names.index(name) for name in named], len(names))

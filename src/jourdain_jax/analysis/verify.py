@@ -25,7 +25,7 @@ from jourdain_jax.analysis.statements import Verification, by_reduction, check, 
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest
+from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
@@ -144,7 +144,7 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
 def _size(found: dict, *others) -> float:
     """Return the reference size for differences of forces: impressed and inertial forces."""
     forces = (found["impressed"], found["gyroscopic"], *others)
-    return sum(largest(force) for force in forces) + np.finfo(found["M"].dtype).tiny
+    return sum(largest(force) for force in forces) + tiny_of(found["M"])
 
 
 def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, dict[str, float]]:
@@ -156,7 +156,7 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
     if not _acts_on_speeds(scene):
         newton["bodies: m a - F does not add up to the constraint force"] = found["newton"]
     of_h, of_newton = 1 + largest(found["h"]), _size(found, found["newton"])
-    energy = np.abs(found["energy_rate"] - found["power"]) / (np.finfo(found["M"].dtype).tiny + found["power_scale"])
+    energy = np.abs(found["energy_rate"] - found["power"]) / (tiny_of(found["M"]) + found["power_scale"])
     return {
         "reductions": _reductions(found, applicable),
         "forms": {f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},

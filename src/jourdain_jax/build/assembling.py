@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import largest
+from jourdain_jax.calculus.reals import eps_of, largest
 from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
@@ -98,7 +98,7 @@ def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: F
     A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
     """
     length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
-    return np.where(length > np.sqrt(np.finfo(A.dtype).eps) * beyond, length, beyond)
+    return np.where(length > np.sqrt(eps_of(A)) * beyond, length, beyond)
 
 
 def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import random_states
-from jourdain_jax.calculus.reals import Flag, Scalar, at_index, largest
+from jourdain_jax.calculus.reals import Flag, Scalar, at_index, eps_of, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -86,7 +86,7 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
 
 
 def _round_off(pose: Pose):
-    return 1e6 * jnp.finfo(pose.q.array.dtype).eps
+    return 1e6 * eps_of(pose.q.array)
 
 
 def _lengths(contact: Contact) -> dict[str, Scalar]:

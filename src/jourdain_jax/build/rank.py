@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.reals import at_index, check_kind, largest, rank_cutoff
+from jourdain_jax.calculus.reals import at_index, check_kind, eps_of, largest, rank_cutoff, tiny_of
 from jourdain_jax.scene.names import Labels, as_names
 from jourdain_jax.scene.scene import Scene
 
@@ -99,13 +99,13 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
     """Return the coefficients of the rows `rest` in row s, each in its usual length, at states of full rank;
     infinite where they do not give it.
     """
-    tiny, made = np.finfo(found.A.dtype).tiny, []
+    tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)
     usual = np.median(lengths, axis=0)
     for A, length, its_rank in zip(found.A, lengths, ranks_of(found.A, np.zeros(len(found.A))), strict=True):
         if its_rank == rank:
             c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
-            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
+            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(eps_of(A))
             made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
     return np.array(made).reshape(len(made), len(rest))
 
@@ -114,7 +114,7 @@ def _are_bounded(c: np.ndarray) -> bool:
     """Return whether coefficients at many states are: none is large, nor far beyond its usual size with both
     signs, as tangents are.
     """
-    usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
+    usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(eps_of(c))
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
     return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (largest(c, 0) > 2)))
 

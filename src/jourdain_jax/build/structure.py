@@ -20,7 +20,7 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import at_index, is_traced, largest
+from jourdain_jax.calculus.reals import at_index, eps_of, is_traced, largest
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
@@ -157,7 +157,7 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
     """Return the nonzero quantities at distant states; for constraints, those above round-off."""
-    some = np.sqrt(np.finfo(found.A.dtype).eps)
+    some = np.sqrt(eps_of(found.A))
     seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
     rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
     rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
@@ -258,7 +258,7 @@ def _probed_structure(scene: Scene) -> Structure:
     independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
-    full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
+    full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
     acts, at_rest = lambda name: name in unproved or _moves(found.vanishing[name]), found.vanishing["rows at rest"]
     affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
     # near round-off: work that turns out as zero does less harm than work left out
@@ -317,7 +317,7 @@ def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def _is_singular(M: np.ndarray) -> bool:
     """Return whether scaled inertias are singular at all of some states."""
-    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
+    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M)))
 
 
 def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
@@ -326,7 +326,7 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     for A, M, c in zip(found.A, found.M, found.c, strict=True):
         free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
         sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
-        if not sizes.size or sizes[0] > 16 * len(M) * np.finfo(M.dtype).eps:
+        if not sizes.size or sizes[0] > 16 * len(M) * eps_of(M):
             return
         moved.append(np.abs(c * (free @ directions[:, 0])))
     if not moved:

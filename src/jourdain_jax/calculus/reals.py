@@ -232,6 +232,16 @@ def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
 
 
+def eps_of(x):
+    """Return the round-off of an array's type."""
+    return jnp.finfo(x.dtype).eps
+
+
+def tiny_of(x):
+    """Return the smallest normal number of an array's type."""
+    return jnp.finfo(x.dtype).tiny
+
+
 def at_index(tree, index):
     """Return `x[index]` of all arrays `x` of a tree."""
     return jax.tree.map(lambda x: x[index], tree)

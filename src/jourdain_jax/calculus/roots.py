@@ -31,7 +31,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, largest, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, largest, tiny_of, with_usual_promotion
 
 Unknowns = Float[Array, "unknowns"]
 
@@ -50,7 +50,7 @@ def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
     corrections no longer shrink; what then is still larger than round-off to the power 0.6 has not converged.
     """
 
-    eps = jnp.finfo(guess.dtype).eps
+    eps = eps_of(guess)
 
     def solve(f, x0):
         def running(carry):
@@ -124,7 +124,7 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
         # at most a quarter of the size of the unknowns in one step
-        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(largest(step), jnp.finfo(f.dtype).tiny))
+        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(largest(step), tiny_of(f)))
         # a damping of 1e7: no step makes the rows smaller
         going = (largest(f) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
         return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
@@ -225,7 +225,7 @@ def _loop(step: Callable, carry: tuple, most: int) -> tuple:
         going = quiet < QUIET
         new = jax.lax.cond(eqxi.unvmap_any(going), step, lambda carry: carry, carry)
         old_value, value = jax.lax.stop_gradient((carry[0], new[0]))
-        changed = jnp.any(jnp.abs(value - old_value) > ROUND_OFF * jnp.finfo(value.dtype).eps * (1 + jnp.abs(old_value)))
+        changed = jnp.any(jnp.abs(value - old_value) > ROUND_OFF * eps_of(value) * (1 + jnp.abs(old_value)))
         kept = tuple(jnp.where(going, *pair) for pair in zip(new, carry, strict=True))
         return (kept, jnp.where(going & changed, 0, jnp.minimum(quiet + 1, QUIET))), None
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import largest, rank_cutoff
+from jourdain_jax.calculus.reals import eps_of, largest, rank_cutoff, tiny_of
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.names import Labels, check_names
 
@@ -56,7 +56,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     here = jnp.mean(points, axis=0)
     wrenches = [_resultant(wrench, positions, sets, here) for wrench in (hidden, spare)]
     forces, moments = wrenches[0]
-    tolerance = jnp.sqrt(jnp.finfo(forces.dtype).eps)
+    tolerance = jnp.sqrt(eps_of(forces))
     if len(names) == 1:
         normal = normals[0] @ forces
         return {names[0]: (normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
@@ -64,7 +64,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in names] for own in sets]
     by_set = jnp.asarray(touches, normals.dtype)[:, None, :]
     levers = points - here
-    length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), jnp.finfo(levers.dtype).tiny)
+    length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), tiny_of(levers))
     by_force = (by_set * normals.T).reshape(-1, len(points))  # f = by_force N
     by_moment = (by_set * jnp.cross(levers, normals).T).reshape(-1, len(points)) / length  # moment/length = by_moment N
 

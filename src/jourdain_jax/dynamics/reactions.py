@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Flag, Scalar, largest, rank_cutoff
+from jourdain_jax.calculus.reals import Flag, Scalar, eps_of, largest, rank_cutoff
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
@@ -122,7 +122,7 @@ def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray
     scale = row_scale(A, typical)
     A = jax.lax.stop_gradient(scale[:, None] * A)
     spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
-    return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(jnp.finfo(A.dtype).eps), spare, 0.0)
+    return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(eps_of(A)), spare, 0.0)
 
 
 @eager_if_concrete

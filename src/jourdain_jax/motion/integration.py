@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, at_index, in_default_precision
+from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, at_index, eps_of, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
@@ -277,7 +277,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
 def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     """Return the result code, with the cause if known; later conditions take precedence."""
     start, end = begun.start, solved.y_end
-    eps, finite = jnp.finfo(start.q.dtype).eps, lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
+    eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite(end.q, end.v), code, results.NOT_FINITE)
     # a change of sign, or so small, means that the partition into privileged and dependent speeds was lost
     code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
@@ -317,7 +317,7 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
     """Return whether T + V changed by more than N `steps` explain."""
     at, off = energies
     T, V = at.T
-    E, error = T + V, jnp.sum(jnp.abs(off - at) + jnp.finfo(at.dtype).eps * jnp.abs(at), axis=1)
+    E, error = T + V, jnp.sum(jnp.abs(off - at) + eps_of(at) * jnp.abs(at), axis=1)
     most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # passes over NaN
     return most[4] + most[5] > jnp.fmax(diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
 

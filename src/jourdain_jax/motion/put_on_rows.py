@@ -27,7 +27,7 @@ from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.derivatives import differentiated_as
-from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, rank_cutoff, real_type
+from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, rank_cutoff, real_type
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -295,9 +295,9 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
     low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
     every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
-    tolerance = 16 * float(jnp.finfo(q.dtype).eps)
+    tolerance = 16 * float(eps_of(q))
     scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
-    good = float(jnp.finfo(q.dtype).eps) ** 0.5
+    good = float(eps_of(q)) ** 0.5
     found, guess = first_root(scaled, every, size, tolerance, good, low, high)
     begin, met = jnp.where(free, found.x, q), found.left <= good
     near_q = jnp.where(met, put_positions(scene, t, begin, free, usual)[0], begin)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module
+from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module, eps_of
 from jourdain_jax.motion.inputs import knots_between
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
@@ -184,6 +184,6 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     xp = array_module((ts, t0, t1))
     direction = xp.sign(t1 - t0)
     # times at an end of the span may lie beyond it by four units in the last place
-    slack = 4 * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
+    slack = 4 * eps_of(ts) * xp.maximum(xp.abs(t0), xp.abs(t1))
     from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
     return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)

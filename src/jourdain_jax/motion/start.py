@@ -15,7 +15,7 @@ import numpy as np
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Number, Numbers, at_once, check_kind, compiled_quickly, described, is_traced, known_numbers, nothing_is_traced
+from jourdain_jax.calculus.reals import Number, Numbers, at_once, check_kind, compiled_quickly, described, eps_of, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -162,7 +162,7 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
     these parameters contradict each other at others.
     """
     near = start.residual < contradiction(start.q.dtype)
-    if not known_numbers(near & (start.residual > OFF * np.finfo(start.q.dtype).eps)).all():  # more than round-off is left
+    if not known_numbers(near & (start.residual > OFF * eps_of(start.q))).all():  # more than round-off is left
         return start
     state = consistent(model, start.t, start.q, start.u, inputs)
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]

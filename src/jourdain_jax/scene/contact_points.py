@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, tiny_of
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_at
 
@@ -120,7 +120,7 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
         return jnp.append(x + gap * n - shape.lowest(n), ground.value(x))
 
     guess = _guess(jax.lax.stop_gradient(shape), ground)
-    size = jnp.maximum(jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), jnp.finfo(guess.dtype).tiny)  # the radius, nearly
+    size = jnp.maximum(jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), tiny_of(guess))  # the radius, nearly
     root = newton_root(residual, guess, jnp.full(4, jax.lax.stop_gradient(size)))
     x, gap = root.x[:3], root.x[3]
     found = root.converged

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import eps_of, is_traced
 from jourdain_jax.scene.parameters import parameters_of
 
 
@@ -83,7 +83,7 @@ def _value(value) -> str:
 def in_digits(values) -> list[str]:
     """Return numbers with six digits; those below the round-off of the largest are 0."""
     values = np.asarray(values)
-    least = np.finfo(values.dtype).eps * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
+    least = eps_of(values) * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from jourdain_jax.calculus.reals import at_index
+from jourdain_jax.calculus.reals import at_index, eps_of
 from jourdain_jax.motion.arrays.back import cotangents
 from jourdain_jax.motion.arrays.functions import ArrayForm, split
 from jourdain_jax.motion.arrays.loop import Loop
@@ -41,7 +41,7 @@ def loop_of(
     args, most, eps = (
         integrands.within(goals[0], begun.args),
         setup.most_steps(knots),
-        float(jnp.finfo(y0.q.dtype).eps),
+        float(eps_of(y0.q)),
     )
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import Count, Scalar, largest, passing_cutoff, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, with_nan_as_a_mark
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
@@ -143,7 +143,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             f"rows have rank {high} on the whole motion, but {usual} at generic states: a singular configuration, or another assembly of the scene; "
             "state a `domain` around the motion to decide"
         )
-    elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
+    elif smallest < np.sqrt(eps_of(trajectory.q)):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
         # residual of a row, relative to the state
