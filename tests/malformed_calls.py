@@ -215,7 +215,7 @@ INERTIAS = {
     "inertia(lambda s: jnp.array([1.0, 1.5, 1.0]) * s.moments[0])": "moments about axes 1 and 2 are different multiples of `moments`",
     "inertia(lambda s: s.moments**2)": "entry 11 of its inertia is made of `moments`, expected one parameter times a constant",
     "inertia(lambda s: jnp.diag(s.moments) + s.first * crossing(0, 1) + s.second * crossing(0, 2))": "it has 2 products of inertia and 3 moments that differ",
-    "inertia(lambda s: jnp.diag(s.moments) + s.moments[0] * crossing(0, 1))": "one parameter is a moment and a product",
+    "inertia(lambda s: jnp.diag(s.moments) + s.moments[0] * crossing(0, 1))": "one parameter serves as a moment and a product",
 }
 
 IMPOSSIBLE = {

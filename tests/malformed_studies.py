@@ -22,7 +22,7 @@ DESIGNS: dict[str, str] = {
     "jj.Design({'a': 3.0})": "`a` varies as",
     "jj.Design({'a': [1.0, np.nan]})": "not finite",
     "jj.Design({'a': [1.0], 'b': [1.0, 2.0]})": "`a` has 1, `b` has 2",
-    "jj.Design({'a': [1.0]}, samples=3)": "leave `samples` out",
+    "jj.Design({'a': [1.0]}, samples=3)": "omit `samples`",
     "jj.Design(TWO)": "`samples` is None",
     "jj.Design(TWO, sampler='sobel', samples=8)": "did you mean `sobol`",
     "jj.Design(TWO, sampler='grid', samples=8)": "a grid takes `jj.Levels`, but `mass` varies as",

@@ -156,6 +156,10 @@ def test_the_readme_has_at_most_five_hundred_words():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 500
 
 
+def test_the_site_has_at_most_28_000_words():
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= 28_000
+
+
 def _docstrings():
     path = DOCS / "sphinx_parts" / "docstrings.py"
     spec = importlib.util.spec_from_file_location("docstrings", path)

@@ -109,7 +109,7 @@ def test_lanes_of_a_rollout_are_those_of_xla_step_by_step():
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     disc, board = jj.models.TiltingDisc(), jj.models.Snakeboard()
     assert set_up(disc).reason_against_machine_code == ""
-    assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was asked for"
+    assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was requested"
     assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
     assert "scalar program" in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
     assert set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code == ""

@@ -24,7 +24,7 @@ def page():
 
 def bowl_without_domain(**stated):
     """The page's ball in a bowl without a `domain`, as who has not read on writes it."""
-    exec(code_of(PAGE)[1], names := {})
+    exec(code_of(PAGE)[0], names := {})
     return type("Bowl", (names["Bowl"],), {"domain": {}} | stated)()
 
 

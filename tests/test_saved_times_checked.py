@@ -59,9 +59,9 @@ def test_lanes_with_times_of_their_own_are_judged_one_by_one():
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
     assert np.isnan(lanes.lanes.q[2:]).all()
     assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
-    assert "the times to save at leave the span or are not in order" in str(lanes)
+    assert "saved times lie outside the span or are not in order" in str(lanes)
     assert "lanes 2, 3" in str(lanes)
-    with pytest.raises(jj.SimulationError, match="the times to save at"):
+    with pytest.raises(jj.SimulationError, match="saved times lie outside the span"):
         lanes.lane(2).raise_if_failed()
 
 

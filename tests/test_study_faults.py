@@ -137,14 +137,14 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, path, computed
 def test_a_study_of_which_no_receipt_is_left_has_no_numbers(path):
     for receipt in (path / "run" / "chunks").iterdir():
         receipt.write_bytes(b"torn")
-    with pytest.raises(ValueError, match=f"no chunk of `{path}` is done yet"):
+    with pytest.raises(ValueError, match=f"no chunk of `{path}` is finished"):
         jj.load_study(path).statistics  # noqa: B018
 
 
 @pytest.mark.parametrize("harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")])
 def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, path, computed):
     harm(path / "run" / "grid.json")
-    with pytest.raises(ValueError, match=r"`run/grid.json` is damaged; run the study first"):
+    with pytest.raises(ValueError, match=r"`run/grid.json` is damaged; run the study, which computes it"):
         jj.load_study(path).mean("lean at the end")
     assert_same(run(path), whole)
     assert computed == [0]
@@ -192,7 +192,7 @@ def test_ctrl_c_ends_the_chunk_keeps_it_and_says_how_to_go_on(whole, tmp_path, m
 
     with monkeypatch.context() as patch:
         patch.setattr(Store, "write", write)
-        with pytest.raises(KeyboardInterrupt, match=r"1 of 3 chunks are kept in .*; the same call goes on"):
+        with pytest.raises(KeyboardInterrupt, match=r"1 of 3 chunks are kept in .*; the same call continues"):
             run(path)
     assert signal.getsignal(signal.SIGINT) is handler
     assert sum(jj.load_study(path).counts.values()) == 32
@@ -316,7 +316,7 @@ def test_chunks_of_another_grid_do_not_count(whole, path, computed):
     with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are left out"):
         found = jj.load_study(path)
     assert (found.complete, found.counts) == (False, {})
-    with pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"), pytest.warns(UserWarning, match="come out with other bits"):
+    with pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"), pytest.warns(UserWarning, match="have other bits here"):
         assert run(path).complete
     assert sorted(set(computed)) == [0, 1, 2]
 
