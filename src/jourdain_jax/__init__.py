@@ -129,7 +129,8 @@ if _typing.TYPE_CHECKING:  # imported on first use
 else:  # a static tool does not see it: to one, any other name is a mistake
     _GONE = {
         "Built": "it is `Model`, which `build` returns",
-        "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time",
+        "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take "
+            "half of its time",
     }
     __getattr__, __dir__ = _names_on_first_use(globals(), _GONE)
 

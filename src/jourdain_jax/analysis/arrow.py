@@ -31,9 +31,7 @@ Members = Int[np.ndarray, "members"]  # their numbers
 
 
 class ByMember:
-    """Base of dataclasses of arrays with a leading axis of members, and of parts with such arrays; None for
-    missing parts.
-    """
+    """Base of dataclasses of arrays with a leading axis of members. A missing part is None."""
 
     def _parts(self) -> list:
         return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
@@ -72,7 +70,7 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
 
 @dataclass(frozen=True)
 class Arrow(ByMember):
-    """A linearised problem. Unknowns are (shared, own of piece 0, own of piece 1, ...)."""
+    """A linearised least-squares problem. Its unknowns are (shared, own of piece 0, own of piece 1, ...)."""
 
     local: Float[np.ndarray, "members pieces local width"]  # the rows of T that hold own unknowns
     shared: Float[np.ndarray, "members rows columns"]  # of all pieces together the rest, as one triangle
@@ -92,11 +90,15 @@ class Arrow(ByMember):
 
     @property
     def _blocks(self) -> list[np.ndarray]:
-        """Return rows in the shared unknowns; in a piece and these; in a piece, its predecessor and these."""
+        """Return three blocks of rows: those that contain shared unknowns only, those of single pieces, and
+        those that join a piece to its predecessor.
+        """
         return [x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None]
 
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
-        """Return the entries of x that belong to the columns of each block; before the first piece of a run, which joins nothing, any."""
+        """Return the entries of x for the columns of each block. A first piece has no predecessor; the
+        entries for its place are arbitrary.
+        """
         shared, own = self.split(x)
         if len(self._blocks) == 1:
             return [shared]
@@ -116,8 +118,8 @@ class Arrow(ByMember):
         return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
 
     def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
-        """Return sums over all rows of the quantity `of` rows: (..., rows, columns and residual) -> (...,
-        columns).
+        """Return, for each column, the sum over all rows of the function `of`: (..., rows, columns and
+        residual) -> (..., columns).
         """
         shared, *others = map(of, self._blocks)
         pieces, m, _ = self.counts
@@ -147,7 +149,9 @@ class Arrow(ByMember):
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
     def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: ByUnknown) -> "Arrow":
-        """Return the problem of all other unknowns, with the residuals after the `held` ones have `moved`."""
+        """Return the problem of all other unknowns, with the residuals that result when the `held` ones have
+        `moved`.
+        """
         blocks = [rows.copy() for rows in self._blocks]
         for rows, change, free in zip(blocks, self._changes(np.where(held, moved, 0.0)), self._columns(~held), strict=True):
             rows[..., -1] += change
@@ -155,7 +159,7 @@ class Arrow(ByMember):
         return self._of_blocks(blocks)
 
     def step(self, damping: PerMember, D, held, moved, cutoff: float) -> ByUnknown:
-        """Return the damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
+        """Return the damped step; the `held` unknowns change by `moved`. D: (members, unknowns), positive."""
         _, m, p = self.counts
         here = self._held(held, moved) if held.any() else self
         D_s, D_l = self.split(D)
@@ -171,8 +175,8 @@ class Arrow(ByMember):
 
 
 def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
-    """Add one `residual` (theta - mean) * weight for each unknown, zero without a prior; for shared ones
-    multiplied by M. The scores stay.
+    """Add the `residual` (theta - mean) * weight of each unknown, which is zero without a prior. For shared
+    unknowns it is multiplied by M; the scores stay.
     """
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
@@ -181,10 +185,10 @@ def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[n
 
 
 def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that give own unknowns in terms of shared unknowns and of the piece before, and the rows that are left for these.
+    """Eliminate the unknowns of a piece. Return the rows that express them by the shared unknowns and the
+    previous piece, and the remaining rows.
 
-    `below`: the diagonal (members, pieces, local) of the rows that are added, with a residual. The remaining
-    rows follow one another.
+    `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """
     members, pieces, m, width = local.shape
     if not m:
@@ -209,13 +213,15 @@ def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = 
 
 
 def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.ndarray, "*batch rows wider"]:
-    """Return the rows with zeros in the columns of the piece before, which come after their first m."""
+    """Return the rows with zero columns inserted after their first m columns, for the unknowns of the
+    previous piece.
+    """
     return np.concatenate([rows[..., :m], np.zeros((*rows.shape[:-1], m)), rows[..., m:]], axis=-1)
 
 
 def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float) -> Float[np.ndarray, "members shared"]:
-    """Return the damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c;
-    undetermined directions stay.
+    """Return the damped step of the shared unknowns times D: (S^2 + lambda) ds = - S U' c. Undetermined
+    directions do not move.
     """
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest
@@ -225,7 +231,9 @@ def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cu
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """Makes an arrow of the triangles of all runs, with `local` unknowns of their own in the first columns."""
+    """Make an arrow from the triangles of all runs; their first `local` columns belong to the runs' own
+    unknowns.
+    """
     members, runs, width, _ = triangles.shape
     rest = triangles[:, :, local:, local:]
     scores = (rest[..., None, :, -1] @ rest[..., :-1])[..., 0, :]

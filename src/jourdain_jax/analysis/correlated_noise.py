@@ -28,11 +28,11 @@ SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
 def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Return for each sample of a channel the time index of its last present predecessor (itself if there is
-    none), and the time between, s.
+    """Return, for each sample of a channel, the index of the previous sample that is not missing (its own
+    index if there is none), and the time since then, s.
 
-    That time is infinite if there is none, and for samples that are missing. `weight` is zero where a sample
-    is missing. Both have its shape.
+    The time is infinite for missing samples and where there is no predecessor. `weight` is zero where a
+    sample is missing. Results have its shape.
     """
     index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
     last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)
@@ -43,19 +43,21 @@ def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp
 
 
 def memory(gap, tau, xp=np):
-    """`rho = exp(-gap / tau)`, smooth in tau; zero where the gap is infinite or tau is zero."""
+    """Return `rho = exp(-gap / tau)`, smooth in tau; zero where the gap is infinite or tau is zero."""
     counts = xp.isfinite(gap) & (tau > 0)
     return xp.where(counts, xp.exp(-xp.where(counts, gap, 1.0) / xp.where(counts, tau, 1.0)), 0.0)
 
 
 def whitened(r, previous, rho):
-    """`(r - rho r_before) / sqrt(1 - rho^2)`, where `previous` is r at the sample before."""
+    """Return `(r - rho r_before) / sqrt(1 - rho^2)`; `previous`: r at the sample before."""
     return (r - rho * previous) / (1 - rho**2) ** 0.5
 
 
 @dataclass(frozen=True)
 class Chains:
-    """Which sample goes before which in the residuals of runs of equal structure, of each member."""
+    """The index of the previous sample for each sample in the residuals, for each member of runs of equal
+    structure.
+    """
 
     before: Int[np.ndarray, "runs members samples"]
     gap: Float[np.ndarray, "runs members samples"]  # s
@@ -66,8 +68,8 @@ class Chains:
     def of(
         weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], unknown: list[slice]
     ) -> "Chains":
-        """Return the chains of samples with weights (runs, members, times, *channel), times (runs, times) and
-        correlation times (runs,) of some channels.
+        """Return the chains of samples of some channels, from weights (runs, members, times, *channel), times
+        (runs, times) and correlation times (runs,).
         """
         parts, known, (runs, times) = [], [], ts.shape
         for name, where in channels.items():
@@ -81,8 +83,8 @@ class Chains:
         return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
     def at(self, places: np.ndarray, members: np.ndarray, taus: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of preceding samples, and rho, for lanes: these runs of these members, with
-        correlation times (lanes, channels) where unknown.
+        """Return indices of preceding samples, and rho, for some runs of some members (`lanes`); estimated
+        correlation times have shape (lanes, channels).
         """
         tau = self.known[places].copy()
         for where, value in zip(self.unknown, taus.T, strict=True):
@@ -91,8 +93,7 @@ class Chains:
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
-    """Return `log det(J'J) / 2` in unknowns divided by `size`, with a constant for undetermined directions.
-    """
+    """Return `log det(J'J) / 2` for unknowns divided by `size`; undetermined directions add a constant."""
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts
     members = len(size)
@@ -119,18 +120,22 @@ def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) 
 
 
 def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float, float]:
-    """Shortest and longest correlation time that is looked for, s. ValueError where no run has two samples."""
+    """Return the shortest and longest correlation time (s) of the search. Raises ValueError where no run has
+    two samples.
+    """
     ts = [np.asarray(run.ts) for run in runs if channel in run.values and len(run.ts) > 1]
     if not ts:
-        raise ValueError("a correlation time is None, but each run has only one sample, which cannot determine it; give a number in s, or 0 for white noise")
+        raise ValueError("a correlation time is None, but each run has only one sample, which cannot "
+            "determine it; give a number in s, or 0 for white noise")
     # beyond ten spans hardly to be told from a bias
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
 def log_density(r, weight, ts, tau) -> Scalar:
-    """Logarithm of the density of `r` in units of sigma, `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`, without `log(sigma sqrt(2 pi))`; on JAX arrays.
+    """Return `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`: the logarithm of the density of `r` in units of
+    sigma, without `log(sigma sqrt(2 pi))`, on JAX arrays.
 
-    r, weight: (times, *channel); a weight of zero marks a sample that is missing.
+    r, weight: (times, *channel); a weight of zero marks a missing sample.
     """
     before, gap = chain(weight, ts, jnp)
     rho = memory(gap, tau, jnp)

@@ -43,7 +43,7 @@ class Energy(eqx.Module):
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Conservation of T + V along every motion of a scene, or the loads that change it."""
+    """Conservation of T + V along every motion of a scene, or the list of loads that change it."""
 
     conserved: bool
     changed_by: tuple[str, ...]

@@ -48,15 +48,17 @@ class Range:
     interval: float = 0.0  # h, s, of a memory
 
     def least_size(self, guess: float) -> float:
-        """Return the smallest large change of an unknown near zero: the typical change, or a hundredth of the
-        first guess or of the width.
+        """Return the size of a change that counts as large for an unknown near zero: its typical change, or a
+        hundredth of the first guess or of the width of the range.
         """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
         return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
-        """Other first guesses: for `share` from 0 to 1 all numbers between the bounds; without bounds a factor of five to either side, or a typical change."""
+        """Return another first guess for each `share` from 0 to 1. These cover the range between the bounds;
+        without bounds, a factor of five or a typical change to either side.
+        """
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
         if self.kind == "positive":
@@ -64,7 +66,7 @@ class Range:
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
-        """The part of the range that is not below this number, zero or a little more."""
+        """Return the part of the range at or above this number, which is zero or slightly more."""
         return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
 
     def constrain(self, x: Numbers) -> Numbers:
@@ -75,7 +77,7 @@ class Range:
         return -self.interval / jnp.log(jnp.sin(inside)) if self.kind == "memory" else inside
 
     def log_slope(self, x: Numbers) -> Numbers:
-        """`log |d theta / dx|`; of a correlation time `log |d arcsin rho / dx|`."""
+        """Return `log |d theta / dx|`; for a correlation time `log |d arcsin rho / dx|`."""
         if self.kind in ("bounds", "memory"):
             return np.log(self.high - self.low) + jax.nn.log_sigmoid(x) + jax.nn.log_sigmoid(-x)
         return x if self.kind == "positive" else jnp.zeros_like(x)
@@ -98,8 +100,8 @@ class Range:
 
 
 def positive() -> Range:
-    """Keep an unknown at zero or above: `free={"mass": jj.positive()}`. The default of parameters declared
-    positive or non-negative.
+    """Keep an unknown at zero or above: `free={"mass": jj.positive()}`. This is the default for parameters
+    declared positive or non-negative.
     """
     return Range("positive", low=0.0)
 
@@ -112,13 +114,14 @@ def bounds(low: Number, high: Number) -> Range:
     for name, end in (("low end", low), ("high end", high)):
         checked_known(end, f"{name} of `bounds`", ())
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
+        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero "
+            "use `positive()`, for none `unbounded()`")
     return Range("bounds", float(low), float(high))
 
 
 def unbounded(scale: Number | None = None) -> Range:
-    """Let an unknown take any number, within the declared sign of a parameter. `scale`, in its unit, is a
-    typical change: give it if the first guess is zero.
+    """Let an unknown take any number, within the declared sign of a parameter. `scale`: a typical change, in
+    its unit; required if the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.
     """
@@ -126,13 +129,16 @@ def unbounded(scale: Number | None = None) -> Range:
         return Range("unbounded")
     number = float(checked_known(scale, "`scale` of `unbounded`", ()))
     if not (np.isfinite(number) and number > 0):
-        raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
+        raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of "
+            "the unknown")
     return Range("unbounded", scale=number)
 
 
 @dataclass(frozen=True, eq=False)
 class Correlated:
-    """The prior of one of several numbers that were measured together (`joint_normal`): its mean, its standard deviation, and its place among them."""
+    """The prior of one of several numbers that were measured together (`joint_normal`): its mean, its
+    standard deviation, and its index among them.
+    """
 
     mean: float
     sigma: float
@@ -146,38 +152,43 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
 
     **Arguments**
     - `mean`: name -> mean, in the unit of the parameter, of one number each.
-    - `covariance`: (n, n), in the order of the names. It may be singular: a combination that it says is known exactly is taken as known to a ten thousandth of
-      the standard deviations.
+    - `covariance`: (n, n), in the order of the names. It may be singular: a combination without variance gets
+      a standard deviation of a ten thousandth of the others.
 
-    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.joint_normal(...) | {"gain": None}`. Where only some of the names
-    are free, the covariance is that of these. `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
+    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.joint_normal(...)
+    | {"gain": None}`. If only some of the names are free, their block of the covariance counts.
+    `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
-    **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or no covariance, and a variance that is zero.
-    Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), chapter 14 (prior information as further data).
+    **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or
+    not a covariance, and a variance of zero. Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed.
+    (2013), chapter 14 (prior information as further data).
     """
     if not isinstance(mean, Mapping) or not mean:
-        raise ValueError(f'`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> mean, such as {{"mass": 20.9, "inertia": 1.64}}')
+        raise ValueError(f'`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> '
+            'mean, such as {"mass": 20.9, "inertia": 1.64}')
     means = [float(checked_known(x, f"the mean of `{name}`", (), advice="give one number")) for name, x in mean.items()]
     n, names = len(means), list(mean)
-    C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice=f"one row and one column for each of {', '.join(names)}")
+    C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice="one row and one column "
+        f"for each of {', '.join(names)}")
     if not (np.all(np.isfinite(C)) and np.all(np.isfinite(means))):
         raise ValueError("mean and covariance of `joint_normal` must be finite; omit unknown quantities")
     for name, variance in zip(names, variances := np.diag(C), strict=True):
         if variance <= 0:
-            raise ValueError(f"the variance of `{name}` is {variance:g}, expected a number above zero; omit known quantities")
+            raise ValueError(f"the variance of `{name}` is {variance:g}, expected a number above zero; omit "
+                "known quantities")
     sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
     if largest(correlations - correlations.T) > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
-        raise ValueError("`covariance` of `joint_normal` is not a covariance matrix: its correlations have the "
-            f"eigenvalue {least:.3g}, expected none below zero")
+        raise ValueError("`covariance` of `joint_normal` is not a covariance matrix: its correlations have "
+            f"the eigenvalue {least:.3g}, expected none below zero")
     return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
 
 
 def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
-    """Return M for numbers with these priors (None, or a mean and a sigma): the identity except for jointly
-    measured numbers.
+    """Return M for numbers with these priors (None, or a mean and a sigma). It is the identity except for
+    numbers that were measured together.
     """
     M = np.eye(len(priors))
     together: dict[int, list[int]] = {}
@@ -200,13 +211,15 @@ class Estimate:
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg
 
-    - `guess`: where the fit begins, in the unit of the number. It may be omitted where the number has a
-      value already: a parameter, a start value.
-    - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; by default what suits the number.
-    - `per_run`: whether each run has one of its own; otherwise all runs share it. Start values are each run's own, parameters are shared.
-    - `prior`: what is known beforehand, as `Normal(mean, sigma)`; it counts as one measured value.
+    - `guess`: the value at which the fit begins, in the unit of the number. Parameters and start values have
+      one already, and need none.
+    - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; the default depends on the kind of number.
+    - `per_run`: whether each run has its own value; otherwise all runs share it. Start values always belong
+      to their run, parameters to all runs.
+    - `prior`: earlier knowledge, as `Normal(mean, sigma)`; it counts as one measured value.
 
-    Raises ValueError for numbers that are not finite, and for a prior that is none or has no spread.
+    Raises ValueError for numbers that are not finite, for a prior that is not a `Normal`, and for a sigma of
+    zero.
     """
 
     guess: Any = None  # a number, or several
@@ -233,6 +246,8 @@ def _check_prior(prior) -> None:
     try:
         mean, sigma = float(prior.mean), float(prior.sigma)
     except (AttributeError, TypeError):
-        raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, sigma)`") from None
+        raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, "
+            "sigma)`") from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
-        raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give known numbers without `Estimate`")
+        raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give "
+            "known numbers without `Estimate`")

@@ -46,9 +46,8 @@ Sentences = tuple[str, ...]
 
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentences:
-    """Return one sentence for each run whose motion, with these unknowns, meets an event before a sample that
-    counts, or not the one that was observed, or crosses a jump of its loads.
-    """
+    """Return one sentence for each run whose motion, with these unknowns, meets an event before its last
+    sample, misses the observed event, or crosses a jump of its loads."""
     shared, local = problem.unknowns.split(theta)
     found, layout, options = [], problem.unknowns.layout, problem.asked.options
     for index, run in enumerate(problem.runs):
@@ -58,14 +57,16 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         jumps = partial(moving_jumps, modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
         if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
             found.append(
-                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: derivatives and "
-                "standard errors omit the shift of the times of jumps; let loads change within a short time or length"
+                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: "
+                "derivatives and standard errors omit the shift of the times of jumps; let loads change "
+                "within a short time or length"
             )
         if type(scene).events is Scene.events:
             continue
         if run.ended_by:
             if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
-                found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the observed time; start nearer")
+                found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} "
+                    "times the observed time; start nearer")
             continue
         motion = motion(one.ts)
         late = np.asarray(one.ts) > float(motion.t_end)
@@ -73,8 +74,8 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         if motion.event >= 0 and samples:
             event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
             found.append(
-                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it continued; omit these, or give "
-                "the time at which it was observed, in `events`"
+                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as "
+                "if it continued; omit these, or give the time at which it was observed, in `events`"
             )
     return tuple(found)
 
@@ -203,7 +204,7 @@ class ChannelResiduals(Printed, eqx.Module):
 
     @staticmethod
     def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
-        """Return the summary of the residuals `r` of a channel, NaN where a sample is missing."""
+        """Return the summary of a channel's residuals `r`, which are NaN where a sample is missing."""
         r = r[~np.isnan(r)]
         numbers = (r.mean(), np.sqrt((r**2).mean()), largest(r)) if r.size else (np.nan,) * 3
         return ChannelResiduals(run, name, r.size, *map(float, numbers))
@@ -216,8 +217,8 @@ class ChannelResiduals(Printed, eqx.Module):
 
 
 GONE = {
-    "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about `simulate` of `scene` and `starts`, and give them "
-    "to `fit_batch`"
+    "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about "
+        "`simulate` of `scene` and `starts`, and give them to `fit_batch`"
 }
 
 
@@ -225,11 +226,10 @@ GONE = {
 class Estimates(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. Results at the minimum
-    are computed on first
-    access; each part of it can be requested here: `scene`, `starts`, `standard_errors`, `low`, `high`,
-    `at_bound`, `residuals`, `whitened`, `sigma`,
-    `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
+    After `fit_batch`, every array has a leading axis `repeats`, also those of `scene`. Results at the minimum
+    are computed on first access: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`,
+    `residuals`, `whitened`, `sigma`, `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and
+    the other fields of `Statistics`.
     """
 
     values: PerUnknown
@@ -254,11 +254,13 @@ class Estimates(Printed):
         return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
     def __getattr__(self, name: str) -> Any:
-        """Return an entry of `statistics`, such as `standard_errors`, of the request, or of the unknowns."""
+        """Return an entry of `statistics`, such as `standard_errors`, or of the arguments of the fit, or of
+        the unknowns."""
         parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
         for part in (part for part, names in parts.items() if name in names):
             return getattr(getattr(self, part), name)
-        raise AttributeError(f"`{name}` was removed: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
+        raise AttributeError(f"`{name}` was removed: {GONE[name]}" if name in GONE else "`Fit` has no "
+            f"`{name}`; {nearest(name, dir(self))}")
 
     def __getitem__(self, name: str) -> Estimated:
         check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
@@ -272,7 +274,8 @@ class Estimates(Printed):
 
     @property
     def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
-        """Covariance of the estimates in the order of `labels`, to first order; NaN where not identifiable."""
+        """Return the covariance of the estimates in the order of `labels`, to first order; NaN where not
+        identifiable."""
         return self.information.covariance
 
     @property
@@ -282,9 +285,8 @@ class Estimates(Printed):
 
     @property
     def reduced_chi_square(self) -> PerRepeat:
-        """Sum of squared residuals per degree of freedom, near 1 for a correct scene and correct sigmas; NaN
-        with as many unknowns as samples.
-        """
+        """Return the sum of squared residuals per degree of freedom, near 1 for a correct scene and correct
+        sigmas; NaN with as many unknowns as samples."""
         return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
@@ -303,33 +305,35 @@ class Estimates(Printed):
 
     @property
     def correlated(self) -> Sentences:
-        """Pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first, one sentence each."""
+        """Return pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first,
+        one sentence each."""
         some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
         found = np.triu(self.correlation[np.ix_(some, some)], 1)
         pairs = sorted(zip(*np.nonzero(np.abs(found) >= 0.98), strict=True), key=lambda ij: -abs(found[ij]))
         return tuple(
-            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
-            "the data determine a combination of them far better than either"
+            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at "
+            f"{np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: the data determine a combination "
+            "of them far better than either"
             for i, j in pairs
         )
 
     @property
     def weak(self) -> Sentences:
-        """Poorly determined shared unknowns and combinations, with a relative standard error of 0.1 or more,
-        weakest first, one sentence each.
-        """
+        """Return poorly determined shared unknowns and combinations (relative standard error 0.1 or more),
+        weakest first, one sentence each."""
         return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
 
     @property
     def impossible(self) -> Sentences:
-        """Bodies of the fitted scene that no distribution of mass can make, one sentence each."""
+        """Return one sentence for each body of the fitted scene whose inertia no distribution of mass can
+        have."""
         q, _, _ = self.scene.named(**self.starts[0])
         return impossible_bodies(self.scene, q)
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """Correlation of neighbouring whitened residuals of each channel over all runs, and the value that
-        white ones hardly exceed (3.5 / sqrt(pairs)).
+        """Return the correlation of neighbouring whitened residuals of each channel over all runs, and the
+        limit 3.5 / sqrt(pairs), which white noise rarely exceeds.
         """
         found = {}
         for name in dict.fromkeys(name for run in self.whitened for name in run):
@@ -351,13 +355,16 @@ class Estimates(Printed):
 
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
-        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first order (the delta method). So a combination is
-        told whose parts the data do not tell apart. NaN where it depends on a direction that does not show, or on an unknown at its bound.
+        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first
+        order (the delta method). A combination may have an interval although its parts cannot be told apart.
+        NaN where it depends on an undetermined direction, or on an unknown at its bound.
 
-        - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for print.
+        - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for
+          `print`.
 
-        **Returns** value, standard error and ends of the interval in that shape, of a batch with a leading axis `repeats`. **Raises** ValueError where the
-        function returns no numbers. Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
+        **Returns** value, standard error and ends of the interval in that shape; for a batch with a leading
+        axis `repeats`. **Raises** ValueError where the function returns no numbers. Source: C. R. Rao, Linear
+        Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
         """
         shared = self.layout.sizes[0]
         value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
@@ -369,6 +376,8 @@ class Estimates(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """Return the parameters that follow from unknowns by functions and possible inertias in `free`, as from `derived`."""
+        """Return the parameters that follow from unknowns, by functions or possible inertias in `free`, in
+        the form of `derived`.
+        """
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}

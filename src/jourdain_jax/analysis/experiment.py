@@ -47,9 +47,9 @@ class Experiment(eqx.Module):
     - `events`: the stop event of the scene that ended the run, with the time at which it was observed and its sigma, both in s:
       `events={"has_fallen": (1.83, 0.005)}`. The time at which the motion stops there, less that one, is a residual. Samples after it do not count.
 
-    **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, names
-    that do not match, more than one event, one that is not after the start, and samples that may show times
-    before the start.
+    **Raises** ValueError for times that do not increase, infinite values, channels without any value, sigmas
+    that are not positive, names that do not match, more than one event, an event that is not after the start,
+    and samples that may show times before the start.
     """
 
     ts: Times  # s; all on NumPy where it is known
@@ -108,33 +108,41 @@ class Experiment(eqx.Module):
     def __check_init__(self):
         if not holds(lambda t0, ts: (t0 <= ts[0]) & (t0 < ts[-1]), self.t0, self.ts):
             raise ValueError(
-                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last ({self.ts[-1]} s); give an earlier `t0`"
+                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before "
+                f"the last ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
-            raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the time of an event, in `events`")
+            raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the "
+                "time of an event, in `events`")
         for names, what, known in (
             (self.sigma, "`sigma` names channel `{}`, which has no values", self.values),
-            (self.correlation_time, "`correlation_time` names channel `{}`, which has no values", self.values),
+            (self.correlation_time, "`correlation_time` names channel `{}`, which has no "
+                "values", self.values),
             (self.sensors, "sensor `{}` has no measured values", self.values),
-            (self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start),
+            (self.unknown_start, "unknown start value `{}` has no first guess; give one in "
+                "`start`", self.start),
         ):
             check_names(names, known, what)
         for name in self.values:
             if name not in self.sigma:
-                raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one number for all channels")
+                raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one "
+                    "number for all channels")
         if self.ended_by in (*self.sensors, *self.correlation_time):
-            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; omit them, or rename the channel")
+            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation "
+                "time; omit them, or rename the channel")
         for name, value in self.values.items():
             if not holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
-                    f"channel `{name}` holds values that are infinite, the first at sample {int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; "
-                    "give NaN for samples that are missing"
+                    f"channel `{name}` holds values that are infinite, the first at sample "
+                    f"{int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; give NaN for samples that are "
+                    "missing"
                 )
             if not holds(lambda x: ~np.all(np.isnan(x)), value):
                 raise ValueError(f"channel `{name}` holds only NaN; omit the channel")
         for name, value in self.sigma.items():
             if not holds(lambda x: x > 0, value):
-                raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
+                raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the "
+                    "standard deviation of its noise")
 
     # Equinox's own costs a microsecond each time, to make methods pytrees; a fit asks for a hundred fields
     __getattribute__ = object.__getattribute__
@@ -146,8 +154,8 @@ class Experiment(eqx.Module):
         return found
 
     def sigma_of(self, name: str, repeats: bool = False) -> Numbers:
-        """Return sigma for each measured value of the channel `name`, in its unit; `repeats`: the values have
-        a leading axis of repeats.
+        """Return sigma for each measured value of the channel `name`, in its unit. `repeats`: whether values
+        have a leading axis of repeats.
         """
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
@@ -165,10 +173,12 @@ def _reals(what: str, given: Mapping, advice: str = "check how it is put togethe
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
     """Return the nonzero correlation times; zero for unknown ones."""
     numbers = {name: 0.0 if value is None else value for name, value in given.items()}
-    found = _reals("correlation time of channel", numbers, "give a time in s, or None where it is not known", ())
+    found = _reals("correlation time of channel", numbers, "give a time in s, or None where it is not "
+        "known", ())
     for name, time in found.items():
         if not holds(lambda x: np.isfinite(x) & (x >= 0), time):
-            raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None where it is not known")
+            raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero "
+                "or more; None where it is not known")
     return {name: time for name, time in found.items() if given[name] is None or holds(lambda x: x != 0, time)}
 
 
@@ -181,16 +191,16 @@ def _check_times(ts) -> None:
         k = int(np.argmin(good(ts)))
         after = f" after {ts[k - 1]:.10g} s" if k else ""
         raise ValueError(
-            f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort the samples by time and merge repeated ones"
+            f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort "
+            "the samples by time and merge repeated ones"
         )
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
-    """Return the run with its inputs and sensors made ready, after its channels and shapes were compared with
-    the scene.
+    """Check channels and shapes against the scene; return the run with its inputs and sensors prepared.
 
-    `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, for wrong shapes, and for samples that may show
-    what was before the start.
+    `repeats`: whether values have a leading axis. Raises ValueError for an unknown channel, start value or
+    input, for wrong shapes, and for samples that may show times before the start.
     """
     where = f"run {index} of `{type(scene).__name__}`"
     entries_named(scene, run.start)
@@ -210,9 +220,11 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
             hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
             hint = "; take its only column, `[:, 0]`" if values.shape == (*shape, 1) else hint
-            raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
+            raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for "
+                f"{times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
-            raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
+            raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, "
+                f"expected (), {(times,)} or {shape}")
     inputs, drives = _inputs(scene, run, where, estimates)
     by_name = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
     by_name |= {"readings": readings, "drives": drives, "estimates": estimates}
@@ -220,7 +232,8 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
-    """Return the measured quantity of a sensor (a prepared function, an instrument, or a name) and its shape.
+    """Return the quantity that a sensor measures (a prepared function, an instrument, or a name) and its
+    shape.
     """
     if isinstance(given, Instrument):
         given.check(scene, channel_name, where)
@@ -236,7 +249,8 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, 
     numbers, unknown, used = response(sensor)
     for number in ("gain", "bias"):
         if numbers[number].shape not in ((), shape):
-            raise ValueError(f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, expected () or {shape}")
+            raise ValueError(f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, "
+                f"expected () or {shape}")
     estimates |= {f"{name}.{number}": getattr(sensor, number) for number in unknown}
     named = isinstance(quantity, str)
     return Reading(numbers, unknown, used, None if named else quantity, quantity if named else "")
@@ -253,13 +267,15 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     first, t0 = float(run.ts[np.argmax(at_times)]), float(run.t0)
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
-            f"channel `{name}` of {where} begins at {first:g} s; minus its delay of up to {latest(delay):g} s, this is before the start at t0 = {t0:g} s, "
-            "where the motion is not known; give an earlier `t0` with the start there, or NaN for the first samples"
+            f"channel `{name}` of {where} begins at {first:g} s; minus its delay of up to {latest(delay):g} "
+            f"s, this is before the start at t0 = {t0:g} s, where the motion is not known; give an earlier "
+            "`t0` with the start there, or NaN for the first samples"
         )
 
 
 def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
-    """Return all inputs, at the first guess of estimated numbers; and the actuators with such numbers."""
+    """Return all inputs, with first guesses for estimated numbers, and the actuators that have such numbers.
+    """
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}
@@ -274,12 +290,14 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
         drive = Drive(*response(actuator), actuator.command, scene.inputs.entries.index(name), actuator.hold)
         for number in drive.unknown:
             if f"{name}.{number}" in estimates:
-                raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated {number}; give the channel another name")
+                raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated "
+                    f"{number}; give the channel another name")
             estimates[f"{name}.{number}"] = getattr(actuator, number)
         if drive.has_filter and not holds(lambda command, ts: command[-1] >= ts[-1], actuator.command.ts, run.ts):
             raise ValueError(
-                f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
-                "and its lag ends there; repeat the last value at a later time"
+                f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, "
+                f"before the last sample at {float(run.ts[-1]):g} s, and its lag ends there; repeat the last "
+                "value at a later time"
             )
         inputs = drive.put_into(inputs)
         if drive.unknown:
@@ -288,20 +306,20 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
 
 
 def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
-    """ValueError where all samples of an input that changes lie before the run, or after it."""
+    """Raise ValueError where all samples of a varying input lie before the run, or all after it."""
     def overlaps(knots, x, ts, t0):
         return np.ptp(x) == 0 or (knots[0] < ts[-1] and knots[-1] > t0)
 
     if isinstance(signal, Sampled) and not holds(overlaps, signal.ts, signal.values, run.ts, run.t0):
         first, last, begin, end = (f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1]))
         raise ValueError(
-            f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to {end} s, where it would be constant; "
-            "take both from one clock, or give a number"
+            f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to "
+            f"{end} s, where it would be constant; take both from one clock, or give a number"
         )
 
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
-    """Return the shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
+    """Return the shape of a coordinate or speed: (4,) for a quaternion, (3,) for its rates."""
     both = scene.coordinate_names, scene.speed_names
     entries = both[0].entries + both[1].entries
     if name in entries:
@@ -309,5 +327,6 @@ def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tupl
     groups = {group: length for names in both for group, _, length in names.groups}
     if name not in groups:
         unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
+        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities "
+            "give a function of the motion in `sensors`.")
     return (groups[name],)

@@ -51,15 +51,17 @@ def filtered_log_likelihood(
     ground disturbs the motion, not the sensor.
 
     **Arguments**
-    - `data`: one run or several. A start value is known, or a first guess with an `Estimate(prior=Normal(mean, sigma))` in `unknown_start`: the motion then
-      begins with this spread. Sensors are without delay and lag, with known gain and bias; all numbers are
-      known.
-    - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the speed)^2 / s: left to it alone, the variance of
-      the speed grows by q t. Speeds that are not named are not disturbed. Which speeds are independent: `scene.privileged`, or the engine's choice.
+    - `data`: one run or several. A start value is known, or a first guess with an
+      `Estimate(prior=Normal(mean, sigma))` in `unknown_start`, which is its distribution at the start.
+      Sensors have no delay and no lag, and all their numbers are known.
+    - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the
+      speed)^2 / s: alone, it makes the variance of the speed grow by q t. Speeds without an entry are not
+      disturbed. The independent speeds are those of `scene.privileged`, or the engine's choice.
     - `options`, `by_name`: as of `simulate`.
 
-    The motion and its derivatives with respect to the state come from `simulate`, from each sample to the next. Linear scenes have their exact likelihood; of
-    others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
+    The motion and its derivatives with respect to the state come from `simulate`, from each sample to the
+    next. The likelihood is exact for linear scenes; for others the covariance of the state is propagated to
+    first order. Without process noise and with a known start it equals `log_likelihood`.
 
     Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion), under
     `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is not a
@@ -136,8 +138,8 @@ class _Filter:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
 
     def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
-        """Return the state with these independent coordinates and speeds; the others follow, the coordinates
-        near q.
+        """Return the state with these independent coordinates and speeds. The others follow; coordinates are
+        found near q.
         """
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
@@ -193,29 +195,35 @@ class _Filter:
 
 def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     if scene.coordinates.quaternions:
-        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose covariance the filter does not support; use a scene with angles as coordinates")
+        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose covariance the filter does not "
+            "support; use a scene with angles as coordinates")
     check_known(runs, "a filter")
     for index, run in enumerate(runs):
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, but the filter assumes white noise; omit it")
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, but the filter assumes "
+                "white noise; omit it")
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):
-                raise ValueError(f"run {index} gives the time of its event `{name}`, which the filter does not use; omit it, and the samples after it")
+                raise ValueError(f"run {index} gives the time of its event `{name}`, which the filter does "
+                    "not use; omit it, and the samples after it")
             which = f"sensor `{name}` of run {index}"
             if reading.is_late:
-                raise ValueError(f"{which} has a delay or a lag, which the filter does not support; shift its times by the delay, or use `fit`")
+                raise ValueError(f"{which} has a delay or a lag, which the filter does not support; shift "
+                    "its times by the delay, or use `fit`")
             if isinstance(reading.operation, Instrument):
-                raise ValueError(f"{which} measures accelerations, which contain the white disturbance itself; omit it, or use `fit`")
+                raise ValueError(f"{which} measures accelerations, which contain the white disturbance "
+                    "itself; omit it, or use `fit`")
         for name, given in run.unknown_start.items():
             if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):
                 raise ValueError(
-                    f"start value `{name}` of run {index} is unknown, but has no prior; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
+                    f"start value `{name}` of run {index} is unknown, but has no prior; give "
+                    "`jj.Estimate(prior=jj.Normal(mean, sigma))`"
                 )
 
 
 def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
-    """Return the scene's independent speeds, or those of a scene with another choice where they do not
-    determine the rest at a known start.
+    """Return the scene's independent speeds, or those of a copy with another choice if they do not determine
+    the rest at a known start.
     """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)
@@ -230,13 +238,15 @@ def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
 def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speeds:
     names = [scene.speed_names.entries[i] for i in speeds]
     if not isinstance(given, Mapping):
-        raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> intensity in (unit of the speed)^2 / s")
+        raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> "
+            "intensity in (unit of the speed)^2 / s")
     found = dict.fromkeys(names, jnp.zeros(()))
     for name, value in given.items():
         if name not in names:
             raise ValueError(
-                f"`process_noise` names `{name}`, which is not an independent speed of `{type(scene).__name__}`; {nearest(name, names)} "
-                "To choose others, set `privileged` in the scene."
+                f"`process_noise` names `{name}`, which is not an independent speed of "
+                f"`{type(scene).__name__}`; {nearest(name, names)} To choose others, set `privileged` in the "
+                "scene."
             )
         number = checked_real(value, f"process noise of `{name}`", (), advice="give one number")
         if not holds(lambda x: np.isfinite(x) & (x >= 0), number):

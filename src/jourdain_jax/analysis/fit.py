@@ -49,15 +49,14 @@ class FitFields(OptionFields, total=False):
 
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
-    """Return the minimum from each `theta`; where none is found, or residuals are far beyond their sigmas,
-    the lower one of it and that over growing spans.
+    """Return the minimum from each `theta`. If there is none, or if residuals are far beyond their sigmas,
+    return the lower one of it and the minimum over growing spans.
 
-    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins
-    at the end of the fit over the shorter span, and
-    unknowns not determined by a short span stay near the first guess. A distant fit without progress is
-    replaced by growing spans, and continues only if these do not lead
-    to small residuals either. Where each theta is a first guess of one problem, spans grow only where none
-    led to a minimum with small residuals.
+    Over a short span a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
+    begins at the end of the fit over the shorter span; unknowns that a short span does not determine stay
+    near the first guess. A distant fit without progress is replaced by growing spans, and continues only if
+    these do not lead to small residuals either. If every theta is a first guess of the same problem, spans
+    grow only if none led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
@@ -92,7 +91,7 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
 
 def with_memory(problem: Problem, found: Minimum) -> Minimum:
     """Return the minimum with estimated correlation times of the noise: these and the unknowns are estimated
-    in turns, starting from white noise.
+    alternately, starting from white noise.
     """
     if not problem.with_memory:
         return found
@@ -102,7 +101,8 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = problem.minimum(found.theta[going], going, "whole runs, after a turn of correlation times", some)
+        again = problem.minimum(found.theta[going], going, "whole runs, after a turn of correlation "
+            "times", some)
         found = found.continued(going, again)
         going = going[(changed > 1e-3) | ~again.converged]
     found.converged[going] = False
@@ -110,8 +110,8 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
 
 
 def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
-    """Return the minimum, continued where unknowns leave a bound to lower it; and the statistics of those
-    that stay.
+    """Return the minimum after moving unknowns off their bounds where that lowers it, and the statistics of
+    the unknowns that stay at a bound.
     """
     for _ in range(20):
         with problem.unmoved() if isinstance(problem, Piecewise) else nullcontext():
@@ -119,7 +119,8 @@ def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
         if not told.lower:
             break
         members = np.array(list(told.lower))
-        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, "whole runs, off a bound")
+        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, "whole runs, "
+            "off a bound")
         found = with_memory(problem, found.lowered(members, again.after(found, members)))
     return found, told
 
@@ -151,38 +152,35 @@ def fit(
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. The objective is unchanged.
 
-    By name (`by_name`):
-    - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
-      well above the relative accuracy of the simulation.
-    - `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
-      more than about this fraction. `max_iterations` (50): steps tried at most, over each span.
-    - `loss`: `huber()` or `student_t()` for data with outliers (default: least squares).
-    - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white
-      noise. "runs": the differences between runs
-      (the cluster sandwich, for five runs or more), valid for any noise within a run, also where the scene is
-      not quite right; unknowns of
-      single runs still take noise within the run as white.
-    - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
-      and `Fit.warnings` names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the
-      fitted one does, estimates whose motion ends early would have fewer residuals.
+    By name (`by_name`): - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the
+    largest count as zero (`Information`). Keep it well above the relative accuracy of the simulation. -
+    `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many
+    sigmas, and no unknown by more than about this fraction. `max_iterations` (50): the largest number of
+    steps over each span. - `loss`: `huber()` or `student_t()` for data with outliers (default: least
+    squares). - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid
+    for white noise. "runs": the differences between at least five runs (the cluster sandwich), valid for any
+    noise within a run, even if the scene is not quite right; unknowns of single runs still assume white noise
+    within the run. - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`,
+    `max_steps`. Stop events do not cut a run: all given samples count, and `Fit.warnings` names events that
+    the fitted motion meets before a sample. Give samples up to the event of the real motion; if the fitted
+    motion decided, estimates whose motion ends early would have fewer residuals.
 
     If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans
-    (unless `shooting` is
-    given): the first 1/32 of each run, then more of it, as far as the fitted motion follows the data, with
-    the first guess as a weak prior (known to
-    its own size). So unstable motions can be fitted that no first guess would follow to their end. The lower
-    minimum counts, and `Fit.grown` tells which one it
-    was.
+    (unless `shooting` is given): the first 1/32 of each run, then more of it, as far as the fitted motion
+    follows the data, with the first guess as a weak prior whose sigma is its own size. This also fits
+    unstable motions that no first guess would follow to their end. The lower minimum counts; `Fit.grown`
+    tells whether it came from growing spans.
 
-    **Returns** a `Fit`: estimates with covariance and 95 % intervals (given sigmas count as known; where they
-    are None, or under a robust loss,
-    intervals are those of Student's t), residuals, the fitted scene, and sentences on undetermined
-    combinations. An unknown at its bound has a one-sided
-    interval, by profile likelihood. `converged` is False where no minimum was found. Runs of equal structure go through one compiled program, whatever their
-    number and lengths; time and memory are proportional to the number of runs.
+    **Returns** a `Fit`: estimates with covariance and 95 % intervals, residuals, the fitted scene, and
+    sentences on undetermined combinations. Given sigmas count as known; where they are None, or under a
+    robust loss, intervals are those of Student's t. An unknown at its bound has a one-sided interval, by
+    profile likelihood. `converged` is False where no minimum was found. Runs of equal structure share one
+    compiled program, whatever their number and lengths; time and memory are proportional to the number of
+    runs.
 
-    **Raises** ValueError for names, shapes or numbers that do not fit, no or too many unknowns, and a start that contradicts the
-    constraints; DifferentiationModeError inside `jit`, `vmap` or a derivative, since steps are chosen outside of compiled code.
+    **Raises** ValueError for names, shapes or numbers that do not fit, for no or too many unknowns, and for a
+    start that contradicts the constraints; DifferentiationModeError inside `jit`, `vmap` or a derivative,
+    since steps are chosen outside of compiled code.
 
     **Examples**
 
@@ -193,7 +191,8 @@ def fit(
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
     """
-    guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: how many first guesses to begin from")
+    guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: how many first guesses to "
+        "begin from")
     check_shooting(shooting)
     return _fit(replace(_asked(scene, free, by_name, "fit"), guesses=guesses, shooting=shooting), data)
 
@@ -232,8 +231,9 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     scene, data = asked.scene, tuple(data) if isinstance(data, Iterator) else data
     if is_traced((scene, data, asked.control.tolerance, asked.control.cutoff, asked.options)):
         raise DifferentiationModeError(
-            "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
-            "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
+            "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled "
+            "code. Call it with known numbers; for many repeats use `fit_batch`, for derivatives of the "
+            "fit's objective `log_likelihood`."
         )
     _check_control(asked.control)
     runs = as_runs(scene, data, repeats=repeats)
@@ -266,21 +266,26 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
 
 def _check_control(control: Control) -> None:
     if not 0 < control.cutoff < 1:
-        raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of the largest singular value that counts as zero")
+        raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of "
+            "the largest singular value that counts as zero")
     if not control.tolerance > 0:
-        raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in sigmas that ends the fit")
+        raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in "
+            "sigmas that ends the fit")
     checked_whole(control.most_steps, "`max_iterations`", 0, expected="of steps")
 
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
     if asked.errors == "runs" and len(runs) < 5:
-        raise ValueError(f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give 5 or more, or errors="sigmas"')
+        raise ValueError('errors="runs" takes standard errors from the differences between runs, but there '
+            f'are {len(runs)}; give 5 or more, or errors="sigmas"')
     robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and robust:
-        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of outliers; give a number")
+        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of "
+            "outliers; give a number")
     coloured = sorted({name for run in runs for name in run.correlation_time})
     if coloured and robust:
-        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss assumes independent samples; omit one of them")
+        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss "
+            "assumes independent samples; omit one of them")
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 
@@ -293,8 +298,8 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
         raise ValueError(
-            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; measure more, or free fewer of "
-            f"{', '.join(unknowns.labels)}"
+            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; "
+            f"measure more, or free fewer of {', '.join(unknowns.labels)}"
         )
     return np.asarray(each >= len(unknowns.labels) + sigmas)
 

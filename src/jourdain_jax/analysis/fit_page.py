@@ -21,7 +21,9 @@ _WIDTH, _HEIGHT = 460, 200  # pixels
 
 
 def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:
-    """Draw samples of one component and their prediction; below, errors in sigmas, over a band of two."""
+    """Draw samples of one component with their prediction, and below them the errors in sigmas over a band of
+    two sigmas.
+    """
     value, predicted, sigma = (np.asarray(x).reshape(len(one.ts), -1)[:, component] for x in (one.values, one.prediction, one.sigma))
 
     def draw(whole) -> None:
@@ -45,7 +47,8 @@ def interval_widths(fit: Estimates) -> str:
     half = np.maximum(high - values, values - low)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 100 * half / np.abs(values)
-    told, words = np.isfinite(half), ["one-sided" if bound else "the data do not tell" for bound in fit.at_bound]
+    told, words = np.isfinite(half), ["one-sided" if bound else "the data do not "
+        "tell" for bound in fit.at_bound]
     for i in np.flatnonzero(told):
         words[i] = f"{values[i]:.4g} {fit.units[i]}".strip() + (f" ± {half[i]:.2g}" if share[i] < 1000 else "")
 
@@ -64,7 +67,9 @@ def interval_widths(fit: Estimates) -> str:
 
 
 def profile(one: Profile, error: float) -> str:
-    """Draw the rise along an unknown, its 95 % interval, and the parabola of the standard error."""
+    """Draw the rise of the sum of squares along an unknown, its 95 % interval, and the parabola of the
+    standard error.
+    """
     shown = one.rise <= 3 * RISE_95
     values, rise = one.values[shown], one.rise[shown]
 
@@ -117,8 +122,9 @@ def fit_page(
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]
     if profiles:
         about = (
-            "The rise of the sum of squares when one unknown is held and all others are fitted again. The interval ends where it passes 3.84 (red, "
-            "dashed). Grey: the parabola of the standard error; where both differ, trust the profile."
+            "The rise of the sum of squares when one unknown is held and all others are fitted again. The "
+            "interval ends where it passes 3.84 (red, dashed). Grey: the parabola of the standard error; "
+            "where both differ, trust the profile."
         )
         figures = [profile(one, float(fit[one.name].standard_error)) for one in profiles.values()]
         sections.append(Section("Profile likelihood", about, list(map(str, profiles.values())), figures))
@@ -129,8 +135,8 @@ def fit_page(
         sections.append(_predicted("Data (dots) and prediction (line)", "", fitted, units, "run"))
     if held_out:
         about = (
-            "These runs had no part in the fit. Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of each "
-            "run, are fitted to the run itself."
+            "These runs had no part in the fit. Shared unknowns are held at their estimates; start values "
+            "that are unknown, and numbers of sensors of each run, are fitted to the run itself."
         )
         sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
     sections += [_whiteness(fit, fitted), _way(fit)]
@@ -139,8 +145,8 @@ def fit_page(
 
 def _informed(shares: Informed) -> Section:
     about = (
-        "By how much the variance of an estimate would fall if these samples were a little more precise, of all samples together; it allows for all other "
-        "unknowns being estimated, too."
+        "By how much the variance of an estimate would fall if these samples were a little more precise, of "
+        "all samples together; it allows for all other unknowns being estimated, too."
     )
     shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # of which it is drawn where they inform
     columns = {f"run {run}": shares.of_runs[:, run] for run in shown} | shares.of_channels | {"priors": shares.of_priors}

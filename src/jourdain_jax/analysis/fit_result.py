@@ -26,12 +26,13 @@ def warnings_of(fit: Estimates) -> Labels:
     if not np.isfinite(fit.chi_square):
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is not a number any more
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
-        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.events_met)
+        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with "
+            "`simulate`", *fit.events_met)
     return (*_of_the_minimum(fit), *fit.impossible, *fit.events_met, *fit.oddities, *fit.too_narrow, *_of_the_data(fit), *_of_residuals(fit))
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
-    """Warn of a minimum that is none, or that bounds or missing degrees of freedom decide."""
+    """Warn if the minimum is not a true one, or if bounds or missing degrees of freedom determine it."""
     if fit.stuck:
         yield "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
     elif fit.shooting is not None and fit.shooting.continuity > 1:
@@ -44,13 +45,15 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
         yield f"{', '.join(names)} {verb}; standard errors are meaningless: widen the bounds"
     for name in fit.untold:
         yield (
-            f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: its samples are fitted exactly, and "
-            "do not count in intervals"
+            f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: its "
+            "samples are fitted exactly, and do not count in intervals"
         )
 
 
 def _of_the_data(fit: Estimates) -> Iterator[str]:
-    """Warn of channels that are counted twice, of a minimum that one first guess found alone, and of priors that the data contradict."""
+    """Warn of duplicate channels, of a minimum found from one first guess only, and of priors that the data
+    contradict.
+    """
     first: dict[bytes, str] = {}
     for run, of_run in enumerate(fit.residuals):
         for name, r in of_run.items():
@@ -83,8 +86,9 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     if small := [size for size in sizes if size.most * larger(size.channels) < _by_chance(size.wide, -sure)]:
         times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
         yield (
-            f"the residuals{small[0].named} are smaller than the sigmas predict{times}: sigmas are too large, which makes intervals too wide, or samples were "
-            "smoothed or have no noise; give `None` to estimate a sigma"
+            f"the residuals{small[0].named} are smaller than the sigmas predict{times}: sigmas are too "
+            "large, which makes intervals too wide, or samples were smoothed or have no noise; give `None` "
+            "to estimate a sigma"
         )
     wide = {name for size in small for name in size.channels}
     named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
@@ -92,7 +96,8 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     start = f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals"
     if named and fit.errors == "sigmas":
         yield (
-            f"{start} too narrow: check the scene, sensors and noise; `correlation_time=None` estimates the correlation of the noise, and with five runs "
+            f"{start} too narrow: check the scene, sensors and noise; `correlation_time=None` "
+            "estimates the correlation of the noise, and with five runs "
             'or more, errors="runs" accounts for it'
         )
     elif named and own:
@@ -111,15 +116,15 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return how many standard deviations a mean square is from 1: its cube root is nearly normal (Wilson and
-    Hilferty). `spread`: its standard deviation, near 1.
+    """Return the distance of a mean square from 1 in standard deviations. Its cube root is nearly normal
+    (Wilson and Hilferty). `spread`: its standard deviation, near 1.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Return sizes of the residuals of all channels with known sigmas, then channel by channel; under a
-    robust loss by the median.
+    """Return the size of the residuals of all channels with known sigmas, and that of each channel; under a
+    robust loss from medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
@@ -135,8 +140,8 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
 
 
 def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
-    """Return the mean square of residuals that determined so many unknowns, and its standard deviation if
-    they are normal; `robust`: from their median.
+    """Return the mean square of residuals that determined `determined` unknowns, and its standard deviation
+    for normal residuals; `robust`: computed from their median.
     """
     degrees = max(squares.size - determined, 1)
     if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
@@ -151,15 +156,17 @@ def text(fit: Estimates) -> str:
     """
     most = 8  # combinations of unknowns that are told poorly, pairs that correlate, pieces of runs
     lines = [
-        f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
-        f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
+        f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in "
+        f"{int(fit.steps)} steps; {int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square "
+        f"{float(fit.reduced_chi_square):.4g}"
     ]
     lines += [f"WARNING: {sentence}" for sentence in warnings_of(fit)]
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
     if fit.shooting is not None:
         pieces = " + ".join(map(str, fit.shooting.pieces[:most])) + (" + ..." if len(fit.shooting.pieces) > most else "")
-        lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
+        lines.append(f"found by multiple shooting in {pieces} pieces, which join to "
+            f"{float(fit.shooting.continuity):.1g} of the simulation's tolerance")
     if fit.guesses > 1:
         lines.append(fit.agreement)
     if fit.errors == "runs":
@@ -198,7 +205,8 @@ def batch_text(fit: Estimates) -> str:
         some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
         numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
-    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])
+    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} "
+        "converged", *table(rows)])
 
 
 class Fit(Estimates):
@@ -220,15 +228,13 @@ class Fit(Estimates):
         return warnings_of(self)
 
     def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
-        """Return profile likelihoods of the unknowns in `names` (default: all that runs share), by name: the
-        range within which 2 (F - F_min) stays below 3.84 when all others are fitted again, "bounded",
+        """Return profile likelihoods by name, of the unknowns in `names` (default: all that runs share): the
+        range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted again, "bounded",
         "one-sided" or "flat". `data`: the runs of the fit.
 
-        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or
-        errors="runs", the rise is divided by the
-        increase of variances and quantiles. ValueError for a fit of a batch or one that failed, and other
-        data than the fit's; KeyError for names that were
-        not estimated.
+        This takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or
+        errors="runs", the rise is scaled accordingly. Raises ValueError for a batch, a failed fit, and other
+        data than the fit's; KeyError for names that were not estimated.
         """
         self._check_one()
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
@@ -240,9 +246,9 @@ class Fit(Estimates):
         """Predict `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the unit of the
         channel) and `r_squared`.
 
-        Shared unknowns are held at their estimates; start values that are unknown, and numbers of sensors of
-        each run, are fitted to the run itself.
-        ValueError for a fit of a batch or one that failed, and for runs that do not fit its scene or whose motion fails.
+        Shared unknowns keep their estimates; unknown start values, and the numbers of each run's sensors, are
+        fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit its
+        scene or whose motion fails.
         """
         self._check_one()
         return of_held_out(self, runs)
@@ -259,13 +265,16 @@ class Fit(Estimates):
         """Write this fit as one self-contained HTML file: estimates, warnings, undetermined combinations,
         correlations, residuals, the path to the minimum.
 
-        - `data`: the runs fitted; their samples are drawn beside the prediction, with R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2, and it is
-          told which run, channel and time span informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
+        - `data`: the fitted runs; their samples are drawn beside the prediction, with R^2 = 1 - sum
+          (prediction - value)^2 / sum (value - mean)^2. The report shows which run, channel and time span
+          informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
         - `held_out`: other runs, which are predicted as by `predict`.
-        - `profiles`: True or names, to compute them now; or what `profiles` returned.
-        - `units`: channel -> its unit, for labels, such as `{"x": "m"}`; a scene knows the units of its parameters only.
+        - `profiles`: True or names, to compute them now; or the result of `profiles`.
+        - `units`: channel -> its unit, for labels, such as `{"x": "m"}`, since a scene states units of
+          parameters only.
 
-        ValueError for a path that is no .html file, a fit of a batch or one that failed, and other data than the fit's.
+        Raises ValueError for a path that is no .html file, a batch or a failed fit, and other data than the
+        fit's.
         """
         runs, others = ((x,) if isinstance(x, Experiment) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):
@@ -274,10 +283,11 @@ class Fit(Estimates):
         shapes = lambda runs: [{name: np.shape(x) for name, x in run.items()} for run in runs]  # noqa: E731
         if runs and shapes(run.values for run in runs) != shapes(self.residuals):
             raise ValueError(
-                f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected those of the fit: {shapes(self.residuals)}"
+                f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected "
+                f"those of the fit: {shapes(self.residuals)}"
             )
         if not runs and profiles and not isinstance(profiles, Mapping):
-            raise ValueError("profiles are computed from the runs that were fitted; give them as `data`")
+            raise ValueError("profiles are computed from the runs that were fitted; give these as `data`")
         along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
         shares = informed(*taken_up(self, runs), 24) if runs else None  # unknowns of which the report says what informs them
         page = fit_page(self, of_fitted(self, runs) if runs else (), shares, self.predict(others) if others else (), along, units or {})
@@ -286,7 +296,8 @@ class Fit(Estimates):
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("this needs a single fit whose motion does not fail; for a batch or a failed fit, use `print`")
+            raise ValueError("this needs a single fit whose motion does not fail; for a batch or a failed "
+                "fit, use `print`")
 
     def _repr_html_(self) -> str:
         one = self.values.ndim == 1 and np.isfinite(self.chi_square)

@@ -43,7 +43,9 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Covariance in blocks, and directions (changes of theta / size) that do not show. A batch of fits has a leading axis `members` in all arrays."""
+    """Covariance in blocks, and undetermined directions (changes of theta / size). In a batch of fits all
+    arrays have a leading axis `members`.
+    """
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
     hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # of each member, orthonormal
@@ -78,9 +80,11 @@ class Information:
         return replace(self, **{name: np.asarray(x[0]) for name, x in vars(self).items() if name not in ("hidden", "estimated")})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
-        """Takes the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
+        """Compute the covariance of the shared unknowns from the differences between runs: C (sum g g') C n /
+        (n - 1). C is the previous covariance and g are the scores of the n runs.
 
-        Own unknowns follow the shared ones; the spread of their own noise stays as it is. Source: K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
+        The runs' own unknowns change with the shared ones; the variance due to their own noise stays. Source:
+        K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
         """
         runs = scores.shape[-2]
         shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
@@ -95,15 +99,18 @@ def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[
 
 
 def students_t_95(degrees):
-    """97.5 % quantile of Student's t with one degree of freedom or more; beyond 1e7 it is normal."""
+    """Return the 97.5 % quantile of Student's t with one degree of freedom or more; beyond 1e7 it is that of
+    a normal distribution.
+    """
     return stdtrit(np.clip(degrees, 1.0, 1e7), 0.975)
 
 
 def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float) -> Information:
-    """Information of an arrow in units of sigma.
+    """Return the information of an arrow in units of sigma.
 
-    `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
-    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero.
+    `size`: magnitude of each unknown, in its unit; `estimated`: indices of unknowns; `bound`: (members,
+    indices), True where an unknown is held at its bound; `fails`: (members,), True where nothing is known;
+    `cutoff`: singular values below this fraction of the largest count as zero.
     """
     (runs, m, p), held = arrow.counts, np.ones(size.shape, bool)
     held[:, estimated] = bound[:, estimated]
@@ -143,16 +150,18 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
 
 
 def least_move(cutoff: float, largest):
-    """Return the smallest movement, in standard errors, that counts as part of an undetermined direction.
+    """Return the movement, in standard errors, below which an unknown does not count as part of an
+    undetermined direction.
 
-    An error of J by cutoff * largest (singular value) turns such a direction by as many.
+    If J has an error of cutoff * (largest singular value), such a direction turns by this many standard
+    errors.
     """
     return np.maximum(0.1, cutoff * largest)  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
 def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return orthonormal undetermined directions that move no held place; `own`: V' of each run, with some
-    determined directions.
+    """Return orthonormal undetermined directions that leave held unknowns unchanged; `own`: V' of each run,
+    which may include determined directions.
     """
     (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
     apart = np.zeros((len(runs), count, m))
@@ -164,11 +173,11 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
 
 
 def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Labels:
-    """Return each direction that does not show, in words. `directions`: rows, changes of theta / size,
-    orthonormal; parts below `least_part` are none.
+    """Describe each undetermined direction in words. `directions`: orthonormal rows, changes of theta / size;
+    parts below `least_part` count as zero.
 
-    A basis is chosen in which each direction has one unknown of its own (row-reduced form), told in relative changes
-    `d theta / theta` where the unknown is not zero.
+    The basis is chosen (row-reduced form) so that each direction has one unknown of its own. Changes are
+    relative, `d theta / theta`, where the unknown is not zero.
     """
     relative = np.abs(values) > 1e-3 * np.abs(size)
     basis = _reduced(np.asarray(directions), least_part) * size / np.where(relative, values, 1.0)
@@ -178,8 +187,8 @@ def hidden_combinations(directions, least_part, size, values, labels: Labels) ->
 
 
 def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels) -> str:
-    """Return the direction in words. `power`: the power of the unknown that may stay constant along this
-    direction and all others.
+    """Describe the direction in words. `power`: if an unknown occurs in a product of powers that stays
+    constant along all directions, its exponent.
     """
     involved, close = np.flatnonzero(row), 0.01  # how far an exponent may be from a multiple of one half, and two changes from being equal
     if len(involved) == 1:
@@ -199,7 +208,9 @@ def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: 
 
 
 def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
-    """Reduced row-echelon form with the largest pivots; parts below `least_part`, in rows of length one, are noise, and go."""
+    """Return the reduced row-echelon form with the largest pivots. Parts below `least_part`, in rows of
+    length one, are noise and become zero.
+    """
     rows, free = rows.copy(), list(range(len(rows)))
     for _ in range(len(rows)):
         i, k = max(((i, k) for i in free for k in range(rows.shape[1])), key=lambda place: round(abs(rows[place]), 6))
@@ -211,14 +222,17 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
 
 
 def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], shared: Float[np.ndarray, "*repeats shared"]):
-    """y and d y / d (shared unknowns), of one fit or of each of a batch. ValueError where the function does not return numbers."""
+    """Return y and d y / d (shared unknowns), of one fit or of each fit of a batch. Raises ValueError where
+    the function does not return numbers.
+    """
 
     def of(shared):
         value = function(layout.scene(scene, shared))
         try:
             return jnp.asarray(value, real_type())
         except (TypeError, ValueError):
-            raise ValueError(f"the function returns {described(value)}, expected a number or an array of numbers") from None
+            raise ValueError(f"the function returns {described(value)}, expected a number or an array of "
+                "numbers") from None
 
     def with_slopes(shared):
         return of(shared), jax.jacfwd(of)(shared)
@@ -236,9 +250,10 @@ def standard_errors(
     at_bound: Bool[np.ndarray, "*repeats shared"],
     cutoff: float,
 ) -> Float[np.ndarray, "*numbers"]:
-    """Standard errors of numbers with these slopes, which have an axis of repeats in front where the information has.
+    """Return standard errors of numbers with these derivatives, which have a leading axis of repeats if the
+    information has.
 
-    NaN for those that depend on a direction that does not show, or on an unknown at a bound.
+    They are NaN for numbers that depend on an undetermined direction or on an unknown at a bound.
     """
     shared = slopes.shape[-1]
     parts = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0), known.rank, slopes, sizes, at_bound
@@ -262,7 +277,7 @@ def weak_combinations(
 ) -> Labels:
     """Return the directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
 
-    They are those of the unknowns that runs share, where there are any.
+    They concern the unknowns that runs share, if there are any.
     """
     some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # unknowns that are looked at
     shared = [i for i in some if not labels[i].startswith("run ")]

@@ -45,7 +45,7 @@ Nodes = Int[np.ndarray, "_ _"]
 
 
 class Places(NamedTuple):
-    """Locations of the parts of v, and of the columns of D; the geometric constraints come first in g."""
+    """Locations of the parts of v, and of the columns of D. Geometric constraints come first in g."""
 
     qdot: np.ndarray
     udot: np.ndarray
@@ -70,7 +70,9 @@ def _ranges(*counts: int) -> list[np.ndarray]:
 
 
 class Sloped:
-    """Values of nodes v, their slopes D, and maybe another matrix, as machine code or by NumPy: a function of the numbers given, which may be traced."""
+    """Values of nodes v, their Jacobian D and, if requested, another matrix, as a function of numbers that
+    may be traced. It runs as machine code or on NumPy.
+    """
 
     def __init__(
         self,
@@ -105,7 +107,9 @@ class Sloped:
 
 
 class ByProgram:
-    """v, D and, unless it is too large, the mass matrix of a class of scenes as one scalar program of all numbers in a row: parameters, t, q, u, inputs."""
+    """v, D and the mass matrix (unless it is too large) of a class of scenes, as one scalar program. Its
+    input is one vector of all numbers: parameters, t, q, u, inputs.
+    """
 
     def __init__(self, scene: Scene, program: Lowered, asked: tuple[int, ...], varied: tuple[int, ...] = ()) -> None:
         rows = row_program(scene)
@@ -146,7 +150,9 @@ def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
 
 @dataclass(frozen=True)
 class ByMatrices:
-    """v, D and the mass matrix by a scene's own matrices, differentiated by JAX; accelerations in the speeds that are to be constant."""
+    """v, D and the mass matrix from a scene's own matrices, differentiated by JAX. Accelerations are those of
+    the speeds that must be constant.
+    """
 
     constant: tuple[int, ...]
 
@@ -173,7 +179,7 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
 
 def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
     """Return the program for a scene's instants, with these speeds constant or independent; `masses`: whether
-    their mass matrix is needed.
+    it needs their mass matrix.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
@@ -202,15 +208,15 @@ by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` if 
 
 
 def on_rows(scene: Scene) -> np.ndarray:
-    """Return which coordinates geometric rows and unit norms depend on, at some probed state: others may
-    stand in their graph, and cancel.
+    """Return the coordinates on which geometric rows and unit norms depend at some probed state. Other
+    coordinates in their graph cancel.
     """
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
 
 def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:
-    """Return lists of nodes of another graph in this one, with replacements for its parameters by leaf, t, q,
-    u and inputs.
+    """Return copies of lists of nodes of another graph, in which its parameters (by leaf), t, q, u and inputs
+    are replaced.
     """
     parameters, *rest = variables
     places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]

@@ -51,10 +51,10 @@ class RowsOverStates:
         self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
-        """Return values at the points, taken at the speeds u (which matter where rows are nonlinear in them),
-        and derivatives as a function of directions.
+        """Return values at the points for the speeds u, and their derivative as a function of directions. The
+        speeds matter only where rows are nonlinear in them.
 
-        `x`, `u` and what that function takes have a leading axis of points.
+        `x`, `u` and the directions have a leading axis of points.
         """
         probes = Probes(self.traced.graph, named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs)))))
         found = probes([*self.values, *(node for _, _, node in self.changes)])
@@ -69,7 +69,9 @@ class RowsOverStates:
         return self._arranged(value, u, 1.0), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
-        """Return the rows and the frame in values with a last axis of points; `time`: its rate."""
+        """Return the rows and the frame as arrays whose last axis is that of the points; `time`: the rate of
+        the time coordinate.
+        """
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
         if self.places:
@@ -90,10 +92,12 @@ def integrable_below() -> float:
 
 
 def frobenius_violations(scene: Scene) -> dict[str, float]:
-    """Frobenius' criterion for every row by itself, at six random admissible states of the scene's domain.
+    """Return Frobenius' criterion for every row by itself, at six random admissible states of the scene's
+    domain.
 
-    The violation is the largest value of the two-form dw on unit velocities that w admits, over all states, divided by the size of w and of its derivatives;
-    infinite for rows nonlinear in the speeds, which are no differential forms.
+    The criterion is the largest value of the two-form dw on unit velocities that w admits, over all states,
+    divided by the size of w and of its derivatives. It is infinite for rows that are nonlinear in the speeds,
+    since these are no differential forms.
     """
     names = structure_of(scene).row_names
     if not names:
@@ -110,7 +114,8 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
 
 
 def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.ndarray) -> float:
-    """Largest value of dw on unit velocities that w admits, w F = a, over the size of w; the last axis of `da` and `dF` are directions in (t, q).
+    """Return the largest value of dw on unit velocities that w admits, w F = a, divided by the size of w. The
+    last axis of `da` and `dF` are directions in (t, q).
 
     dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x)      of fields X = F x, Y = F y, x and y being constant
     """
@@ -128,11 +133,12 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
 
 
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
-    """Growth vector of the admissible velocities at generic states, by brackets of at most `depth` fields; and whether it is closed: longer brackets bring
-    nothing new, or everything is reached. Empty for rows nonlinear in the speeds.
+    """Return the growth vector of the admissible velocities at generic states, from brackets of at most
+    `depth` fields, and whether it is closed: longer brackets add nothing, or all dimensions are reached. It
+    is empty for rows nonlinear in the speeds.
 
-    Of two random states, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more than 1e-6 (1e-2 in single
-    precision) of the terms that it is made of.
+    The larger result of two random states counts. A bracket is a new direction if it adds more than 1e-6
+    (1e-2 in single precision) of the terms of which it consists.
     """
     structure = structure_of(scene)
     if not structure.affine:
@@ -174,7 +180,9 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
-    """Return an orthonormal basis extended by the values that add to it, largest first; and their indices."""
+    """Extend an orthonormal basis by those of the values that are independent of it, largest first. Return
+    the basis and their indices.
+    """
     chosen: list[int] = []
     while len(chosen) < len(values):
         rest = values - (values @ spanned.T) @ spanned
@@ -189,7 +197,7 @@ def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple
 
 
 def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brackets `[X, [Y, ...]]` at points x, and the sizes of the terms they are made of.
+    """Return brackets `[X, [Y, ...]]` at points x, and the sizes of the terms of which they consist.
 
     `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of X, Y, ...
     """
@@ -227,7 +235,9 @@ def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> 
 
 
 class _Fields:
-    """The generators `X` (and `(1, X_0)` first, where time counts) as columns over (t, q) or q, and their derivatives."""
+    """The generators `X` as columns over q, or over (t, q) with `(1, X_0)` first if they depend on time, and
+    their derivatives.
+    """
 
     def __init__(self, scene: Scene, with_time: bool, u):
         self.scene, self.with_time, self.u, self.rows = scene, with_time, np.asarray(u, float), RowsOverStates(scene)

@@ -52,15 +52,17 @@ def possible_inertia() -> PossibleInertia:
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-    In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments D (kg m^2) and shears l as unknowns,
-    `"rear frame second moment[0]"` and `"rear frame shear[0]"`. Principal moments of inertia are then positive, and each is at most the sum of the other two.
-    `Fit.tied` has moments and products, with standard errors and intervals to first order; none where D is at
-    its bound, where the body
-    is flat according to the data. Where two axes have one parameter, as those of a wheel do, they have one D.
+    In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments
+    D (kg m^2) and shears l as unknowns, `"rear frame second moment[0]"` and `"rear frame shear[0]"`.
+    Principal moments of inertia are then positive, and each is at most the sum of the other two. `Fit.tied`
+    has moments and products with standard errors and intervals to first order, except where D is at its
+    bound, that is, where the body is flat. Two axes that share one parameter, as those of a wheel do, share
+    one D.
 
-    It is for scenes that have a parameter for each of the three moments, and for none, one or all of the products; ValueError, from `fit`, for others, and
-    where the first guess is no inertia of a body with a thickness. Source: P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3
-    (2018) 60, for possible inertias.
+    The scene must have a parameter for each of the three moments, and for none, one or all of the products.
+    Otherwise, and where the first guess is no inertia of a body with a thickness, `fit` raises ValueError.
+    Source: P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3 (2018) 60, for
+    possible inertias.
     """
     return PossibleInertia()
 
@@ -91,7 +93,7 @@ class BodyInertia:
         return f"{self.body} second moment", f"{self.body} shear"
 
     def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:
-        """D and l of a scene's parameters; NaN where no body with a thickness has such moments."""
+        """Return D and l for a scene's parameters; NaN where no body with a thickness has such moments."""
         value = {(entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index] for entry in self.entries}
         of_axis = {self.axes[entry.row]: value[entry.row, entry.row] for entry in self.entries if entry.row == entry.column}
         I = jnp.diag(jnp.stack([of_axis[k] for k in self.axes]))
@@ -121,8 +123,8 @@ class BodyInertia:
 
 
 def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
-    """Return the parameters of the inertia of the named body. ValueError if there is no such body, or its
-    inertia has another form.
+    """Return the parameters of the named body's inertia. Raises ValueError if there is no such body, or if
+    its inertia has another form.
     """
     diagonal, products = _found(scene, name)
     axes: list[int] = []
@@ -135,12 +137,13 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
             entries.append(entry)
         number, factor = seen[what]
         if factor != entry.factor:
-            raise ValueError(_refusal(scene, name, f"moments about axes {entries[number].row + 1} and {i + 1} are different multiples of `{entry.name}`"))
+            raise ValueError(_refusal(scene, name, f"moments about axes {entries[number].row + 1} and "
+                f"{i + 1} are different multiples of `{entry.name}`"))
         axes.append(number)
     there = tuple(k for k, entry in enumerate(products) if entry is not None)
     entries += [entry for entry in products if entry is not None]
     if len({(entry.name, entry.index) for entry in entries}) < len(entries):
-        raise ValueError(_refusal(scene, name, "one parameter is a moment and a product, or two products"))
+        raise ValueError(_refusal(scene, name, "one parameter serves as a moment and a product, or as two products"))
     if len(there) == 2 or (there and len(seen) < 3):
         what = f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one or three products, and three moments with any"
         raise ValueError(_refusal(scene, name, what))
@@ -148,8 +151,9 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
     if not np.all(np.isfinite(found.numbers(scene)[0])):
         moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
         raise ValueError(
-            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which, with its products, no body with a thickness has: "
-            "principal ones must be positive, each less than the sum of the other two; of a flat body, give the largest a little less than that sum"
+            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which, "
+            "with its products, no body with a thickness has: principal ones must be positive, each less "
+            "than the sum of the other two; of a flat body, give the largest a little less than that sum"
         )
     return found
 
@@ -160,7 +164,8 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     what = f"`free` asks for a possible inertia of `{name}`, which is not a body of `{type(scene).__name__}`"
     check_name(name, known, what)
     if not isinstance(known[name], RigidBody):
-        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name a rigid body")
+        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name "
+            "a rigid body")
     names = [of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)]
     values = {of: np.asarray(getattr(scene, of), float) for of in names}
     generator = np.random.default_rng(0)
@@ -174,13 +179,15 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
         if not where:
             if i != j and abs(I[i, j]) <= round_off * size:
                 return None
-            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is not a parameter"))
+            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg "
+                "m^2, is not a parameter"))
         of, index = where[0]
         factor = float(slopes[of][(i, j, *index)])
         straight = all(abs(M[i, j] - factor * x[of][index]) <= round_off * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
         if len(where) > 1 or not straight:
             parts = ", ".join(f"`{of}`" for of in dict.fromkeys(of for of, _ in where))
-            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia is made of {parts}, expected one parameter times a constant"))
+            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia is made of {parts}, "
+                "expected one parameter times a constant"))
         return Entry(of, index, i, j, factor)
 
     return [entry(i, j) for i, j in _DIAGONAL], [entry(i, j) for i, j in _PRODUCTS]
@@ -215,8 +222,8 @@ class Tie:
 
 
 def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
-    """Return a parameter as a function of the scene, which has the first guesses. ValueError where the
-    function gives no value that the parameter may have.
+    """Return a parameter as a function of the scene, which has the first guesses. Raises ValueError where the
+    function returns no allowed value.
     """
     leaves, treedef = jax.tree.flatten(scene)
     expected = jnp.shape(getattr(scene, name))
@@ -226,16 +233,19 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
         try:
             found = jnp.asarray(value, real_type())
         except (TypeError, ValueError):
-            raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a number or an array of shape {expected}") from None
+            raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a "
+                f"number or an array of shape {expected}") from None
         if found.shape != expected:
-            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, expected {expected}, the shape of the parameter")
+            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, "
+                f"expected {expected}, the shape of the parameter")
         return found
 
     found = Tie(name, Call(jax.make_jaxpr(of_leaves)(*leaves), ("a tied parameter",)))
     try:
         scene.replace(**{name: found.value(leaves)})
     except ValueError as error:
-        raise ValueError(f"at the first guess the function in `free` of `{name}` gives a value that is not allowed: {error}") from None
+        raise ValueError(f"at the first guess the function in `free` of `{name}` gives a value that is not "
+            f"allowed: {error}") from None
     return found
 
 
@@ -244,7 +254,7 @@ Kind = Literal["scene", "inertia", "start", "sensor"]  # a parameter, of a body'
 
 @dataclass(frozen=True)
 class Place:
-    """Locations of the entries of a parameter, an initial value, or a number of a sensor or actuator, in a
+    """Location of the entries of a parameter, an initial value, or a number of a sensor or actuator, in a
     vector of unknowns.
     """
 
@@ -259,7 +269,9 @@ class Place:
         return self.begin + math.prod(self.shape)
 
     def of(self, vector):
-        """Its numbers in a vector (or in many, with leading axes), in their own shape."""
+        """Return the numbers of this entry from a vector (or from many, with leading axes), in their own
+        shape.
+        """
         return vector[..., self.begin : self.end].reshape((*vector.shape[:-1], *self.shape))
 
 
@@ -268,7 +280,7 @@ class Layout:
     """Names and shapes of the shared unknowns and of those of each run, and the dependent parameters;
     hashable.
 
-    A single run has nothing of its own, unless it is cut into pieces: its unknowns are shared ones.
+    A single run has no unknowns of its own, unless it is cut into pieces: all its unknowns are shared.
     """
 
     shared: tuple[Place, ...]
@@ -326,7 +338,6 @@ class Layout:
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:
-        """Return names and numbers of the unknowns of a kind, in the vectors of the shared ones and of those
-        of a run.
+        """Return names and indices of the unknowns of a kind, in the vectors of shared unknowns and of a run.
         """
         return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)

@@ -65,8 +65,8 @@ class Minimum(ByMember):
 
     @staticmethod
     def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
-        """Return the state before the first step; members whose motion fails do not take part. `what`: the
-        name of the objective in the trace.
+        """Return the state before the first step; members whose motion fails are excluded. `what`: the name
+        of the objective in the trace.
         """
         none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
         trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
@@ -100,7 +100,7 @@ class Minimum(ByMember):
         return self if len(self.theta) == 1 else self.of([int(np.argmin(self.at.cost))])
 
     def agreeing(self, apart: float) -> int:
-        """Return the number of members that converged to a value at most `apart` from the lowest one."""
+        """Return the number of members that converged to a value at most `apart` above the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":
@@ -160,10 +160,11 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
 
 
 def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> PerMember:
-    """Return by how much F falls along a step d.
+    """Return the decrease of F along a step d.
 
-    Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends of the
-    step, the first one of which is given, tell it to more digits.
+    Near the minimum, errors of the simulation hide small changes of F: F jumps where a motion takes one step
+    more. There the decrease is computed from the slopes of F at both ends of the step, of which the first is
+    given.
     """
     found = before - trial.cost
     by_slopes = 0.5 * (slope - np.einsum("bi,bi->b", trial.arrow.gradient, d))
@@ -172,8 +173,8 @@ def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, 
 
 
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
-    """Return D: lengths of the columns of J, and positive substitutes for zero ones: sizes of their unknowns
-    times the longest.
+    """Return D, the lengths of the columns of J. For a zero column it is the size of the unknown, times the
+    largest length.
     """
     norms = arrow.column_norms
     by_size = norms * size

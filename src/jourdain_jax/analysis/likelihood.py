@@ -46,8 +46,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Labels:
-    """Return one sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`:
-    values have a leading axis, and the first one counts.
+    """Return one sentence for each oddity of `checked` runs; traced numbers are not examined. `repeats`:
+    values have a leading axis, of which the first entry counts.
     """
     found: list[str] = []
     for index, run in enumerate(runs):
@@ -63,18 +63,17 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Labels:
 
 
 def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: float) -> Iterator[str]:
-    """Yield where samples of an input that changes leave a run at an end, and where some are missing from a
-    log in between.
+    """Yield sentences for inputs whose samples do not cover a run, and for gaps in a log.
 
-    The last interval may be a jump, such as those of commands that are held; then the one before it counts.
+    The last interval may be a jump, as for commands that are held; then the interval before it counts.
     """
     intervals, beyond = np.diff(ts), 1.5  # intervals, that an end may be away from that of a run
     spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
     spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > beyond * max(intervals[-2:]) else []
     if spans:
         yield (
-            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, repeat that value in its samples, otherwise give "
-            "more samples, or shorter measurements"
+            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "
+            "repeat that value in its samples, otherwise give more samples, or shorter measurements"
         )
     usual = float(np.median(intervals))
     (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # intervals that are missing
@@ -82,14 +81,14 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
         k = int(gaps[0])
         more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
         yield (
-            f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, where it is interpolated linearly; if this is "
-            "wrong, give the samples, or shorter measurements"
+            f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, "
+            "where it is interpolated linearly; if this is wrong, give the samples, or shorter measurements"
         )
 
 
 def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
-    """Yield where values lie in [-pi, pi] or [0, 2 pi], and neighbours are nearly one turn apart, but near
-    each other without it.
+    """Yield a sentence for angles that appear wrapped: values in [-pi, pi] or [0, 2 pi], some of whose
+    neighbours differ by nearly one turn.
     """
     known, turn = np.isfinite(values), 2 * np.pi
     x, t = values[known], ts[known]
@@ -99,13 +98,14 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
     if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
         yield (
-            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: a wrapped angle, but coordinates are continuous; "
-            "give `np.unwrap` of it"
+            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: a "
+            "wrapped angle, but coordinates are continuous; give `np.unwrap` of it"
         )
 
 
 _REFUSED = dict.fromkeys(
-    ("start", "t0", "t1", "ts", "inputs", "events", "work"), "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
+    ("start", "t0", "t1", "ts", "inputs", "events", "work"), "each `Experiment` states start, times and "
+        "inputs, and its motion ends with its last sample"
 )
 _REFUSED["retry"] = "its motions are compiled, in one way"
 
@@ -117,7 +117,8 @@ def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Ma
 
 
 def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experiment, ...]:
-    """Return one run or several, checked against the scene; ValueError as in `checked`, and without any run.
+    """Return one run or several as a list, checked against the scene. Raises ValueError as `checked` does,
+    and if there is no run.
 
     Oddities of a run (`oddities`) cause warnings.
     """
@@ -134,30 +135,36 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
-    """Return channels with an unknown value; ValueError if it is None in one run and given in another."""
+    """Return the channels whose value is unknown. Raises ValueError for a channel whose value is None in one
+    run and given in another.
+    """
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
         if any(name in run.values and name not in unknown(run) for run in runs):
-            raise ValueError(f"{what} of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+            raise ValueError(f"{what} of channel `{name}` is None in one run and given in another; give it "
+                "in all runs, or in none")
     return names
 
 
 def check_known(runs: Sequence[Experiment], what: str) -> None:
-    """ValueError where a sigma, or a number of a sensor or an actuator, is not known."""
+    """Raise ValueError where a sigma, or a number of a sensor or an actuator, is unknown."""
     for run in runs:
         for name in run.unknown_sigma:
-            raise ValueError(f"sigma of channel `{name}` is None, but {what} needs the standard deviation of its noise; give a number")
+            raise ValueError(f"sigma of channel `{name}` is None, but {what} needs the standard deviation of "
+                "its noise; give a number")
         for label in run.estimates:
-            raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, which may be traced, in place of the `Estimate`")
+            raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, "
+                "which may be traced, in place of the `Estimate`")
 
 
 def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]) -> Scalar:
     """Return the logarithm of the probability density of the measurements `data` (one run or several): `- sum
     r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
-    Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
-    otherwise) and in known correlation times of the noise;
-    -inf where the motion fails. `options`, `by_name`: as of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
+    Differentiable in scene, start values, measured values, sigmas, numbers of sensors and actuators (reverse
+    mode, unless `adjoint` requests another) and known correlation times of the noise. It is -inf where the
+    motion fails. `options`, `by_name`: as of `simulate`. Missing samples (NaN, or an infinite sigma) do not
+    count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
@@ -167,7 +174,8 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
     scene = as_scene(scene)
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
-        raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")
+        raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to "
+            "know it; give a number in s, or 0 for white noise")
     check_known(runs, "a likelihood")
     return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]))
 
@@ -187,8 +195,8 @@ def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
 
 
 def mapped(f: Callable, runs: Run, *more: Array) -> Array:
-    """Return `f(run, *more)` for each of the stacked runs; a single one is not batched, since batches use
-    wider and slower registers.
+    """Return `f(run, *more)` for each of the stacked runs. A single run is not batched, since batches use
+    wider, slower registers.
     """
     if runs.ts.shape[0] > 1:
         return eqx.filter_vmap(f)(runs, *more)
@@ -215,11 +223,13 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def standard_errors(self) -> dict[str, Scalar]:
-        """Lower bounds of standard errors of unbiased estimates, by name, in the unit of the unknown."""
+        """Return lower bounds of standard errors of unbiased estimates, by name, in the unit of the unknown.
+        """
         return dict(zip(self.labels, jnp.sqrt(jnp.diagonal(self.covariance)), strict=True))
 
     def log_det(self, names: str | Iterable[str] = ()) -> Scalar:
-        """`log det F`; of the unknowns in `names`, that of the inverse of their block of F^-1, all others being estimated too. To be made as large as possible.
+        """Return `log det F`, which a plan should make large. With `names`, return it for these unknowns
+        only, with all others estimated as well.
 
         Raises KeyError for names that are not unknown.
         """
@@ -235,7 +245,7 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def _hidden(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return undetermined directions, in rows, and the sizes of the unknowns by which they are scaled."""
+        """Return undetermined directions, in rows, and the sizes by which the unknowns are scaled."""
         values = np.abs(np.asarray(self.values))
         size = np.where(values > 0, values, 1.0)
         squares, directions = np.linalg.eigh(np.asarray(self.matrix) * size * size[:, None])
@@ -275,9 +285,10 @@ def planned_information(
     scene.
 
     **Arguments**
-    - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and sensors. Their `values` do not matter, but where they
-      are NaN there will be no sample.
-    - `free`, `options`, `by_name`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
+    - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and
+      sensors. Their `values` do not matter, except that NaN marks a missing sample.
+    - `free`, `options`, `by_name`: as of `fit`. Start values in `unknown_start` and estimated numbers of
+      sensors are unknowns, too, and priors count.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
     inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
@@ -298,9 +309,11 @@ def planned_information(
     runs = as_runs(scene, plan)
     for run in runs:
         for name in run.unknown_sigma:
-            raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
+            raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of "
+                "its noise; give a number")
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, which a plan does not support; omit it")
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, which a plan does not "
+                "support; omit it")
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places = unknowns.estimated

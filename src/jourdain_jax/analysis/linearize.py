@@ -80,7 +80,8 @@ class Linearization(Printed, eqx.Module):
     def _text(self) -> str:
         if self.A.ndim != 2:
             return f"Linearizations of shape {self.A.shape[:-2]}; named coordinates: {', '.join(self.coordinates) or 'none'}"
-        lines, names = [f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), pivot {float(self.pivot):.2g}"], self.coordinates
+        lines, names = [f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
+            f"pivot {float(self.pivot):.2g}"], self.coordinates
         if names:
             lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)]
             lines += matrix("F", self.F, names, self.inputs) if self.inputs else []
@@ -99,11 +100,14 @@ class Linearization(Printed, eqx.Module):
         return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
-        """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
+        """Return the roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. They are
+        differentiable where distinct.
+        """
         return _roots(self._companion())
 
     def modes(self, names: Labels | None = None) -> Modes:
-        """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative).
+        """Return the eigenvalues of `eigenvalues` with the shapes of their modes in the named coordinates
+        (without derivative).
 
         `names`: of the modes in this order; default: the `mode_names` of the scene, or "mode 1", ...
         """
@@ -114,9 +118,11 @@ class Linearization(Printed, eqx.Module):
         """Return derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every
         parameter, as machine code: `small.sensitivities("weave")["c"]`.
 
-        The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep their values, as many as steady motions beside
-        this one have freedoms; default: speeds in the scene's order, of a bicycle `x_rate`. `names`: as of `modes`. At a double root all is NaN, and `code`
-        is not 0. ValueError: an unknown mode, a motion that is not steady; `NotLowered` where the scene has no scalar program.
+        The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep
+        their values, as many as there are freedoms among neighbouring steady motions; default: speeds in the
+        scene's order, for a bicycle `x_rate`. `names`: as of `modes`. At a double root all is NaN, and `code`
+        is not 0. Raises ValueError for an unknown mode and a motion that is not steady; `NotLowered` where
+        the scene has no scalar program.
         """
         found = self.modes(names)
         check_name(mode, dict.fromkeys(found.names), f"no mode `{mode}`")
@@ -126,15 +132,17 @@ class Linearization(Printed, eqx.Module):
     def state_eigenvalues(self) -> Complex[Array, "states"]:
         """Return eigenvalues of A, 1/s, by ascending real part.
 
-        Ignorable coordinates, and speeds that a steady motion may have at will, add zeros, often in Jordan blocks: a root of
-        round-off then stands in their place. `eigenvalues` is free of them.
+        Ignorable coordinates, and speeds that a steady motion may choose freely, have zero eigenvalues. They
+        often form Jordan blocks, whose eigenvalues are sensitive to round-off: an error of 1e-16 may show as
+        1e-8. `eigenvalues` omits them.
         """
         return _roots(self.A)
 
     def _companion(self) -> Float[Array, "modes modes"]:
         k = len(self.coordinates)
         if k == 0:
-            raise ValueError("no coordinates are named, so there is no second-order form; give `coordinates` to `linearize`, or use `state_eigenvalues`")
+            raise ValueError("no coordinates are named, so there is no second-order form; give `coordinates` "
+                "to `linearize`, or use `state_eigenvalues`")
         lower = -jnp.linalg.solve(self.M, jnp.concatenate([self.K, self.C], axis=1))
         return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
 
@@ -156,20 +164,22 @@ def linearize(
         small.M, small.C, small.K, small.eigenvalues()
 
     **Arguments**
-    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant,
-      and `residual` reports it. They are
-      constant along a steady motion where only ignorable coordinates move: a disc's yaw and spin, but not the attitude of a spinning disc.
-    - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A quaternion `attitude` has
-      `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
+    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and
+      `residual` reports how far it is from steady. They are constant along a steady motion if only ignorable
+      coordinates move, such as a disc's yaw and spin.
+    - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A
+      quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
     - `inputs`: values of the scene's inputs (default: zero), held constant.
-    - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
-      is well conditioned at the state (over the scene's domain, while state or parameters are traced).
+    - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the
+      independent speeds. The default is well conditioned at the state (for a traced state or traced
+      parameters, over the scene's domain).
 
     Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` settles the
     backend.
 
-    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
-    determine the others, all is NaN there and `code` is not 0: name others.
+    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and
+    the state. If the privileged speeds do not determine the others, all results are NaN and `code` is not 0:
+    name others.
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed; at a known
     state, speeds or coordinates that do not determine the others there.
@@ -191,8 +201,9 @@ def linearize(
         found = found if chosen == y else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
-            f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at this state (pivot {float(found.pivot):.1e}): "
-            "choose others by `privileged` or `dependent`, or linearize at a nearby state"
+            f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at "
+            f"this state (pivot {float(found.pivot):.1e}): choose others by `privileged` or `dependent`, or "
+            "linearize at a nearby state"
         )
     return found
 
@@ -201,8 +212,9 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
     """Warn where loads have no derivative; traced values are not checked."""
     if not is_traced((scene, state, f)) and (rough := bent_load(scene, state.t, state.q, state.u, f)):
         text = (
-            f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at this state: it has a kink or jumps there, as dry "
-            "friction does at rest. Linearize at a state beside it, or let the load change within a short range, as by `jnp.tanh`"
+            f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at "
+            "this state: it has a kink or jumps there, as dry friction does at rest. Linearize at a state "
+            "beside it, or let the load change within a short range, as by `jnp.tanh`"
         )
         warn(text, SensitivityWarning)
 
@@ -268,7 +280,9 @@ def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates:
 
 
 def _relative(neglected, kept):
-    """Largest neglected entry over the largest kept one; the entry itself where nothing is kept."""
+    """Return the ratio of the largest neglected entry to the largest kept one; the entry itself where nothing
+    is kept.
+    """
     xp = array_module(kept)
     size = largest(kept)
     return largest(neglected) / xp.where(size > 0, size, 1.0)
@@ -296,7 +310,9 @@ def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
 
 
 def _own_rate(scene: Scene, name: str) -> int | None:
-    """Index of the speed that is the rate of the perturbation `name`; None where the scene has speeds of its own."""
+    """Return the index of the speed that is the rate of the perturbation `name`; None where the scene has its
+    own speeds.
+    """
     if scene.speeds is not None:
         return None
     speed = f"{name}_rate" if name in scene.coordinate_names.entries else name.replace("_turn_", "_omega_")
@@ -304,7 +320,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
 
 
 def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
-    """Return positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
+    """Return the positions in y of the privileged speeds other than the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was
     own = [_own_rate(scene, name) for name in coordinates]
@@ -312,6 +328,8 @@ def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     if len(beside) + len(coordinates) == len(y):
         return np.array(beside, int)
     raise ValueError(
-        f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the privileged speeds of `{type(scene).__name__}` "
-        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates, or give `privileged` speeds that contain their rates"
+        f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the "
+        f"privileged speeds of `{type(scene).__name__}` "
+        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates, or give "
+        "`privileged` speeds that contain their rates"
     )

@@ -39,9 +39,11 @@ Points = Float[Array, "*batch unknowns"]
 
 
 class LogDensity(eqx.Module):
-    """`log p(z)` of a vector z of real numbers, up to a constant: call it, under `jit`, `grad` and `vmap` as you like.
+    """`log p(z)` of a vector z of real numbers, up to a constant. It can be called under `jit`, `grad` and
+    `vmap`.
 
-    `labels` names the unknowns, as those of a `Fit`; a sigma that is estimated is `"lean.sigma"`, a correlation time `"lean.correlation_time"` (s).
+    `labels` names the unknowns, as in a `Fit`; an estimated sigma is `"lean.sigma"`, a correlation time
+    `"lean.correlation_time"` (s).
     """
 
     scene: Scene
@@ -97,12 +99,12 @@ class LogDensity(eqx.Module):
         return self._each(Range.constrain, self._spread(self._checked(z)))
 
     def named(self, z: Points) -> dict[str, Float[Array, "*batch"]]:
-        """Return the unknowns at z by name, in their units; for one vector or many."""
+        """Return the unknowns at z by name, in their units, for one vector or many."""
         theta = self.constrain(z)
         return {label: theta[..., i] for i, label in enumerate(self.labels)}
 
     def unconstrain(self, values: Mapping) -> Point:
-        """Return z at these values of unknowns by name, in their units; missing ones are at their first
+        """Return z for these values of unknowns by name, in their units. Omitted unknowns are at their first
         guess.
 
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
@@ -112,7 +114,8 @@ class LogDensity(eqx.Module):
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):
             off = int(np.argmin(np.isfinite(x)))
-            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound of it; give a value inside")
+            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound "
+                "of it; give a value inside")
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
     def scene_at(self, z: Point) -> Scene:
@@ -123,16 +126,19 @@ class LogDensity(eqx.Module):
         """Return the density in transformed unknowns z, independent with unit variance according to a fit of
         the same data, so that samplers need few steps.
 
-        It is the density of the same unknowns: `constrain` and `named` lead to the same values. Where the fit is at its minimum, z is zero.
-        ValueError for a fit of other unknowns, one of a batch, and unknowns that have no standard error, hidden in the data or at a bound.
+        `constrain` and `named` convert back to the unknowns. At the minimum of the fit z is zero. Raises
+        ValueError for a fit of other unknowns, for a batch, and for unknowns without a standard error
+        (undetermined, or at a bound).
         """
         of_noise = set(self.sigmas) <= set(fit.sigma) and set(self.with_memory) <= set(fit.correlation_time)
         if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not of_noise:
-            raise ValueError(f"the fit is of {', '.join(fit.labels)}, the density of {', '.join(self.labels)}; give the fit of the same unknowns and data")
+            raise ValueError(f"the fit is of {', '.join(fit.labels)}, the density of "
+                f"{', '.join(self.labels)}; give the fit of the same unknowns and data")
         for label, error in zip(fit.labels, fit.standard_errors, strict=True):
             if not np.isfinite(error):
                 raise ValueError(
-                    f"`{label}` has no standard error in the fit, so its scale is unknown; give it a prior, or omit it from `free`"
+                    f"`{label}` has no standard error in the fit, so its scale is unknown; give it a prior, "
+                    "or omit it from `free`"
                 )
         noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
         theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
@@ -151,7 +157,8 @@ class LogDensity(eqx.Module):
     def _checked(self, z) -> Array:
         z = jnp.asarray(z, real_type())
         if z.shape[-1:] != (len(self.labels),):
-            raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number for each of {', '.join(self.labels)}")
+            raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number "
+                f"for each of {', '.join(self.labels)}")
         return z
 
     def _spread(self, z: Points) -> Points:
@@ -183,16 +190,18 @@ def log_density(
     samplers such as those of BlackJAX and NumPyro.
 
     **Arguments**
-    - `scene`, `data`, `free`, `options`, `by_name`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators
-      that are estimated, and sigmas that are None, which are named `"lean.sigma"`.
-    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma,
-      and in arcsin rho, rho = exp(-h / tau), of a correlation time tau that is None, where h is the shortest interval between samples of its channel.
-      A flat prior without bounds has no integral: if the data do not determine an unknown, the posterior has
-      none either, and a sampler diverges.
+    - `scene`, `data`, `free`, `options`, `by_name`: as of `fit`. Unknowns are free parameters, unknown start
+      values, estimated numbers of sensors and actuators, and sigmas that are None, which are named
+      `"lean.sigma"`.
+    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
+      itself, in the logarithm of a sigma, and in arcsin rho, rho = exp(-h / tau), of an estimated correlation
+      time tau, where h is the shortest interval between samples of its channel. A flat prior without bounds
+      has no integral: if the data do not determine an unknown, the posterior has none either, and a sampler
+      diverges.
 
-    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead
-    back and forth. The logarithms of the transforms'
-    derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad`.
+    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain`
+    convert between the vector and the unknowns. It includes the logarithms of the transforms' derivatives. It
+    is a pure function: it works under `jit`, `vmap` and `grad`.
 
     **Raises** ValueError as `fit`.
 
@@ -242,11 +251,14 @@ def log_density(
 
 
 def _rms(scene: Scene, groups: Sequence[Run], name: str, options: AllOptions) -> float:
-    """Root mean square of the residuals of a channel at the first guess, whose weights are one: a first guess of its sigma."""
+    """Return the root mean square of a channel's residuals at the first guess, with weights one. It serves as
+    first guess of sigma.
+    """
     of = partial(Run.residuals, scene=scene, simulate=simulate, options=options)
     residuals = [mapped(lambda run: of(run)[name], group) for group in groups]
     samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
     found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))
     if not np.isfinite(found):
-        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has no first guess; examine the motion with `simulate`")
+        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has no "
+            "first guess; examine the motion with `simulate`")
     return max(found, 1e-12)

@@ -50,7 +50,9 @@ class _Standing(ByMember):
 
 
 class Piecewise(Problem):
-    """The problem of whole runs computed in pieces; `pieces`: the same with nodes as independent unknowns."""
+    """The problem of whole runs, computed in pieces. `pieces`: the same problem with the states at the joints
+    as further unknowns.
+    """
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
         super().__init__(asked, runs, unknowns)
@@ -62,7 +64,8 @@ class Piecewise(Problem):
         of_each = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
         parts = tuple(itertools.chain(*of_each))
         if len(parts) == len(runs):
-            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or omit `shooting`")
+            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or "
+                "omit `shooting`")
         self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
@@ -96,8 +99,8 @@ class Piecewise(Problem):
         return self._each(theta, 0.0, 0.0, 0.0)
 
     def _each(self, of_runs: np.ndarray, later, first_node, later_node, carried: bool = True) -> np.ndarray:
-        """Return values for unknowns of whole runs as values for all pieces; `later`: for start values in
-        later pieces; `carried`: without shared ones.
+        """Return the unknowns of all pieces from those of whole runs; `later`: the start values of later
+        pieces; `carried`: without shared unknowns.
         """
         shared, own = self.unknowns.split(of_runs)
         own = own[..., self.run_of, :]
@@ -108,7 +111,7 @@ class Piecewise(Problem):
         return np.concatenate([shared, whole.reshape(*whole.shape[:-2], -1)], axis=-1)
 
     def with_ends(self, theta: np.ndarray, members: np.ndarray) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
-        """[J r] of all pieces with these unknowns, and [J x] of the states at which they end."""
+        """Return [J r] of all pieces with these unknowns, and [J x] of their end states."""
         _, pieces, M = self.pieces.unknowns.split(theta)[1].shape
         found, ends = [], np.zeros((len(members), pieces, self.states, M + self.shared + 1))
         for b, j, plain in self.pieces.evaluated(theta, members):
@@ -118,7 +121,9 @@ class Piecewise(Problem):
         return found, ends
 
     def _from_before(self, ends: np.ndarray, local: np.ndarray, piece: int) -> Float[np.ndarray, "members decided width"]:
-        """Return [A B c]: the end of a piece as a function of its predecessor, minus its value."""
+        """Return [A B c], a linear model of a gap: the end of a piece as a function of its predecessor's
+        unknowns, minus the next piece's start.
+        """
         carried = np.zeros((len(local), self._carried.size, ends.shape[-1]))
         carried[:, range(self._carried.size), self._carried], carried[..., -1] = 1.0, local[:, piece - 1, self._carried]
         rows = np.concatenate([carried, ends[:, piece - 1]], axis=1)
@@ -126,7 +131,7 @@ class Piecewise(Problem):
         return rows
 
     def with_gaps(self, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
-        """Return the objective with the starts of all pieces as unknowns: gaps are residuals of this width,
+        """Return the objective with the starts of all pieces as unknowns. Gaps are residuals of this width,
         in sizes of the states.
         """
         (some, ends), local = self.with_ends(theta, members), self.pieces.unknowns.split(theta)[1]
@@ -177,7 +182,9 @@ class Piecewise(Problem):
         self.at = self.at.of([member])
 
     def evaluated(self, theta: ByUnknown, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of whole runs; pieces move along with the unknowns, to first order, until they join."""
+        """Yield [J r] of whole runs. The starts of pieces move along with the unknowns, to first order, until
+        the pieces join.
+        """
         failed = np.zeros(len(members), bool)
         for _ in range(8):
             some = np.flatnonzero(~failed & ~((theta == self.at.theta[members]).all(axis=1) & self.closed(members)))
@@ -188,7 +195,9 @@ class Piecewise(Problem):
             yield b, j, closed(rows, self.own + self.shared)
 
     def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
-        """As `evaluated`, where a share of the gaps is closed, and rows are [J g r]: r will have changed by g once pieces join."""
+        """Return [J g r], as `evaluated` does, with a share of the gaps closed. g is the further change of r
+        when all gaps are closed.
+        """
         return self._of_runs(members, ~self._move(theta, members, share))
 
     def _of_runs(self, members: np.ndarray, failed: Flags) -> Iterator[Some]:
@@ -216,13 +225,13 @@ class Piecewise(Problem):
         return np.sqrt(squares)
 
     def _by_piece(self, theta: ByUnknown) -> Float[np.ndarray, "members pieces own_and_shared"]:
-        """Return the unknowns of the run that each piece belongs to, then the shared ones."""
+        """Return the unknowns of each piece's run, followed by the shared ones."""
         shared, own = self.unknowns.split(theta)
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
-        """Return the factor by which small changes of the unknowns grow from the first node to their maximum,
-        in sizes of states and unknowns.
+        """Return the largest factor by which small changes of the unknowns grow from the first joint on, in
+        sizes of states and unknowns.
         """
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
@@ -231,7 +240,7 @@ class Piecewise(Problem):
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """A context in which unknowns may be tried anywhere: after it, the pieces are as they were before."""
+        """Return a context in which unknowns may be tried anywhere; afterwards the pieces are as before."""
         kept = self.at.of(np.arange(len(self.at.theta)))
         yield
         self.at = kept
@@ -241,13 +250,17 @@ class Piecewise(Problem):
         return self.continuity(members) <= 1.0
 
     def continuity(self, members: np.ndarray) -> PerMember:
-        """Return the largest jump from one piece to the next, in tolerances of the options, `atol + rtol |x|`."""
+        """Return the largest jump between neighbouring pieces, in tolerances of the options, `atol + rtol
+        |x|`.
+        """
         rtol, atol = self.tolerance
         allowed = atol + rtol * np.maximum(np.abs(self.at.local[members][..., self.own :]), self.node_sizes)
         return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
 
     def _move(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Flags:
-        """Pieces of some members to other unknowns; which of them do not fail there. The others stay."""
+        """Move the pieces of some members to other unknowns. Return which members do not fail there; the
+        failing ones stay.
+        """
         m, M = self.own, self.own + self.states
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)
         local = before.local + (before.slopes @ self._by_piece(theta - before.theta)[..., None])[..., 0] + share[:, None, None] * before.gaps
@@ -277,7 +290,7 @@ class Piecewise(Problem):
         return good
 
     def _condensed(self, run: int, rows_of: np.ndarray, slopes: np.ndarray, gaps: np.ndarray) -> Float[np.ndarray, "samples width"]:
-        """[J g r] of a whole run from [J r], slopes and gaps of all pieces."""
+        """Return [J g r] of a whole run from [J r], derivatives and gaps of all pieces."""
         M, found = self.own + self.states, np.zeros(self._shape(run))
         for i in np.flatnonzero(self.run_of == run):
             of_piece, of_run = self._places[i]
@@ -288,7 +301,7 @@ class Piecewise(Problem):
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of a piece that belong to its run, and their places there."""
+        """Return the residuals of a piece that belong to its run, and their indices there."""
         run = int(self.run_of[piece])
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])

@@ -64,8 +64,8 @@ class Loss:
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:
-        """Return the factor of the covariance (J'WJ)^-1 from the residuals that count, which determined so
-        many unknowns.
+        """Return the factor of the covariance (J'WJ)^-1, from residuals that have determined `determined`
+        unknowns.
         """
         if not np.isfinite(bend := self.bend(r)):
             return bend
@@ -74,8 +74,8 @@ class Loss:
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
     def bend(self, r: Residuals) -> float:
-        """Return the factor that turns (J'WJ)^-1 into the inverse of the second derivatives of F; infinite
-        where F is not convex in the residuals.
+        """Return the factor that turns (J'WJ)^-1 into the inverse second derivative of F; infinite where F is
+        not convex in the residuals.
         """
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
@@ -90,8 +90,8 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 
 def huber(k: Number = 1.345) -> Loss:
-    """Count residuals beyond `k` sigmas by their magnitude, not their square: `jj.fit(..., loss=jj.huber())`.
-    The default keeps 95 % of the efficiency.
+    """Count residuals beyond `k` sigmas by their magnitude in place of their square: `jj.fit(...,
+    loss=jj.huber())`. The default keeps 95 % of the efficiency.
 
     Raises ValueError unless k is positive and finite.
     """
@@ -99,8 +99,8 @@ def huber(k: Number = 1.345) -> Loss:
 
 
 def student_t(degrees: Number = 4.0) -> Loss:
-    """Assume noise with the tails of Student's t, so that outliers hardly count. `degrees` of freedom: fewer
-    for heavier tails; sigma is the scale of the noise.
+    """Assume noise with the tails of Student's t, so that outliers hardly count. `degrees`: of freedom, fewer
+    for heavier tails. Sigma is then the scale of the noise.
 
     Raises ValueError unless the degrees are positive and finite.
     """
@@ -110,7 +110,8 @@ def student_t(degrees: Number = 4.0) -> Loss:
 def _positive(x: Number, name: str, function: str) -> float:
     checked_real(x, f"`{name}` of `{function}`", ())
     if not (np.isfinite(x) and x > 0):
-        raise ValueError(f"{function}({x}): expected a positive finite number for `{name}`; omit it for the default")
+        raise ValueError(f"{function}({x}): expected a positive finite number for `{name}`; omit it for the "
+            "default")
     return float(x)
 
 
@@ -130,8 +131,8 @@ class Asked:
 
 @dataclass(frozen=True)
 class Span(ByMember):
-    """The first part of all runs. The first guess is a weak prior, known to its own size, for undetermined
-    unknowns.
+    """The first part of all runs. For undetermined unknowns the first guess is a weak prior, with its own
+    size as standard deviation.
     """
 
     shares: PerMember  # of the span of each run, from its start: samples beyond do not count
@@ -139,8 +140,8 @@ class Span(ByMember):
 
 
 class Problem:
-    """The objective of a fit over its runs: residuals with derivatives, for any members at any numbers.
-    `repeats` of the experiment; None: it has none.
+    """The objective of a fit over its runs: residuals with derivatives, for any members at any values of the
+    unknowns. `repeats`: the number of repeats of the experiment, or None.
     """
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None):
@@ -177,16 +178,18 @@ class Problem:
             yield from group.evaluate(*self.unknowns.split(theta), members)
 
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
-        """Return the objective with its arrow, for some members, over all runs or a span of them."""
+        """Return the objective and its arrow for some members, over all runs or over a span of them."""
         return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
-        """Return the minimum of some members, from theta. `control`: other than that of the fit."""
+        """Return the minimum of some members, from theta. `control`: replaces that of the fit."""
         evaluate = lambda x, here: self.linearised(x, members[here], span and span.of(here))  # noqa: E731
         return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
 
     def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
-        """Return the minimum over all unknowns but one, which is held at this value; to one per cent of a standard error."""
+        """Return the minimum over all unknowns but one, which is held at this value, to one per cent of a
+        standard error.
+        """
         unknowns, control, fixed = self.unknowns, self.asked.control, self.unknowns.fixed.copy()
         begin = np.clip(theta, unknowns.low, unknowns.high)
         begin[0, place], fixed[place] = value, True
@@ -232,7 +235,7 @@ class Problem:
 
     def joined(self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None) -> tuple[Arrow, np.ndarray | float]:
         """Return the arrow of triangles (members, runs, kinds, width, width) with these sigmas (members,
-        kinds) and all priors; and the part of the priors in F.
+        kinds) and all priors, and the contribution of the priors to F.
         """
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]
@@ -249,7 +252,7 @@ class Problem:
         return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
-        """Return the shares of the span over which squared residuals average at most so many times those of
+        """Return the shares of the span over which the mean squared residual is at most `most` times that of
         noise.
         """
         good = np.isfinite(at.cost)
@@ -264,7 +267,9 @@ class Problem:
         return found
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
-        """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
+        """Set unknown correlation times to the maximum of the restricted likelihood. Return the largest
+        change of rho, the correlation over one shortest interval.
+        """
         evaluated, ends = list(self.evaluated(theta, members)), np.array([correlation_limits(self.runs, name) for name in self.with_memory])
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
         for k, (low, high) in enumerate(ends):
@@ -284,11 +289,13 @@ class Problem:
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
     def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the part of estimated correlation times, (members, unknowns), in each squared standard error
-        C, relative to it; and the variance of log C.
+        """Return the contribution of estimated correlation times to each squared standard error C, (members,
+        unknowns), relative to C; and the variance of log C.
 
-        By moments over the restricted likelihood of each correlation time, with weights that are even in arcsin rho (Jeffreys' prior of AR(1) noise): C becomes
-        mean C + variance of the estimates, which move with it. `of`: standard errors and changes of the estimates from an arrow. Zero where none is estimated.
+        Moments are taken over the restricted likelihood of each correlation time, with weights that are even
+        in arcsin rho (Jeffreys' prior of AR(1) noise). The total variance is the mean of C plus the variance
+        of the estimates, both over the correlation time. `of`: returns standard errors and changes of the
+        estimates from an arrow. The result is zero if no correlation time is estimated.
         """
         members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
@@ -323,8 +330,8 @@ class Problem:
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
-        """Return residuals of a run in units of sigma by channel, (members, *samples); NaN for missing
-        samples, or if another run had failed. `white`: whitened ones.
+        """Return the residuals of a run by channel in units of sigma, (members, *samples); NaN for missing
+        samples, and where another run failed. `white`: return whitened residuals.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
@@ -340,7 +347,8 @@ class Problem:
         return parts
 
     def kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
-        """[J r] of lanes of a run: of channels whose sigma is known, then of each other channel."""
+        """Return [J r] of lanes of a run: first of all channels with known sigma, then of each other channel.
+        """
         if not self.estimated:
             return [whole]
         channels = self.group_of[run].channels
@@ -349,8 +357,8 @@ class Problem:
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
-    """Return [J r] from [J g r], where pieces of a run do not join yet: g is the first-order change of r once
-    they do.
+    """Return [J r] from [J g r], for pieces of a run that do not join yet: g is the first-order change of r
+    when they join.
     """
     if rows.shape[-1] == unknowns + 1:
         return rows

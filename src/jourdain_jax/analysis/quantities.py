@@ -59,8 +59,8 @@ class Channel(eqx.Module):
 
 
 def channel(function: Callable, scene: Scene) -> Channel:
-    """Return a function of a motion of this scene as a channel; it is traced again if it is new, or the
-    values it reads have changed.
+    """Return a channel as a function of a motion of this scene. It is traced again if it is new or if values
+    that it reads have changed.
     """
     now = now_read_by(function)
     if now is None:
@@ -84,9 +84,11 @@ def _traced(function: Callable, scene: Scene) -> Channel:
         closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
     except TypeError as error:
         advice = "write it with `jax.numpy`, without `if` of numbers of the motion, and return one array of numbers"
-        raise ValueError(f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}") from error
+        raise ValueError("a function of `sensors` cannot be called with a motion "
+            f"({str(error).splitlines()[0]}); {advice}") from error
     if not hasattr(shape, "shape"):
-        raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of numbers; return one array")
+        raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of "
+            "numbers; return one array")
     jaxpr = closed.jaxpr
     operations = ClosedJaxpr(jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars]), [])
     return Channel(Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
@@ -110,7 +112,8 @@ class Instrument(eqx.Module):
 
     @abstractmethod
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """ValueError, which names the channel and the run, where the scene has nothing that it could show."""
+        """Raise ValueError, with the names of channel and run, where the scene lacks the measured quantity.
+        """
 
     @abstractmethod
     def over_times(self, motion: Trajectory) -> OverTimes:
@@ -139,13 +142,17 @@ class Accelerometer(Instrument):
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
         check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
-        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice="give three components in the body's frame, m")
+        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice="give three components "
+            "in the body's frame, m")
         self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise a ValueError that names the `channel` and the run, `where`, if the scene has no such body."""
+        """Raise ValueError, with the names of the `channel` and the run (`where`), if the scene has no such
+        body.
+        """
         bodies = motion_shape(scene).bodies
-        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there")
+        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, "
+            "which is not there")
 
     def over_times(self, motion: Trajectory) -> OverTimes:
         """Return the readings at all times of one motion."""
@@ -181,11 +188,12 @@ class LoadCell(Instrument):
         self.contact = contact
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise a ValueError that names the `channel` and the run, `where`, if the scene has no such contact,
-        or its force is not determined.
+        """Raise ValueError, with the names of the `channel` and the run (`where`), if the scene has no such
+        contact or its force is not determined.
         """
         determined = _determined(scene)
-        check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which is not there")
+        check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact "
+            f"`{self.contact}`, which is not there")
         if not determined[self.contact]:
             raise ValueError(
                 f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not "
@@ -209,7 +217,7 @@ LATEST = 4.0  # times the observed time: where a motion meets the event later th
 
 
 class StopEvent(eqx.Module):
-    """An event of a scene by name, for whose time there is a measured value."""
+    """An event of a scene, by name, whose time was measured."""
 
     name: str = eqx.field(static=True)
 
@@ -222,7 +230,7 @@ class StopEvent(eqx.Module):
         return StopEvent(name)
 
     def time(self, motion: Callable, t0, span) -> Scalar:
-        """Return the time at which the motion stops at the event, NaN if it does not. `motion`: of times,
+        """Return the time at which the motion stops at the event, NaN if it does not. `motion`: simulated
         with its events; `span`: from the start to the observed time.
         """
         found = motion((t0 + LATEST * span)[None])
@@ -230,20 +238,23 @@ class StopEvent(eqx.Module):
 
 
 def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
-    """Return times, values and sigmas of a run up to its event, whose time is one more channel; a vector of
-    times: for repeats. ValueError for impossible times.
+    """Return times, values and sigmas of a run up to its event, whose time is one more channel (a vector for
+    repeats). Raises ValueError for impossible times.
     """
     if len(events) > 1:
-        raise ValueError(f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at the first of its events; give that one")
+        raise ValueError(f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at "
+            "the first of its events; give that one")
     ((name, given),) = events.items()
     if name in values:
-        raise ValueError(f"`{name}` is both a channel and an event; give the channel another name, with a sensor")
+        raise ValueError(f"`{name}` is both a channel and an event; give the channel another name, with a "
+            "sensor")
     if not isinstance(given, tuple | list) or len(given) != 2:
-        raise ValueError(f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as (1.83, 0.005)")
+        raise ValueError(f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as "
+            "(1.83, 0.005)")
     at, spread = (checked_known(x, f"{what} of event `{name}`", advice="give a number in s") for x, what in zip(given, ("the time", "sigma"), strict=True))
     if is_traced((ts, t0)) or at.ndim > 1 or not np.all(at > t0):
-        raise ValueError(f"the time of event `{name}` is {at} s, expected a time after the start at t0 = {t0} s "
-            "(for `fit_batch` a vector with one time per repeat)")
+        raise ValueError(f"the time of event `{name}` is {at} s, expected a time after the start at t0 = "
+            f"{t0} s (for `fit_batch` a vector with one time per repeat)")
     last = min(int(np.searchsorted(ts, at.max())), len(ts) - 1)
     kept, axis = slice(last + 1), at.ndim
     after = ts[kept] > at[..., None]

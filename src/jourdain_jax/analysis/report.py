@@ -68,7 +68,9 @@ class Report(Printed):
     conventions: str
 
     def as_dict(self) -> dict:
-        """Return the report for machines: the fields by name, with None for values that are not finite."""
+        """Return the report as a dictionary for programs: the fields by name, with None for values that are
+        not finite.
+        """
         facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         facts["domain"] = {name: list(bounds) for name, bounds in self.domain.items()}
         facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
@@ -113,8 +115,9 @@ class Report(Printed):
             return f"rank {self.rank}, as at generic states"
         freedoms = len(self.speeds) - (self.rank_at_start or 0)
         return (
-            f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} freedoms: a singular configuration, "
-            "or another way to assemble the scene; state a `domain` around the start to have it judged there"
+            f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} "
+            "freedoms: a singular configuration, or another way to assemble the scene; state a `domain` "
+            "around the start to have it judged there"
         )
 
     def _growth(self) -> str:
@@ -143,7 +146,8 @@ class Report(Printed):
 
 @shown_from_users_lines
 @of_known_numbers
-def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | None" = None) -> Report:
+def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | "
+    "None" = None) -> Report:
     """Report freedoms, constraints, rank, redundancy, integrability, growth vector, cyclic and ignorable
     coordinates of a scene.
 

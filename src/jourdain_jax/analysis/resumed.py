@@ -47,13 +47,14 @@ from jourdain_jax.scene.printing import Printed
 
 
 def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
-    """Return a `Fit` of one experiment at its end, with residuals and derivatives computed again. ValueError
-    if `data` are not those of the fit.
+    """Return a `Fit` of one experiment to continue from, with residuals and derivatives computed again.
+    Raises ValueError if `data` are not those of the fit.
     """
     problem = for_runs(fit, data, fit.asked, fit.shooting is not None)
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
-        raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: {', '.join(fit.labels)}")
+        raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: "
+            f"{', '.join(fit.labels)}")
     theta[0, unknowns.estimated] = fit.values
     if isinstance(problem, Piecewise) and fit.shooting is not None:
         problem.put_nodes(theta, fit.shooting)
@@ -64,13 +65,14 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
         for name, r in residuals.items():
             here = np.nan_to_num(again[name][0] if name in again else np.nan) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
             if here.shape != r.shape or largest(np.nan_to_num(r) - here) >= 0.01:
-                raise ValueError("`data` differ from those of the fit (the residuals disagree); give the runs of the fit")
+                raise ValueError("`data` differ from those of the fit (the residuals disagree); give the "
+                    "runs of the fit")
     return problem, Minimum.begun(theta, at, "")
 
 
 def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
-    """Return the problem of a `Fit` for these runs; ValueError if they do not match the scene. `apart`:
-    separate unknowns of runs from shared ones.
+    """Return the problem of a `Fit` for these runs. Raises ValueError if they do not match the scene.
+    `apart`: separate unknowns of runs from shared ones.
     """
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
@@ -104,7 +106,9 @@ class Prediction(Printed):
 
     @property
     def r_squared(self) -> float:
-        """1 - sum error^2 / sum (value - mean)^2, each component of the channel about its own mean; NaN where the values do not vary."""
+        """Return 1 - sum error^2 / sum (value - mean)^2, each component of the channel about its own mean;
+        NaN where the values do not vary.
+        """
         values = np.where(np.isfinite(self.error), self.values, np.nan)
         spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2)
         return float(1 - np.nansum(self.error**2) / spread) if spread > 0 else np.nan
@@ -120,8 +124,8 @@ def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Pre
 
 
 def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
-    """Return predictions of other runs; ValueError if they do not match the scene, or share unknowns that the
-    fit did not estimate.
+    """Return predictions of other runs. Raises ValueError if they do not match the scene, or share unknowns
+    that the fit did not estimate.
     """
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
@@ -176,8 +180,8 @@ class Informed:
         return 1 - self.of_runs.sum(axis=1)
 
     def half(self, unknown: int) -> tuple[int, float, float]:
-        """Return the run with most information on an unknown, and the shortest time span, first and last
-        sample, that holds half of it.
+        """Return the run with most information on an unknown, and the shortest time span (first and last
+        sample) that holds half of that information.
         """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
@@ -189,8 +193,8 @@ class Informed:
 
 
 def informed(problem: Problem, found: Minimum, most: int) -> Informed:
-    """Shares for the first `most` unknowns of a fit that have a standard error, from the sigmas alone: no factor for the loss or for sigmas that are
-    estimated.
+    """Return the shares of information for the first `most` unknowns that have a standard error, from the
+    sigmas alone, without factors for the loss or for estimated sigmas.
     """
     unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
     known = information(at.arrow, unknowns.sizes(theta), unknowns.estimated, unknowns.reached(theta), ~found.going, problem.asked.control.cutoff).only()
@@ -231,11 +235,12 @@ class Profile(Printed):
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         ends = "no data set an end to it" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
-        return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes))
+        return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: "
+            f"{ends}", *self.notes))
 
 
 def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
-    """Return profiles of the unknowns named. `errors`: standard errors by name, for the first step;
+    """Return profiles of the named unknowns. `errors`: standard errors by name, for the first step;
     `inflation`: the divisor of the rise.
     """
     unknowns, found = problem.unknowns, {}

@@ -40,7 +40,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Run(NamedTuple):
-    """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
+    """A prepared run: its measurements with weights 1 / sigma, zero where a sample is missing."""
 
     t0: Float[Entries, ""]
     ts: Times
@@ -63,7 +63,7 @@ class Run(NamedTuple):
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
-        """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
+        """Return `(reading - value) / sigma` by channel, and for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
@@ -82,7 +82,9 @@ class Run(NamedTuple):
         return found | ended(motion, filters, self.start, ts)
 
     def stops(self, event: StopEvent, name: str, motion: Callable) -> Scalar:
-        """When the motion stops at the event whose time is the channel `name`; samples may end long before it."""
+        """Return the time at which the motion stops at the event of the channel `name`; samples may end long
+        before it.
+        """
         observed = jnp.max(jnp.where(self.weights[name] > 0, self.values[name] - self.t0, 0.0))
         return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))
 
@@ -96,8 +98,8 @@ class Run(NamedTuple):
 
 
 def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
-    """Return a run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have
-    a leading axis.
+    """Return a run with weights. `xp`: NumPy, or `jax.numpy` for traced numbers; `repeats`: values have a
+    leading axis.
     """
     weights = {}
     for name, values in data.values.items():
@@ -116,7 +118,7 @@ def on_equal_grids(runs: Sequence[Run]) -> list[Run]:
 
 
 def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
-    """Runs of equal structure and shapes stacked, with their numbers, for use where numbers may be traced."""
+    """Stack runs of equal structure and shapes. Return them with their indices; numbers may be traced."""
     groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in grouped(data):
         for i in indices:
@@ -131,8 +133,8 @@ def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
 
 
 def grouped(data: Sequence[Experiment]) -> list[list[int]]:
-    """Return indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for
-    the number of times.
+    """Return indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, and all shapes
+    except the number of times.
     """
     if len(data) == 1:
         return [[0]]
@@ -160,8 +162,8 @@ def most_knots(runs: Sequence[Run]) -> list[int]:
 
 
 def filled_up(run: Run, times: int, knots: list[int]) -> Run:
-    """Return the run, with an axis of members, padded to as many times and knots as these; padding follows
-    its end closely, and does not count.
+    """Pad a run to the numbers `times` and `knots`, with an axis of members. Padded entries lie shortly after
+    the end of the run, and do not count.
     """
     more = times - run.ts.shape[0]
     counts = iter(knots)
@@ -187,9 +189,11 @@ _BY_MEMBER = ("values", "weights")  # of a run, which differ by member
 
 
 class Group:
-    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member.
+    """Runs of equal structure, padded to one length. A lane is one run (by its number in the problem) of one
+    member.
 
-    `members`: repeats of the experiment, which the values have a leading axis of; None: they have none, and are the same for all members.
+    `members`: the number of repeats of the experiment, the leading axis of the values; None: there are no
+    repeats, and all members share the values.
     """
 
     def __init__(self, scene: Scene, data: Sequence[Experiment], indices: list[int], layout: Layout, options: AllOptions, members: int | None):
@@ -243,8 +247,8 @@ class Group:
                 yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield the number of lanes at a time, with positions of their members and runs, padded with copies
-        of the last.
+        """Yield the number of lanes of a chunk, with the indices of their members and runs, padded with
+        copies of the last.
         """
         count = members * len(self.runs)
         # of many lanes those that are left last run eight at a time: these cost less than another program for fewer
@@ -254,7 +258,8 @@ class Group:
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: np.ndarray) -> np.ndarray:
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples "
+        "width"], taus: np.ndarray) -> np.ndarray:
         """Return rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s.
         """
         if self._chains is None:
@@ -277,8 +282,8 @@ class Group:
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
     def by_channel(self, run: int, flat: Float[np.ndarray, "members samples"]) -> dict[str, np.ndarray]:
-        """Return weighted residuals of a run by channel, NaN for missing samples; all NaN where `flat` is
-        empty, since they were not computed.
+        """Return weighted residuals of a run by channel, NaN for missing samples. If `flat` is empty, nothing
+        was computed, and all are NaN.
         """
         place, found = int(np.searchsorted(self.runs, run)), {}
         for name, where in self.channels.items():
@@ -295,8 +300,8 @@ def _of_members(run: Run, of: Callable) -> Run:
 
 
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
-    """Return all numbers of some trees in the order of `ravel_pytree`, in a row for each member; of a tree
-    that has no axis of members, the same for all.
+    """Return all numbers of some trees in the order of `ravel_pytree`, one row for each member. A tree
+    without an axis of members appears in every row.
     """
     parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
     return np.hstack([np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)])
@@ -304,9 +309,11 @@ def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
-    """Compile [J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns.
+    """Compile [J r] of lanes, shape (lanes, samples, local + shared + 1), from the shared numbers and one row
+    of runs and unknowns for each lane.
 
-    `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with shapes in place of arrays.
+    `reference`: that of the scene; `treedef`, `leaves`: structure of scene, options and run, with shapes in
+    place of arrays.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
     zeros = [np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype)) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]

@@ -47,11 +47,11 @@ Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
 
 def intervals(t0, ts: Times, node) -> int:
-    """Return the number of intervals from the start to the last sample: those of the samples if equal; else
-    none longer than their median.
+    """Return the number of equal intervals from the start to the last sample: those of the samples if these
+    are equal; otherwise enough that none is longer than the samples' median interval.
 
-    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. Of a piece of a run the
-    intervals up to the next `node` are counted so, and there are more beyond.
+    For traced times only their number is known; then there are two intervals for each sample. For a piece of
+    a run the result counts intervals up to the next `node`, after which the grid continues.
     """
     if is_traced((t0, ts)):
         return max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
@@ -63,9 +63,8 @@ def intervals(t0, ts: Times, node) -> int:
 
 
 def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
-    """Return so many intervals up to the last sample; those of a piece continue for at most one more, so that
-    its next `node` is one of the times.
-    """
+    """Return `count` intervals up to the last sample. For a piece they extend by at most one more, so that
+    its next `node` is a time of the grid."""
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
     xp = array_module((t0, end))
@@ -96,10 +95,11 @@ def read(
     lag=None,
     begin: Float[Array, "entries"] | None = None,
 ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"]]:
-    """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s, at equal
-    intervals, six or more), and y there; `lag` None: no lag.
+    """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s, six or more, at
+    equal intervals), and y there; `lag` None: no lag.
 
-    Times before the first of the grid count as that. `delay`, `lag` in s. `begin`: what the filter gives at first; None: it starts at rest.
+    Times before the grid count as its first time. `delay`, `lag` in s. `begin`: the initial output of the
+    filter; None: it starts at rest.
     """
     count, step = grid.shape[0], (grid[-1] - grid[0]) / (grid.shape[0] - 1)
     x = jnp.maximum((ts - delay - grid[0]) / step, 0.0)
@@ -146,15 +146,16 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
 
 
 def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
-    """Knots of a command that keeps each value until the next one: it passes over in a thousandth of the shortest interval, half of it before the time."""
+    """Return the knots of a command that keeps each value until the next one. A change takes a thousandth of
+    the shortest interval, and its middle is at the stated time."""
     half = 0.5e-3 * jnp.min(jnp.diff(ts))
     late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
     return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
 
 
 def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
-    """Return the filter's output at the knots of a command that is linear in between, or held until the next
-    knot: exactly there.
+    """Return the exact output of the filter at the knots of a command that is linear between knots, or held
+    until the next knot.
 
     y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
     """
@@ -182,21 +183,26 @@ class Sensor(eqx.Module):
 
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=0.01)
 
-    - `quantity`: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one instant) such as
-      `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: what the channel is called.
-    - `gain`, `bias` (in the unit of the channel): one number, or one for each component of a channel that is a vector.
-    - `delay` in s. No sample that counts may show a time before the start of the run: its time less the largest delay is at or after `t0`.
-    - `lag` in s: time constant of a first-order low-pass, which starts at rest: at `t0` it shows the quantity as it is then.
+    - `quantity`: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one
+      instant) such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: the coordinate or
+      speed with the channel's name.
+    - `gain`, `bias` (in the unit of the channel): one number, or one for each component of a vector channel.
+    - `delay` in s. Every sample that counts must lie at least the largest delay after `t0`, since the motion
+      before the start is unknown.
+    - `lag` in s: time constant of a first-order low-pass filter that starts at rest, with the quantity's
+      value at `t0`.
 
-    Each number may be an `Estimate`. By default an estimated lag is positive, gain and bias may be any number; a delay needs `range=jj.bounds(low, high)`.
+    Each number may be an `Estimate`. By default an estimated lag is positive, and gain and bias are
+    unbounded; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, a motion (a piece of one, with `shooting`) is computed at equal intervals, 64 or
-    more and none longer than the median interval of
-    the samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the
-    slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to
-    0.08 J h^2.
+    With a delay or a lag, a motion (or a piece of it, with `shooting`) is computed at equal intervals, 64 or
+    more and none longer than the median interval of the samples, and interpolated by polynomials of degree 5:
+    for intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude. Where the
+    slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h;
+    where its second derivative jumps by J, up to 0.08 J h^2.
 
-    Inside `jit`, where times are not known, there are two intervals for each of the samples: take the first sample at or near `t0`.
+    Inside `jit`, where times are unknown, each interval between samples is halved: take the first sample at
+    or near `t0`.
 
     **Raises** ValueError for numbers that are not finite, and delays or lags below zero.
     """
@@ -217,7 +223,8 @@ class Sensor(eqx.Module):
         lag: Stated = 0.0,
     ):
         if not (quantity is None or isinstance(quantity, str | Instrument) or callable(quantity)):
-            raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a speed, or a function of a motion")
+            raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a "
+                "speed, or a function of a motion")
         self.quantity = quantity
         self.gain, self.bias, self.delay, self.lag = _checked("Sensor", gain=gain, bias=bias, delay=delay, lag=lag)
 
@@ -228,14 +235,16 @@ class Actuator(eqx.Module):
 
         inputs={"steer_torque": jj.Actuator(jj.Sampled(ts, command), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=jj.Estimate(0.03))}
 
-    - `command`: `Sampled`; it has its first value at all times before.
-    - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers, or `Estimate`, as of a `Sensor`.
+    - `command`: `Sampled`; before its first sample it has its first value.
+    - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers, or `Estimate`, as of a
+      `Sensor`.
 
-    - `hold`: whether the command keeps each value until the next sample, as that of a digital controller does; otherwise it is linear between its samples.
-      Two knots then stand for a sample, and a motion takes as many more steps.
+    - `hold`: whether the command keeps each value until the next sample, as that of a digital controller
+      does; otherwise it is linear between samples. Each sample then has two knots, and a motion takes as many
+      more steps.
 
-    The low-pass is exact at the samples of the command, and linear in between (of a command that holds, take a lag of an interval or more); it does not go on
-    after the last of them.
+    The low-pass filter is exact at the samples of the command and linear in between, so that a held command
+    needs a lag of at least one interval. It ends with the last sample.
 
     **Raises** ValueError for a command of another kind, a `hold` that is neither True nor False, numbers that are not finite, and delays or lags below zero.
     """
@@ -265,25 +274,30 @@ def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array,
     if isinstance(value, Estimate):
         _check_estimate(where, name, value)
         return value
-    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(real_type())
+    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or "
+        "an `Estimate`").astype(real_type())
     if not holds(np.isfinite, number):
         raise ValueError(f"{where} is {number}, expected a finite number")
     if name in OF_TIME and not holds(lambda x: x >= 0, number):
-        raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a channel is ahead, shift its times")
+        raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a "
+            "channel is ahead, shift its times")
     return number
 
 
 def _check_estimate(where: str, name: str, value: Estimate) -> None:
     if value.guess is None:
-        raise ValueError(f"{where} is to be estimated, but has no first guess; give one: `jj.Estimate({NUMBERS[name]})`")
+        raise ValueError(f"{where} is to be estimated, but has no first guess; give one: "
+            f"`jj.Estimate({NUMBERS[name]})`")
     if name not in OF_TIME:
         return
     if isinstance(value.guess, tuple):
         raise ValueError(f"{where} is to be estimated from {len(value.guess)} guesses, expected one number")
     if name == "delay" and (value.range is None or not np.isfinite(value.range.high)):
-        raise ValueError(f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, high)`, in s")
+        raise ValueError(f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, "
+            "high)`, in s")
     if value.range is not None and value.range.low < 0:
-        raise ValueError(f"{where} may fall to {value.range.low:g} s, expected a range that begins at zero or above")
+        raise ValueError(f"{where} may fall to {value.range.low:g} s, expected a range that begins at zero "
+            "or above")
 
 
 def default_range(name: str):
@@ -292,7 +306,7 @@ def default_range(name: str):
 
 
 class Response(eqx.Module):
-    """The numbers of a sensor or actuator of one run, first guesses for estimated ones."""
+    """The numbers of a sensor or actuator of one run, with first guesses for estimated ones."""
 
     numbers: dict[str, Numbers | float]
     unknown: Labels = eqx.field(static=True)  # names of numbers that are estimated
@@ -321,17 +335,15 @@ class Reading(Response):
     name: str = eqx.field(static=True)  # of that
 
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
-        """Return the measured quantity along a motion; `states`: the same as bodies, for channels that are
-        functions of them.
-        """
+        """Return the measured quantity along a motion; `states`: the same motion as bodies, for channels that
+        are functions of them."""
         if self.operation is None:
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
     def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
-        """Return the reading at `ts` of a quantity with values `x` at these times, or on a grid; and y on the
-        grid, from the initial value (None: at rest).
-        """
+        """Return the reading at `ts` of a quantity whose values at these times, or on a grid, are `x`; and y
+        on the grid. The filter starts from the initial value (None: at rest)."""
         y = None
         if grid is not None:
             x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
@@ -339,7 +351,7 @@ class Reading(Response):
 
 
 def ideal(name: str, event: StopEvent | None = None) -> Reading:
-    """Return an ideal sensor of a coordinate or speed; or of the time of an event."""
+    """Return an ideal sensor of a coordinate or speed, or of the time of an event."""
     return Reading(dict(NUMBERS), (), (), event, name)
 
 
@@ -365,9 +377,8 @@ class Drive(Response):
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
-    """Return its numbers (first guesses for estimated ones), names of the estimated ones, and names of all
-    that matter.
-    """
+    """Return the numbers of a sensor (first guesses for estimated ones), names of the estimated ones, and
+    names of all that have an effect."""
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}

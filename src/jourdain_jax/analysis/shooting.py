@@ -39,8 +39,8 @@ NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run
 
 
 def begin(scene: Scene, start: dict, t0):
-    """Return the beginning for `simulate`: the start of a run; for a later piece its node, which `simulate`
-    projects onto the constraints.
+    """Return the beginning for `simulate`: the start of a run, or for a later piece the state at its joint,
+    which `simulate` projects onto the constraints.
     """
     if NODE in start:
         q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
@@ -62,12 +62,13 @@ class MultipleShooting:
 
         jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
 
-    - `duration`: about how long a piece is, s: a time over which neighbouring motions part by a factor of two to five.
-    - `pieces`: how many pieces each run has; give one of the two.
+    - `duration`: approximate length of a piece, s: a time over which neighbouring motions diverge by a factor
+      of two to five.
+    - `pieces`: the number of pieces of each run; give one of the two.
 
-    Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole
-    run: steps are as for an almost linear problem. The objective and its minimum equal those of a fit without
-    `shooting`.
+    Pieces begin at samples; where a sensor has a delay, they overlap by its largest possible value. This
+    serves motions that are unstable or chaotic over the whole run: steps are as for an almost linear problem.
+    The objective and its minimum equal those of a fit without `shooting`.
 
     **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
     """
@@ -77,27 +78,32 @@ class MultipleShooting:
 
     def __post_init__(self):
         if (self.pieces is None) == (self.duration is None):
-            raise ValueError("`MultipleShooting` expects either `pieces` (their number in each run) or `duration` (of a piece, in s), such as `duration=0.5`")
+            raise ValueError("`MultipleShooting` expects either `pieces` (their number in each run) or "
+                "`duration` (of a piece, in s), such as `duration=0.5`")
         if self.pieces is not None:
-            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for one piece omit `shooting`")
+            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for "
+                "one piece omit `shooting`")
         else:
             number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
             if not (np.isfinite(number) and number > 0):
-                raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite time above zero")
+                raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite "
+                    "time above zero")
 
 
 def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
-    """Return samples at which pieces begin, and the last sample. ValueError if there are fewer intervals than
-    pieces, or the run ended by an event.
+    """Return the samples at which pieces begin, and the last sample. Raises ValueError if there are fewer
+    intervals than pieces, or if an event ended the run.
     """
     if run.ended_by:
-        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does not use; omit it, and the samples after it")
+        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does "
+            "not use; omit it, and the samples after it")
     ts = np.asarray(run.ts)
     count = len(ts) - 1
     pieces = shooting.pieces
     if pieces is not None:
         if pieces > count:
-            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces of at least one interval; give at most {count}")
+            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces of at least "
+                f"one interval; give at most {count}")
         return np.round(np.linspace(0, count, pieces + 1)).astype(int)
     at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
     after = np.clip(np.searchsorted(ts, at), 1, count)
@@ -106,14 +112,15 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
 
 
 def numbers_of_filters(run: Experiment) -> int:
-    """Return the number of states of the low-passes of the sensors of a `checked` run."""
+    """Return the number of states of the low-pass filters of the sensors of a `checked` run."""
     return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 
 def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
-    """For each channel, the first sample that belongs to each piece, and one past the last of all.
+    """Return, for each channel, the first sample that belongs to each piece, and one past the last sample.
 
-    A sample at which two pieces meet belongs to the later one; of a sensor with a delay, to the piece that has begun the largest delay before.
+    A sample at a joint belongs to the later piece. With a delayed sensor it belongs to a later piece only if
+    that began at least the largest delay before it.
     """
     ts, found = np.asarray(run.ts, float), {}
     for name in run.values:
@@ -124,8 +131,8 @@ def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
 
 
 def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
-    """Return the pieces of a `checked` run; all but the first begin at a node of so many numbers. Each
-    continues to its last sample.
+    """Return the pieces of a `checked` run. Each but the first begins at a joint, whose state has `states`
+    numbers; `ends`: their first and last samples.
     """
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
@@ -153,8 +160,8 @@ def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
 
 
 def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
-    """Return the inputs with the knots about this span only; those of actuators stay whole, since their
-    numbers may move them.
+    """Return the inputs with only the knots about this span. Actuators keep all knots, since their numbers
+    may move them.
     """
     if not isinstance(run.inputs, Inputs):
         return run.inputs
@@ -174,4 +181,5 @@ def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
 def check_shooting(shooting) -> None:
     """Raise a ValueError for anything but a `MultipleShooting`."""
     if shooting is not None and not isinstance(shooting, MultipleShooting):
-        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, `jj.MultipleShooting(pieces=...)`, or None")
+        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, "
+            "`jj.MultipleShooting(pieces=...)`, or None")

@@ -40,7 +40,7 @@ from jourdain_jax.scene.scene import Scene
 def first_nodes(
     scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"]
 ) -> Float[np.ndarray, "pieces states"]:
-    """Return nodes at the begin of all pieces of a run, the first one included; q, u: its start."""
+    """Return the states at the beginning of all pieces of a run, including the first; q, u: its start."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
@@ -72,7 +72,8 @@ def first_nodes(
 
 
 def goes_on(scene: Scene, q: Float[np.ndarray, "coordinates"]) -> np.ndarray:
-    """Return which coordinates no geometric row and no unit norm depends on, such as headings and distances.
+    """Return the coordinates on which no geometric row and no unit norm depends, such as headings and
+    distances.
     """
     beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # where no slope vanishes by symmetry
     return ~np.any(_closures(scene, beside) != 0, axis=0)
@@ -162,9 +163,7 @@ def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) ->
 
 
 def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
-    """Set unknown start values of runs to measured ones, where these are within their bounds and have no
-    prior.
-    """
+    """Set unknown start values of runs to measured ones that lie within their bounds and have no prior."""
     unknowns, scene = problem.unknowns, problem.scene
     low, high = unknowns.low, unknowns.high
     for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):
@@ -179,7 +178,7 @@ def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> Non
 
 
 def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
-    """Return the minimum with all gaps closed, by sequential quadratic programming from where the pieces are.
+    """Return the minimum with all gaps closed, by sequential quadratic programming from the present pieces.
     """
     unknowns, control = problem.unknowns, problem.asked.control
 
@@ -211,7 +210,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """Return the fraction of the largest singular value below which one counts as zero: less, where the
-    largest has grown along the motion and the others have not.
+    """Return the fraction of the largest singular value below which others count as zero. It is smaller if
+    the largest has grown along the motion and the others have not.
     """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

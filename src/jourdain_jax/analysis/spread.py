@@ -83,10 +83,11 @@ class Side(NamedTuple):
 
 
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
-    """Follow the profile of member `b` along one unknown to one side (`way` is 1 or -1) until F has risen by `end`, from a distance `first` on.
+    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1) until F has
+    risen by `end`, from a distance `first` on.
 
-    All others continue from where they were at the point before. The end is found by secants of the root of
-    the rise, which is nearly straight.
+    All other unknowns start from their values at the previous point. The end is found by the secant method
+    for the square root of the rise, which is nearly linear.
     """
     close, origin, theta = 0.01, float(found.theta[b, place]), found.theta[b : b + 1]  # close: of the rise at the end
     bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])
@@ -100,7 +101,8 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
             points.append((origin + way * delta, rise))
             note = note if at.converged[0] else f"no minimum over the others was found {where}, so that the interval may be too narrow"
         if rise < -2 * close * end:
-            return Side(bound, False, at, points, f"a lower minimum than the fit lies {where}: fit again from there")
+            return Side(bound, False, at, points, f"a lower minimum than the fit lies {where}: fit again "
+                "from there")
         if abs(rise / end - 1) < close:
             return Side(origin + way * delta, True, at, points, note)
         if rise < end:
@@ -119,8 +121,10 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         else:
             delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + close) if inner[1] else 4.0, 4.0), room)
     if not np.isfinite(outer[1]):
-        return Side(bound, False, None, points, f"the motion fails {where}" if np.isfinite(outer[0]) else note)
-    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: beyond it, other unknowns are elsewhere")
+        return Side(bound, False, None, points, "the motion fails "
+            f"{where}" if np.isfinite(outer[0]) else note)
+    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: beyond it, "
+        "other unknowns are elsewhere")
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
@@ -154,21 +158,25 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
 
 
 def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
-    """Says which unknowns of the first member move further than the `reach` of their interval while one at its bound moves to its limit, one sentence each."""
+    """Return one sentence for each unknown of the first member that leaves its interval (`reach`) when an
+    unknown at a bound moves to the limit of its own interval.
+    """
     sentences = []
     for (_, place), there in told.at_limit.items():
         far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
         if far:
             bounded = labels[int(np.searchsorted(places, place))]
-            sentences.append(f"{_too_narrow(far)}: with `{bounded}` away from its bound, though within its interval, the best fit lies outside; {ADVICE}")
+            sentences.append(f"{_too_narrow(far)}: with `{bounded}` away from its bound, though within its "
+                f"interval, the best fit lies outside; {ADVICE}")
     return sentences
 
 
 def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
-    """Return name the intervals of the first member that are too narrow, since the squares rise less than
-    `errors` predict (errors of all free unknowns).
+    """Return the intervals of the first member that are too narrow, by name. They are too narrow where the
+    squares rise less than `errors`, the standard errors of all free unknowns, predict.
 
-    Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
+    The ends of the intervals of shared unknowns are tested where an interval reaches a bound, or where an
+    unknown may leave its bound.
     """
     limits, theta = problem.unknowns, found.theta[0]
     places, labels = limits.estimated, limits.labels
@@ -194,7 +202,8 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
     if names := named(shared[:8], to_ends):
-        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors predict; {ADVICE}")
+        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to "
+            f"the ends than standard errors predict; {ADVICE}")
     return sentences
 
 
@@ -219,9 +228,9 @@ class NoiseLevels:
 
 
 def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
-    """Return sigmas and their statistics at theta. `told_by`: the information of an arrow; `of_loss`: the
-    factor by which a loss multiplies variances, from the residuals of one member and the number of unknowns
-    that they determined.
+    """Return sigmas and their statistics at theta. `told_by`: returns the information of an arrow; `of_loss`:
+    returns the factor by which a loss multiplies variances, from the residuals of one member and the number
+    of unknowns that they determined.
     """
     members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
     known = told_by(at.arrow)
@@ -257,8 +266,11 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
 
 
-def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds width width"]) -> tuple[np.ndarray, np.ndarray]:
-    """p_c (members, kinds), and (C A_c C)_ii (members, kinds, places), from triangles in units of sigma."""
+def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds width "
+    "width"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return p_c (members, kinds) and (C A_c C)_ii (members, kinds, places), from triangles in units of
+    sigma.
+    """
     m, S, G, own = known.follow.shape[-2], known.shared[:, None, None], known.follow[:, :, None], known.own[:, :, None]
     T_o, T_s = T[..., :m], T[..., m:-1]
     X = T_s - T_o @ G  # own unknowns of a run follow the shared ones, x = - G s
@@ -316,8 +328,9 @@ def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members p
 def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     """Return the 97.5 % quantile in units of standard errors: normal if the noise is known, else Student's t.
 
-    Its degrees of freedom are 2 / var(log C). The variances are those that estimated correlation times and sigmas leave. C is a mean over correlation times, so
-    that t is to have that variance, without its n / (n - 2).
+    Its degrees of freedom are 2 / var(log C), where C is the variance of an estimate as it depends on the
+    estimated correlation times and sigmas. Since C is a mean over correlation times, the factor n / (n - 2)
+    of Student's variance is left out.
     """
     of_memory = np.minimum(of_memory, 0.5)  # an estimated correlation time leaves four degrees of freedom at least
     doubt = of_memory + of_sigmas

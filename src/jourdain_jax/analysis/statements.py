@@ -75,7 +75,7 @@ class Check(eqx.Module):
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """Return the check called `name` (a key of `THRESHOLDS`) from a number for every suspect; NaN counts as
+    """Return the check called `name` (a key of `THRESHOLDS`) from one number for each suspect; NaN counts as
     larger than any number.
     """
     threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
@@ -87,8 +87,8 @@ def check(name: str, values: dict, dtype, note: str = "") -> Check:
 
 
 def along(f: Callable, arguments, point, direction, u) -> tuple:
-    """Return value and slope of `f(arguments, point)` along a direction, its values at -2h, -h, h and 2h, and
-    h, which goes with the speeds `u`.
+    """Return the value and derivative of `f(arguments, point)` along a direction, its values at -2h, -h, h
+    and 2h, and the increment h, which depends on the speeds `u`.
     """
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
     ends = [_value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
@@ -120,7 +120,7 @@ class Verification(Printed, eqx.Module):
 
     @property
     def certifies(self) -> bool:
-        """Whether passing means agreement to round-off of double precision; single precision shows only gross
+        """Whether passing means agreement to round-off of double precision. Single precision shows only gross
         errors.
         """
         return all(check.threshold <= THRESHOLDS[check.name][0] for check in self.checks)
@@ -131,8 +131,8 @@ class Verification(Printed, eqx.Module):
         return all(check.passed for check in self.checks)
 
     def largest(self, *names: str) -> float:
-        """Return the largest value among the checks with these `names` (keys of `THRESHOLDS`); NaN if one is
-        NaN, zero if there is none.
+        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero if
+        there is none.
         """
         values = [check.value for check in self.checks if check.name in names]
         return float(np.max(values)) if values else 0.0
@@ -156,7 +156,8 @@ class Verification(Printed, eqx.Module):
             verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
             lines.append(f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}" + (f"; {check.note}" if check.note else ""))
         if not self.certifies:
-            lines.append("  single precision: gross errors show, but passing certifies nothing; verify in double precision (JAX_ENABLE_X64=1)")
+            lines.append("  single precision: gross errors show, but passing certifies nothing; verify in "
+                "double precision (JAX_ENABLE_X64=1)")
         if self.not_applicable:
             lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
         return "\n".join([*lines, self.mistakes]).rstrip()
@@ -165,16 +166,18 @@ class Verification(Printed, eqx.Module):
 def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
     """Return whether accelerations have a derivative along a change of the parameters and coordinates.
 
-    They have none where the change splits rows that are dependent: `(1 - A A+) dA (1 - A+ A)` is not zero.
+    They have none where the change makes dependent rows independent: `(1 - A A+) dA (1 - A+ A)` is not zero.
 
     **Arguments**
-    - `direction`: the change of every parameter, as a scene like `scene` (zeros for what stays); `dq`: that of the coordinates.
+    - `direction`: the change of every parameter, as a scene like `scene` (zeros for constant ones); `dq`: the
+      change of the coordinates.
     - `inputs`: values of the scene's inputs (default: zero).
 
-    Needs numbers: not under jit or vmap.
+    It needs numbers and does not run under jit or vmap.
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
-        raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a scene like `scene`: a `{type(scene).__name__}`")
+        raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a "
+            f"scene like `scene`: a `{type(scene).__name__}`")
     A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene))
     if A.size == 0:
         return True
@@ -196,9 +199,10 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
 
 
 def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int) -> list[Check]:
-    """Along one random direction: admissible (`Z`) in the coordinates, free in the speeds, relative in the parameters; for every reduction.
+    """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
+    the coordinates, free in the speeds, and relative in the parameters.
 
-    None where no reduction applies.
+    Returns None where no reduction applies.
     """
     names = tuple(name for name in names if name != "gibbs-appell")  # its Hessian of a Hessian costs more than all others together
     if not names:
@@ -280,7 +284,8 @@ def _inertia(motion: Motion) -> dict[str, Scalar]:
         values[f"body `{name}`: its inertia is not symmetric"] = largest(body.inertia - body.inertia.T) / size
         values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
         excess = jnp.where(moments[0] >= 0, jnp.maximum(moments[2] - moments[0] - moments[1], 0.0), 0.0)
-        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = excess / size
+        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other "
+            "two"] = excess / size
         values[f"body `{name}`: its orientation is no rotation matrix"] = largest(body.orientation.T @ body.orientation - jnp.eye(3))
     return values
 
@@ -327,7 +332,8 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
         body = placed.body
         pieces |= {f"body `{name}`: its mass": body.mass, f"body `{name}`: its position": body.position}
         if isinstance(body, RigidBody):
-            pieces |= {f"body `{name}`: its inertia": body.inertia, f"body `{name}`: its orientation": body.orientation}
+            pieces |= {f"body `{name}`: its inertia": body.inertia, f"body `{name}`: its "
+                "orientation": body.orientation}
     for i, load in enumerate(loads_of(scene, motion)):
         for kind, part in (("force", load.forces), ("torque", load.torques), ("force", load.generalized)):
             pieces |= {f"{_name(i, load)}: its {kind} on `{name}`": value for name, value in part.items()}

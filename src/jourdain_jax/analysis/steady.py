@@ -28,7 +28,8 @@ from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` bounds the search, and a backend goes to `jj.build`")
+_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` "
+    "bounds the search, and a backend goes to `jj.build`")
 
 
 class SteadyMotion(Printed, eqx.Module):
@@ -69,15 +70,17 @@ def steady(
         steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
 
     **Arguments**
-    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It need not meet the constraints.
-    - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. Where many steady motions meet this,
-      the result is one near the guess.
-    - `moving`: names of the coordinates that may keep moving; default: those without influence on the
-      scene's accelerations (`ignorable`).
-    - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
-      own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
-    - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60); `by_name`: `max_steps` alone.
-      The search continues to round-off and integrates nothing: no other field means anything here.
+    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It need not satisfy the
+      constraints.
+    - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. If many
+      steady motions satisfy this, the result is one near the guess.
+    - `moving`: names of the coordinates that may keep moving; default: those without influence on the scene's
+      accelerations (`ignorable`).
+    - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that must be
+      constant (default: the scene's own). Choose speeds in which the motion is steady: rates of yaw, lean and
+      spin, say, not velocities along fixed axes.
+    - `options`: a `jj.Options`, of which only `max_steps` has an effect: it bounds the steps of the search
+      (default: 60), which runs to round-off; `by_name`: `max_steps`.
 
     **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
     scene's parameters and in the held values, where the steady motion is a smooth function of them.

@@ -38,7 +38,7 @@ def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbe
     """Return S and B of `dq = E ds`, `E = S + B q`: the identity for plain coordinates, half the product with
     a turn for quaternions.
 
-    Of a unit quaternion the inverse of `x -> q x` is the transpose: `ds = (S + 4 B q)' dq`.
+    For a unit quaternion the inverse of `x -> q x` is its transpose: `ds = (S + 4 B q)' dq`.
     """
     names, entries = perturbed_names(scene), scene.coordinate_names.entries
     S = np.array([[float(entry == name) for name in names] for entry in entries])
@@ -100,8 +100,8 @@ def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> tuple[
 
 
 def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tuple[int, ...]:
-    """Return indices of independent speeds at a known state: the `usual` ones, or others where these do not
-    determine the rest well.
+    """Return indices of independent speeds at a known state: the `usual` ones, or others if these determine
+    the rest poorly.
     """
     A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
     rank = count - len(usual)
@@ -121,15 +121,17 @@ def dependent_coordinates(
     """Return indices of the perturbations `ds` that follow from the geometric constraints: the named ones,
     else well conditioned ones.
 
-    `G`: dg/dq at the state, if it is known; otherwise the choice looks at states of the scene's domain.
+    `G`: dg/dq at the state, if it is known; otherwise states of the scene's domain decide.
     """
     names = perturbed_names(scene)
-    check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to perturb")
+    check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to "
+        "perturb")
     if len(set(named)) != len(named):
         raise ValueError(f"`coordinates` names one twice ({', '.join(named)}); name each once")
     both = set(named) & set(dependent or ())
     if both:
-        raise ValueError(f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it from one of them")
+        raise ValueError(f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it "
+            "from one of them")
     if dependent is not None:
         return np.array([names.index(name) for name in dependent], int)
     if not names_of_position_rows(scene):
@@ -145,7 +147,7 @@ def dependent_coordinates(
     chosen = np.delete(free, best_privileged(G[:, :, free], len(free), rank)) if len(free) >= rank else free
     if len(chosen) < rank or np.any(pivots_at(G, chosen.tolist(), rank) <= cutoff):
         raise ValueError(
-            f"the geometric rows of `{type(scene).__name__}` make the given coordinates dependent; give fewer in `coordinates`, or name the "
-            "`dependent` ones"
+            f"the geometric rows of `{type(scene).__name__}` make the given coordinates dependent; give "
+            "fewer in `coordinates`, or name the `dependent` ones"
         )
     return chosen

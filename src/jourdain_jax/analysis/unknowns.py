@@ -28,7 +28,8 @@ Places = Float[np.ndarray, "*members places"]  # a number for every place
 
 @dataclass(eq=False)
 class Unknowns:
-    """All unknowns, with their first guesses and ranges; vectors theta have a number for every place of every run.
+    """All unknowns, with their first guesses and ranges. Vectors theta have one entry for each number of each
+    run.
 
     Priors are residuals M W (theta - mean), W: one over each standard deviation.
     """
@@ -65,12 +66,14 @@ class Unknowns:
         return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
     def sizes(self, theta: Places) -> Places:
-        """Return the magnitude against which changes of each are measured: its own; near zero a typical one.
+        """Return the size of each unknown by which its changes are measured: its magnitude or, near zero, a
+        typical value.
         """
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
-        """Return the first guess, and others on a Latin hypercube over the ranges; always the same ones."""
+        """Return the first guess, and others on a Latin hypercube over the ranges. They are always the same.
+        """
         theta = np.tile(self.guess, (count, 1))
         if count == 1:
             return theta
@@ -104,12 +107,13 @@ class _Entry:
 
 
 def unknowns_of(
-    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]", apart: bool = False
+    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | "
+        "Callable | None] | Iterable[str]", apart: bool = False
 ) -> Unknowns:
     """Return the unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
-    A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`). Those of a single run count as shared,
-    unless they are to be `apart`.
+    A parameter that is a function of the scene in `free` is no unknown: it follows from the others (`ties`).
+    The unknowns of a single run count as shared unless `apart`.
 
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
@@ -128,7 +132,8 @@ def unknowns_of(
             name, parameters, f"`free` names `{name}`, which is not a parameter of `{type(scene).__name__}`"
         )
         if isinstance(given, Estimate) and given.per_run:
-            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; omit `per_run`, or fit the runs one by one")
+            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; omit "
+                "`per_run`, or fit the runs one by one")
         if callable(given):
             functions[name] = given
             continue
@@ -148,7 +153,8 @@ def unknowns_of(
         local, of_each = (), []
     entries = [*(entry for *_, entry in shared), *of_each]
     if all(entry.fixed for entry in entries):
-        raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
+        raise ValueError("nothing is free; name parameters in `free` "
+            f"({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     each = [entry for entry in entries for _ in range(entry.guess.size)]  # of each number
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
     layout = Layout(_placed((name, entry.guess.shape, kind) for name, kind, entry in shared), local, tuple(bodies))
@@ -170,11 +176,12 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """Return the range cut at zero, below which the scene has no motion; a little above it where it has none
-    at zero either. ValueError for a guess below zero.
+    """Return a range that ends at zero, since the scene has no motion below it; if it has none at zero
+    either, the range ends slightly above. Raises ValueError for a guess below zero.
     """
     if np.any(entry.guess < 0):
-        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared non-negative; give a guess of zero or more")
+        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared "
+            "non-negative; give a guess of zero or more")
     # of the first guess: the bound of a parameter that is to be above zero
     cut = entry.range.not_below(1e-6 * float(entry.guess.min()) if positive else 0.0)
     return replace(entry, range=cut)
@@ -194,7 +201,8 @@ def _check_told_once(layout: Layout, functions: Mapping) -> None:
     for body in layout.bodies:
         for entry in body.entries:
             if entry.name in told:
-                raise ValueError(f"`free` has {told[entry.name]} and the possible inertia of `{body.body}`, which determines `{entry.name}`; omit one of them")
+                raise ValueError(f"`free` has {told[entry.name]} and the possible inertia of `{body.body}`, "
+                    f"which determines `{entry.name}`; omit one of them")
         told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
@@ -207,13 +215,14 @@ def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
             same = estimate.per_run and known.per_run and np.shape(estimate.guess) == np.shape(known.guess)
             if estimate != known and not same:
                 raise ValueError(
-                    f"run {first} and run {index} state `{label}` differently, but share it ({known} and {estimate}); give both the same, or `per_run=True`"
+                    f"run {first} and run {index} state `{label}` differently, but share it ({known} and "
+                    f"{estimate}); give both the same, or `per_run=True`"
                 )
     return {label: estimate for label, (_, estimate) in found.items()}
 
 
 def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
-    """Return an unknown of one run; it is held if it is known there, or does not exist."""
+    """Return an unknown of one run, marked as held if the run knows it or does not have it."""
     if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
         return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
@@ -229,8 +238,8 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """Return an unknown from its description: an `Estimate`, a range, a prior or None; after a check of its
-    first guess.
+    """Check the first guess and return an unknown from its description: an `Estimate`, a range, a prior or
+    None.
     """
     guess, found, prior = value, default, None
     if isinstance(given, Estimate):
@@ -242,21 +251,26 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
         prior = Estimate(prior=given).prior
     elif given is not None:
         raise ValueError(
-            f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None; "
-            "for a parameter that follows from others, a function of the scene"
+            f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, "
+            "`Normal(...)`, `Estimate(...)` or None; for a parameter that follows from others, a function of "
+            "the scene"
         )
     if guess.shape != value.shape:
-        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; omit it to begin at the present value")
+        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; omit it "
+            "to begin at the present value")
     if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
     if isinstance(prior, Correlated) and (value.shape or label.startswith("run ")):
         what = f"has {value.size} numbers" if value.shape else "belongs to one run"
-        raise ValueError(f"`{label}` was given a prior of `joint_normal`, but it {what}; such a prior is for parameters of one number that all runs share")
+        raise ValueError(f"`{label}` was given a prior of `joint_normal`, but it {what}; such a prior is for "
+            "parameters of one number that all runs share")
     return _Entry(label, unit, guess, found, prior=prior)
 
 
 def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
-    """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change."""
+    """Raise ValueError unless the start of each run satisfies the constraints at the first guess, and still
+    does when the unknowns change.
+    """
     guess, layout = unknowns.guess, unknowns.layout
     change = 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
     changes = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"

@@ -55,10 +55,9 @@ def verify(
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
-    Values are relative to the size of the compared quantities; thresholds go with the floating-point type
-    (`analysis.statements`): in single precision
-    gross errors are found, and nothing is certified. Where no reduction applies (no inertia along a free direction) there are no gradients to check, and
-    the verification fails.
+    Values are relative to the size of the compared quantities. Thresholds depend on the floating-point type
+    (`analysis.statements`): single precision shows gross errors only, and certifies nothing. If no reduction
+    applies (no inertia along a free direction), there are no gradients to check, and the verification fails.
 
     **Arguments**
     - `state`: on the constraints, from `start` or `consistent`, or named values as for `start` (default: the scene's example, or a random state of its
@@ -132,8 +131,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
 
 
 def _gyroscopic(scene, t, q, u, partial) -> Speeds:
-    """Return the size of inertia forces that may cancel inside `h`: of `m v omega` and `omega I omega`. Their
-    difference has round-off of this size.
+    """Return the size of the inertia forces `m v omega` and `omega I omega`. They may cancel inside `h`,
+    which then has round-off of this size.
     """
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
@@ -162,7 +161,8 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
         "forms": {f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
         "virtual power": {suspect: largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
         "Newton": {suspect: largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
-        "energy": {"a load whose potential does not give its force, or a row whose power is not counted": energy},
+        "energy": {"a load whose potential does not give its force, or a row whose power is not "
+            "counted": energy},
     }
 
 
@@ -179,8 +179,8 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
 
 
 def _acts_on_speeds(scene: Scene) -> bool:
-    """Return whether loads act directly on speeds, or a potential is given as a function of coordinates: then
-    bodies do not show all forces.
+    """Return whether loads act directly on speeds, or a potential depends on coordinates. Then the forces on
+    bodies do not include all loads.
     """
     flags: list[bool] = []
 

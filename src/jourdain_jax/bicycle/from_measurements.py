@@ -36,14 +36,15 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
         bicycle = benchmark_from_measurements("Browser")  # shipped; or the path of a file
         bicycle.values["IBxx"], bicycle.covariance        # kg m^2; in the order of the names in `values`
 
-    Derivatives of the parameters by the readings are exact, to first order in the sigmas of the readings (see the head of the module). A mass centre is where
-    the squared distances to the upright lines through it are least: the published values are means over all pairs of lines, to which two lines that are
-    nearly parallel contribute as much as others.
+    Derivatives of the parameters with respect to the readings are exact; covariances are of first order in
+    the sigmas of the readings (see the head of the module). A mass centre is the point with the least sum of
+    squared distances from the plumb lines through it. The published values are means over all pairs of lines
+    instead, in which nearly parallel lines weigh as much as others.
 
-    **Arguments:** `path`, of a file of readings (`readings.py` lists what it holds), or the name of a shipped one (`shipped_measurements`).
-    **Returns:** a `MeasuredBicycle`, with a warning for lines that miss the mass centre by more than their sigmas allow.
-    **Raises** ValueError: an unreadable or incomplete file, an unknown name, and readings that belong to no
-    bicycle.
+    **Arguments:** `path`, of a file of readings (`readings.py` lists its content), or the name of a shipped
+    one (`shipped_measurements`). **Returns:** a `MeasuredBicycle`, with a warning for plumb lines that miss
+    the mass centre by more than their sigmas allow. **Raises** ValueError: an unreadable or incomplete file,
+    an unknown name, and readings that belong to no bicycle.
     """
     if isinstance(path, str) and not Path(path).exists() and not Path(path).suffix:
         known = shipped_measurements()
@@ -56,7 +57,8 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
     jacobian = np.array([slopes[name] for name in (*PARAMETER_NAMES, *_misses(readings))]) * sigmas
     values = {name: float(found[name]) for name in PARAMETER_NAMES}
     if broken := [sentence for sentence, is_broken in violations(values).items() if is_broken]:
-        raise ValueError(f"{readings.path}: these readings belong to no bicycle: {'; '.join(broken)}. Look for a reading in another unit, or of another part.")
+        raise ValueError(f"{readings.path}: these readings belong to no bicycle: {'; '.join(broken)}. Look "
+            "for a reading in another unit, or of another part.")
     parameters, misses = np.split(jacobian, [len(PARAMETER_NAMES)])
     covariance = parameters @ parameters.T
     return MeasuredBicycle(
@@ -76,7 +78,7 @@ def _misses(readings: Readings) -> Labels:
 
 
 def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Labels:
-    """Return a sentence for each part whose upright lines do not meet within their sigmas."""
+    """Return one sentence for each part whose plumb lines do not meet within their sigmas."""
     names, warnings = _misses(readings), []
     for part in readings.hangings:
         here = [i for i, name in enumerate(names) if name.startswith(f"miss {part}")]
@@ -87,23 +89,24 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Lab
         worst = int(np.argmax(ratio))
         if ratio[worst] > 3:  # standard deviations, by which lines may miss a mass centre without a word
             warnings.append(
-                f"upright lines through the hung part {part} miss its mass centre by up to {1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: "
-                "these sigmas are too small, or a reading is wrong"
+                f"upright lines through the hung part {part} miss its mass centre by up to "
+                f"{1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: these sigmas are too small, or a "
+                "reading is wrong"
             )
     return tuple(warnings)
 
 
 @compiled_quickly
 def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
-    """Return parameters and distances of upright lines, and their derivatives with respect to each reading,
-    in the order of its means.
+    """Return parameters, distances of plumb lines, and their derivatives with respect to each reading, in the
+    order of the means.
     """
     found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 
 def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:
-    """Return all parameters of the benchmark, and by how much upright lines miss the mass centres ("miss
+    """Return all parameters of the benchmark, and the distances of plumb lines from the mass centres ("miss
     B1").
     """
     found = {"g": y["g"]} | {f"r{wheel}": y[f"d{wheel}"] / (2 * jnp.pi * y[f"n{wheel}"]) for wheel in "RF"}
@@ -130,7 +133,8 @@ def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> PerHan
 
 
 def _geometry(y: Values, known: Values, by_table: bool) -> Values:
-    """Wheelbase, trail and tilt of the steer axis: with lengths of the rear frame a, of the fork b, across, and along the steer axis d between the wheels,
+    """Return wheelbase, trail and tilt of the steer axis from the lengths a of the rear frame and b of the
+    fork, both across the steer axis, and d between the wheels along it,
 
     w = (a + b) cos lam + d sin lam,    rR - rF = d cos lam - (a + b) sin lam = sqrt(d^2 + (a + b)^2) cos(lam + atan((a + b) / d)),
     trail = (rF sin lam - b) / cos lam
@@ -147,8 +151,8 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
 
 
 def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
-    """Return the vector from where the handlebar hung to the front axle, (x, z), m; both lay on a table, with
-    the steer axis level.
+    """Return the vector from the suspension point of the handlebar to the front axle, (x, z), m; both lay on
+    a table, with the steer axis level.
     """
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
@@ -156,9 +160,11 @@ def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
 
 
 def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2"], PerHanging]:
-    """(x, z) from where the part hangs by to its mass centre, m, and by how much the lines of the rod miss it.
+    """Return the vector (x, z) from the suspension point of a part to its mass centre, m, and the distances
+    of the rod's lines from that centre.
 
-    cos(tilt) x + sin(tilt) z = a: the rod, whose line is upright, is a beside the point that the part hangs by.
+    cos(tilt) x + sin(tilt) z = a: the vertical line of the rod passes at the distance a from the suspension
+    point.
     """
     across = jnp.stack([jnp.cos(tilts), jnp.sin(tilts)], axis=1)
     r = _least_squares(across, beside)
@@ -170,7 +176,9 @@ def _least_squares(rows: Float[Array, "rows columns"], values: Float[Array, "row
 
 
 def _moments_about_y(y: Values, lengths: Values) -> Values:
-    """Iyy of the parts with these distances of the mass centre from the axle, kg m^2, from the periods of their swings."""
+    """Return Iyy of parts whose mass centres have these distances from the axle, kg m^2, from the periods of
+    their swings.
+    """
     return {f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l) for p, l in lengths.items()}
 
 
@@ -178,7 +186,8 @@ def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: di
     """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists, by
     least squares for more than three.
 
-    A bar of known inertia gauges the rod. The wheels are on the rod by their rims, the parts with n = (-sin tilt, 0, cos tilt).
+    A bar of known inertia calibrates the rod. Wheels are fixed to it by their rims, parts along n = (-sin
+    tilt, 0, cos tilt).
     """
     bar = y["mP"] * (3 * (y["dP"] / 2) ** 2 + y["lP"] ** 2) / 12
     along = lambda timed: bar * (timed / y["TtP1"]) ** 2  # noqa: E731, n . I n

@@ -28,8 +28,10 @@ from jourdain_jax.motion.trajectories.results import EVENT
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none
 CAVEAT = (
-    "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many have it. Sigmas are taken as\n"
-    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it is known, and used.\n"
+    "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many "
+    "have it. Sigmas are taken as\n"
+    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it "
+    "is known, and used.\n"
     f"A missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
 )
 
@@ -134,7 +136,9 @@ def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
 
 
 def ride(values: dict[str, float], by_label: dict[str, float]) -> Rides:
-    """Simulate the rides of the bicycle with these parameters: a kick in lean rate from upright running, no hands, until it falls."""
+    """Simulate rides of the bicycle with these parameters, without hands: upright running with a kick in lean
+    rate, until it falls.
+    """
     speeds = np.array(list(by_label.values()))
     bicycle = WhippleBicycle.from_values(values)
     kicked = jax.vmap(lambda speed: upright_running(bicycle, speed, 0.1))(jnp.asarray(speeds))
@@ -154,7 +158,9 @@ _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=g
 
 
 def _interval(values, physical) -> dict | None:
-    """value, low, high, fraction of one speed; None where neither the bicycle nor any sample has it."""
+    """Return value, low, high and fraction of one speed; None where neither the bicycle nor any sample has
+    it.
+    """
     if np.isnan(values).all():
         return None
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))
@@ -162,7 +168,7 @@ def _interval(values, physical) -> dict | None:
 
 
 def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndarray:
-    """Return uniform speeds beyond the known ones, and denser ones about the double root, where two
+    """Return uniform speeds beyond the known ones, and denser ones near the double root, where two
     eigenvalues separate like a square root.
     """
     known = [v for v in (weave, capsize) if np.isfinite(v)]

@@ -22,7 +22,7 @@ _DEPENDENT = ("pitch",)
 
 
 def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
-    """Return upright straight running at `speed` (m/s), an exact steady motion; or with a kick in `lean_rate`
+    """Return upright straight running at `speed` (m/s), a steady motion, or with a kick in `lean_rate`
     (rad/s). Both satisfy the constraints exactly.
     """
     q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)

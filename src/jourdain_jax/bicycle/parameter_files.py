@@ -53,15 +53,15 @@ class MeasuredBicycle:
 
     @property
     def prior(self) -> dict[str, Normal]:
-        """Distributions of the parameters from their measurement, for `jj.Study(bicycle.scene,
-        vary=bicycle.prior)`: independent, without those that have no sigma.
+        """Distributions of the measured parameters for `jj.Study(bicycle.scene, vary=bicycle.prior)`:
+        independent, without parameters that have no sigma.
         """
         return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
 
     @property
     def joint_prior(self) -> dict[str, Normal | Correlated]:
-        """The joint prior of the parameters from their measurement, with its covariance if known:
-        `jj.fit(bicycle.scene, data, free=bicycle.joint_prior)`.
+        """The joint prior of the measured parameters, with its covariance if known: `jj.fit(bicycle.scene,
+        data, free=bicycle.joint_prior)`.
         """
         if self.covariance is None:
             return dict(self.prior)
@@ -90,7 +90,8 @@ def shipped_measurements() -> dict[str, Path]:
     """Return the files of raw measurements shipped with the package, name -> path, for
     `benchmark_from_measurements`.
 
-    Those of `Silver` hold none of its parts; those of `Gyro`, `Rigidcl` and `Stratos` have no published parameters.
+    The files of `Silver` do not contain the parts of that bicycle; `Gyro`, `Rigidcl` and `Stratos` have no
+    published parameters.
     """
     return _shipped("Measured")
 
@@ -123,14 +124,16 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
     missing = [name for name in PARAMETER_NAMES if name not in values]
     if missing:
-        raise ValueError(f"{path}: missing {listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
+        raise ValueError(f"{path}: missing {listed(missing)}; a bicycle needs all of "
+            f"{' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
     known = {name: values[name] for name in PARAMETER_NAMES}
     broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
     if broken:
         got = ", ".join(f"{name} = {known[name]:g}" for name in PARAMETER_NAMES if any(f"`{name}`" in s for s in broken))
         raise ValueError(
-            f"{path}: degenerate bicycle: {'; '.join(broken)}; got {got}. The nonlinear model rolls on real wheels: "
-            f"give their true radii, masses and moments of inertia (SI units, radians), or omit this bicycle."
+            f"{path}: degenerate bicycle: {'; '.join(broken)}; got {got}. The nonlinear model rolls on real "
+            "wheels: give their true radii, masses and moments of inertia (SI units, radians), or omit this "
+            "bicycle."
         )
     return MeasuredBicycle(
         name=path.stem.removesuffix("Benchmark") or path.stem,
@@ -160,8 +163,8 @@ def text_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
-    """Return numbers and content of the lines of a set in YAML, as in a text file: of the section `values`,
-    or all if there is none.
+    """Return numbers and content of the lines of a YAML file, as of a text file: those of the section
+    `values`, or all lines without one.
     """
     lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)
@@ -174,16 +177,18 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
         if has_section and not is_indented:
             inside = name == "values"
             if name == "parameterization" and value.strip("\"'") not in ("benchmark", "Meijaard2007"):
-                raise ValueError(f"{path}, line {number}: parameterization `{shortened(value)}`, expected that of the benchmark: {' '.join(PARAMETER_NAMES)}")
+                raise ValueError(f"{path}, line {number}: parameterization `{shortened(value)}`, expected "
+                    f"that of the benchmark: {' '.join(PARAMETER_NAMES)}")
         elif inside and not value:
-            raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: value`, for example `rF: 0.35`")
+            raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: "
+                "value`, for example `rF: 0.35`")
         elif inside:
             yield number, f"{name} = {value}"
 
 
 def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str) -> Iterator[tuple[str, str, str]]:
-    """Yield for each line its place, its name and the text after `=`. ValueError for another `form`, and for
-    a repeated name.
+    """Yield the location, the name and the text after `=` of each line. Raises ValueError for another `form`
+    and for a repeated name.
     """
     given: dict[str, int] = {}
     for number, line in lines:
@@ -198,15 +203,16 @@ def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str)
 
 
 def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, float | None]:
-    """Return the finite number in `text` and its sigma (None if not given); `what`: a value or a reading, of
-    the name.
+    """Return the finite number in `text` and its sigma (None if not given); `what`: "value" or "reading";
+    `name`: its name, for the error.
     """
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or omit this bicycle."
     value, *rest = (files.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
     sigma = rest[0] if rest else None
     if sigma is not None and sigma < 0:
-        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its magnitude, or omit `+/-` if it is unknown.")
+        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give "
+            "its magnitude, or omit `+/-` if it is unknown.")
     return value, sigma
 
 
@@ -223,7 +229,8 @@ def _ignored_but_telling(values: dict[str, float]) -> Labels:
     ]
     for name, twin in _REPEATED.items():
         if values.get(name, values[twin]) != values[twin]:
-            found.append(f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used instead")
+            found.append(f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used "
+                "instead")
     return tuple(found)
 
 

@@ -21,11 +21,11 @@ PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
-    """Return conditions that make a bicycle impossible: each as a sentence, with marks of violations (NaN
-    violates it).
+    """Return the conditions that make a bicycle impossible, each as a sentence, with marks of the values that
+    violate it (NaN does).
 
-    **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number or to an array of samples, all of one shape.
-    **Returns:** sentence -> True where the values break it.
+    **Arguments:** `values`: number, or array of samples of one common shape, for every name of
+    `PARAMETER_NAMES`. **Returns:** sentence -> True where the values break it.
     """
     broken = {}
     for name, known in PARAMETERS.items():
@@ -39,15 +39,16 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
 
 
 def doubts(values: Mapping[str, float]) -> Labels:
-    """Return oddities of one bicycle's values that still can be simulated: one sentence each.
+    """Return one sentence for each oddity of a bicycle's values that does not prevent a simulation.
 
-    A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the other two.
-    **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number.
+    A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the
+    other two. **Arguments:** `values`: number for every name of `PARAMETER_NAMES`.
     """
     found = []
     for wheel in "RF":
         if values[f"I{wheel}yy"] > 2 * values[f"I{wheel}xx"]:
-            found.append(f"`I{wheel}yy` > 2 `I{wheel}xx`: no wheel, even a flat one, has such moments of inertia")
+            found.append(f"`I{wheel}yy` > 2 `I{wheel}xx`: no wheel, even a flat one, has such moments of "
+                "inertia")
     for body in "BH":
         xx, yy, zz, xz = (values[f"I{body}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
         middle, half_spread = (xx + zz) / 2, math.hypot((xx - zz) / 2, xz)
@@ -57,5 +58,6 @@ def doubts(values: Mapping[str, float]) -> Labels:
         if yy > smallest + largest or largest > smallest + yy:
             found.append(f"a principal moment of inertia of body {body} exceeds the sum of the other two")
         if values[f"z{body}"] > 0:
-            found.append(f"`z{body}` > 0: the centre of mass of body {body} lies below the ground (z points down)")
+            found.append(f"`z{body}` > 0: the centre of mass of body {body} lies below the ground (z points "
+                "down)")
     return tuple(found)

@@ -32,8 +32,8 @@ _ALWAYS = ("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "T
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of one bicycle, as means and their standard deviations; `hangings`: numbers of the
-    hangings of each part, such as B: (1, 2, 3).
+    """The readings of one bicycle as means with standard deviations; `hangings`: numbers of the hangings of
+    each part, such as B: (1, 2, 3).
     """
 
     path: str
@@ -57,13 +57,14 @@ def holds_readings(path: Path) -> bool:
 def read_readings(path: str | Path) -> Readings:
     """Read one file of raw measurements.
 
-    **Raises** ValueError naming file, line and quantity: a file that cannot be read, a line of another form, a quantity that is given twice or has a
-    negative sigma; and all that is missing for the parameters of a bicycle.
+    **Raises** ValueError naming file, line and quantity, for a file that cannot be read, a line of another
+    form, a repeated quantity or a negative sigma; and for missing readings.
     """
     path = Path(path)
     means: dict[str, float] = {}
     sigmas: dict[str, float | None] = {}
-    for where, name, right in entries(path, text_lines(read_lines(path)), _FORM, "Write several readings in one line, with commas between."):
+    for where, name, right in entries(path, text_lines(read_lines(path)), _FORM, "Write several readings in "
+        "one line, with commas between."):
         means[name], sigmas[name] = _mean([with_sigma(one, name, where, "reading") for one in right.split(",")])
     split = "mS" in means or "mG" in means
     needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
@@ -73,7 +74,8 @@ def read_readings(path: str | Path) -> Readings:
         missing += [f"{what}{part}{k + 1}" for k in range(len(found), 3) for what in ("alpha", "a", "Tt")]
     if missing:
         raise ValueError(
-            f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and add a line {_FORM} for each."
+            f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and "
+            f"add a line {_FORM} for each."
         )
     used = {*needed, *(f"{what}{part}{k}" for part, found in hangings.items() for k in found for what in ("alpha", "a", "Tt"))}
     return Readings(
@@ -93,6 +95,7 @@ def _hangings(means: dict[str, float], part: str) -> tuple[int, ...]:
 
 
 def _mean(readings: list[tuple[float, float | None]]) -> tuple[float, float | None]:
-    """Mean of the readings in a line, and its standard deviation (None where none of them has one)."""
+    """Return the mean of the readings in a line, and its standard deviation (None where no reading has one).
+    """
     squares = [sigma**2 for _, sigma in readings if sigma is not None]
     return math.fsum(value for value, _ in readings) / len(readings), math.sqrt(math.fsum(squares)) / len(readings) if squares else None

@@ -69,9 +69,9 @@ def eigenvalues(
 ) -> Complex[Array, "speeds 4"]:
     """Return the four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
 
-    Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues), except that of two
-    real eigenvalues on either side of a pair the lower is castering, the higher capsize, and the pair is weave. A pair
-    has its negative frequency first.
+    Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues). If two
+    real eigenvalues lie on either side of a pair, the lower is castering, the higher capsize, and the pair is
+    weave. A pair has its negative frequency first.
     """
     M, C1, K0, K2, g = _as_matrices(M, C1, K0, K2, g)
 
@@ -179,8 +179,8 @@ def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
 
 
 def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return polynomials in x of the module's head: zero where two eigenvalues sum to zero, and where two
-    coincide.
+    """Return two polynomials in x (defined in the module's head): zero where two eigenvalues sum to zero, and
+    zero where two coincide.
     """
     b4, b3, b2, b1, b0 = _coefficients(matrices)
     x = jnp.array([1.0, 0.0], b0.dtype)
@@ -200,10 +200,10 @@ def _slope(polynomial: Polynomial, x: Array) -> Array:
 
 
 def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:
-    """Return the positive real roots up to `top`, with derivatives of two orders, and which they are: others
-    are 1.
+    """Return the positive real roots up to `top` with first and second derivatives, and a mask of them.
+    Entries outside the mask are 1.
 
-    Found as their inverses: coefficients of the highest powers may vanish.
+    The inverses of the roots are computed, since the leading coefficients may vanish.
     """
     inverse = jnp.roots(jax.lax.stop_gradient(polynomial)[::-1], strip_zeros=False)
     there = (inverse.imag == 0) & (inverse.real * top > 1)
@@ -231,8 +231,8 @@ def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
 
 
 def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the widest interval of speeds between neighbouring crossings where all eigenvalues decay,
-    without derivative; NaN if there is none.
+    """Return the widest interval between neighbouring crossing speeds in which all eigenvalues decay, without
+    derivative; NaN if there is none.
     """
     matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
     ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))

@@ -53,7 +53,8 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
     **Raises:** `ValueError` if `count` is not positive.
     """
     if count < 1:
-        raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about 0.1 sigma.")
+        raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about "
+            "0.1 sigma.")
     value = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     standard = jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)
     values = value + standard @ jnp.asarray(_root(bicycle), value.dtype).T

@@ -35,11 +35,10 @@ class Assembled:
 
 
 def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, tries: int = 4) -> Assembled:
-    """Return configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the
-    states numbered k, these by the entries of a pattern.
+    """Return configurations near q on the rows. `look(q[k], k)` returns residuals and slopes of the rows at
+    the states with indices k; slopes are the nonzero entries of a sparse matrix.
 
-    Of the `generic` ones those that find no place inside the domain begin again elsewhere, so that there are
-    `tries` after the first one.
+    `generic` states that find no place inside the domain start again elsewhere, up to `tries` times.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
     # where configurations lie anywhere in the domain: on the rows a row may be of no length at all
@@ -78,8 +77,8 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
 
 
 def typical_lengths(lengths: np.ndarray) -> np.ndarray:
-    """Return the typical length of a constraint row: the median over states, or the largest for a row that
-    vanishes at half of them; 1 for one that always does.
+    """Return the typical length of a constraint row: the median over states, or the largest if the row
+    vanishes at half of them; 1 if it always vanishes.
     """
     typical = usual_lengths_of(lengths)
     return np.where(typical > 0, typical, 1.0)
@@ -92,18 +91,19 @@ def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarr
 
 
 def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
-    """Return the length of each row at most states: the median, or the largest for a row that vanishes at
+    """Return the typical length of each row: the median over states, or the largest if the row vanishes at
     half of them.
 
-    A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
+    `elsewhere`: lengths off the geometric rows. A row that is only round-off relative to this length gets
+    that length, so that it counts as zero.
     """
     length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
     return np.where(length > np.sqrt(eps_of(A)) * beyond, length, beyond)
 
 
 def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
-    """Return the median over the states at which all are numbers, or the largest for a row that vanishes at
-    half of them; 0 for one that always does.
+    """Return the median over the states at which all entries are numbers, or the largest for a row that
+    vanishes at half of them; 0 for one that always does.
     """
     length = length[np.all(np.isfinite(length), axis=1)]
     if not len(length):
@@ -118,7 +118,7 @@ SPEED_DOMAIN = (-1.0, 1.0)
 
 
 def coordinate_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bound of every coordinate; -1 and 1 for the entries of quaternions."""
+    """Return the lower and upper bound of every coordinate; -1 and 1 for entries of quaternions."""
     low, high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
     for first, _ in scene.coordinates.quaternions:
         low[first : first + 4], high[first : first + 4] = -1.0, 1.0

@@ -107,7 +107,8 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: the kind of numbers, the test (axis of states first), the sentence for one state, and a label where it ends a motion."""
+    """One line of the table: the kind of numbers, the test (axis of states first), the sentence for one
+    state, and a label if it ends a motion."""
 
     of: str
     wrong: Callable
@@ -126,7 +127,8 @@ def _lopsided(x):
 
 
 def _negative(x):
-    """Return whether an eigenvalue of a symmetric inertia is negative, by its principal minors, relative to its largest entry or to a point's."""
+    """Return whether an inertia matrix has a negative eigenvalue, by its principal minors, relative to its
+    largest entry or to a point's inertia."""
     I, size = x[..., :3, :], _size(x)
     I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
     at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
@@ -155,7 +157,9 @@ def _nowhere(x):
 
 
 def _exceeds_the_others(x):
-    """Return whether the largest moment of a body with a thickness is above the sum of the others: of thin wheels it is that sum, within published digits."""
+    """Return whether the largest moment of a body with a thickness exceeds the sum of the others. For thin
+    wheels both are equal, to the digits of published values.
+    """
     least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
     return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))
 
@@ -168,7 +172,8 @@ def _unit(kind: str, group: str) -> Check:
     return Check(
         kind,
         lambda square: _off(square) > TOLERANCE,
-        lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; divide it by its length",
+        lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; "
+            "divide it by its length",
         "no unit vector",
         group,
     )
@@ -179,8 +184,9 @@ def _stated_twice(kind: str) -> Check:
         kind,
         lambda x: abs(x[..., 0] - x[..., 1]) > TOLERANCE * x[..., 2],
         lambda x: (
-            f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by `velocity` and `angular_velocity`; state the motion "
-            "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
+            f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by "
+            "`velocity` and `angular_velocity`; state the motion in both: velocity = d origin/dt, "
+            "angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
             f"{_ROWS_INSTEAD}"
         ),
         "a plane that moves in another way than is stated",
@@ -194,27 +200,31 @@ CHECKS = (
         "touch",
         _nowhere,
         lambda _: (
-            "finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
-            "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
+            "finds no point where body and ground touch at any probed state; a ball must be smaller than the "
+            "cylinder or sphere that it rolls in, a surface needs a gradient that does not vanish, "
+            "coordinates a `domain` that lies near it"
         ),
     ),
     Check(
         "mass",
         lambda m: m < 0,
-        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check what its mass is computed from",
+        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check what its mass is "
+            "computed from",
         "a negative mass",
     ),
     Check(
         "inertia",
         _lopsided,
-        lambda x: "has an inertia that is not symmetric; give the same products of inertia above and below the diagonal",
+        lambda x: "has an inertia that is not symmetric; give the same products of inertia above and below "
+            "the diagonal",
         "an inertia that is not symmetric",
     ),
     Check(
         "inertia",
         _negative,
         lambda x: (
-            f"has a principal moment of inertia of {np.linalg.eigvalsh(x[:3])[0]:.4g} kg m^2, expected none below zero; check signs and products of inertia"
+            f"has a principal moment of inertia of {np.linalg.eigvalsh(x[:3])[0]:.4g} kg m^2, expected none "
+            "below zero; check signs and products of inertia"
         ),
         "a negative moment of inertia",
     ),
@@ -222,25 +232,29 @@ CHECKS = (
         "orientation",
         lambda R: _from_identity(R) > TOLERANCE,
         lambda R: (
-            f"has an orientation R that is no rotation: R' R differs from the identity by {_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
-            "or jj.quaternion_to_matrix"
+            "has an orientation R that is no rotation: R' R differs from the identity by "
+            f"{_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z or jj.quaternion_to_matrix"
         ),
         "an orientation that is no rotation",
     ),
     Check(
         "orientation",
         lambda R: _volume(R) < 0,
-        lambda R: "has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round",
+        lambda R: "has an orientation of determinant -1, a reflection and no rotation; turn one of its axes "
+            "round",
         "a reflected orientation",
     ),
     _unit("unit", "grounds"),
-    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check what it is computed from", "no positive length"),
-    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius of its section that is not negative", "a negative tyre"),
+    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check what it is "
+        "computed from", "no positive length"),
+    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius of its section "
+        "that is not negative", "a negative tyre"),
     Check(
         "gap",
         lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],
         lambda x: (
-            f'has height="coordinates", but at a probed state its body is {x[0]:.4g} m off the ground; let the coordinates keep it there, or write height="row"'
+            f'has height="coordinates", but at a probed state its body is {x[0]:.4g} m off the ground; let '
+            'the coordinates keep it there, or write height="row"'
         ),
         "a body off its ground",
     ),
@@ -257,8 +271,8 @@ CHECKS = (
         "ground",
         lambda x: (x[..., 0] > TOLERANCE) & ~(x[..., 1] > 0).any(0),
         lambda _: (
-            "moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, omit the contact and "
-            f"{_ROWS_INSTEAD}"
+            "moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body "
+            f"of the scene, omit the contact and {_ROWS_INSTEAD}"
         ),
         "a ground that another body carries",
         "grounds",
@@ -268,8 +282,9 @@ CHECKS = (
         "inertia",
         _exceeds_the_others,
         lambda x: (
-            "has principal moments of inertia {:.4g}, {:.4g} and {:.4g} kg m^2, the last above the sum of the others: no distribution of mass has them; bound "
-            "the parameters of its inertia, or free fewer".format(*np.linalg.eigvalsh(x[:3]))
+            "has principal moments of inertia {:.4g}, {:.4g} and {:.4g} kg m^2, the last above the sum of "
+            "the others: no distribution of mass has them; bound the parameters of its inertia, or free "
+            "fewer".format(*np.linalg.eigvalsh(x[:3]))
         ),
         group="moments",
     ),
@@ -280,12 +295,12 @@ BY_ROWS = "gap", "own plane"  # kinds of numbers that geometric rows may keep ri
 
 
 def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return random states t, q, u of the domain, as a scene is probed at; not yet on the geometric rows."""
+    """Return random states t, q, u of the scene's domain, not projected onto the geometric rows."""
     return random_states(scene, 3, np.random.default_rng(0))
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return fault -> whether the scene has it at this state, or `elsewhere`, with the coordinates of
+    """Return fault -> whether the scene has it, at this state or (`elsewhere`) with the coordinates of
     `others`.
 
     Also under jit and vmap. NaN is no fault.
@@ -300,18 +315,20 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether numbers show a fault, by their kinds, with a first axis of states and a second of those that have them."""
+    """Return whether numbers show a fault, for each of their kinds. Their first axis is that of states, the
+    second that of bodies or grounds.
+    """
     found = [check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked]
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
 
 
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
-    """Velocities (m/s) of the ground of every contact.
+    """Return velocities (m/s) of the ground of every contact.
 
-    "plane": of its plane along the normal at the contact point, by origin and tilt, and by velocity and angular velocity; and how large either could be. A
-    plane that is tangent to a ground at rest has none, wherever on it the contact moves. "own plane": of a `Contact` whose point a user states, which may be
-    on its ground on the rows alone.
-    "ground": rates of all that says where it is, along the motion of bodies other than the one that rolls on it, to how fast these move; and it is said to.
+    "plane": velocities of the contact's plane along its normal, once from origin and tilt and once from
+    velocity and angular velocity, with an upper bound. A plane that is tangent to a ground at rest has none.
+    "own plane": the same for a `Contact` whose point the user states. "ground": the rates of all numbers that
+    describe the ground, due to the motion of other bodies, and the ground's stated velocity.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
@@ -334,7 +351,8 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
         twice = plane.normal @ origin_rate - normal_rate @ arm, plane.normal @ plane.velocity_at(contact.point)
         could = size(origin_rate, plane.velocity) + size(arm) * size(normal_rate, plane.angular_velocity)
         could += _round_off(pose)  # of rates of 1 m/s that vanish at this state
-        found["own plane" if contact.shape is None else "plane"][f"the plane of contact `{name}`"] = jnp.stack([*twice, could])
+        found["own plane" if contact.shape is None else "plane"]["the plane of contact "
+            f"`{name}`"] = jnp.stack([*twice, could])
         if contact.ground is not None:
             others = {body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate) for body, rate in moving.items()}
             carried = rates(name, jnp.zeros_like(motion.t), jnp.zeros_like(motion.q.array), others)[2]
@@ -345,7 +363,8 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
 
 
 def impossible_bodies(scene: Scene, q) -> Labels:
-    """Bodies that no distribution of mass can make, one sentence each; bodies without thickness whose other moments are zero are passed over.
+    """Return one sentence for each body that no distribution of mass can make. Bodies without thickness whose
+    other moments are zero are omitted.
 
     m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
@@ -359,7 +378,9 @@ def _weights(scene: Scene, q) -> Numbers:
 
 
 def sentences(scene: Scene, numbers: Numbers, group: str) -> Labels:
-    """Return one sentence for each fault that a group of the table finds at many states, about the first that shows it. What is not finite shows no other."""
+    """Return one sentence for each fault of a group of the table, about the first of the given states that
+    shows it. Numbers that are not finite are reported as such only.
+    """
     found = []
     for check in (check for check in CHECKS if check.group == group):
         for name, x in numbers.get(check.of, {}).items():

@@ -39,7 +39,7 @@ _MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at r
 
 
 class Probed(eqx.Module):
-    """Findings at one state, or with a leading axis at all; trees have arrays as leaves."""
+    """Findings at one state, or with a leading axis at many; trees have arrays as leaves."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric rows
     position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
@@ -121,8 +121,8 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities that pass an operation of these kinds; "rank" for constraints, "nonlinear" for
-    constraints with the speeds.
+    """Return the quantities in which operations of these kinds occur. "rank" stands for constraints,
+    "nonlinear" for constraints as functions of the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
@@ -134,10 +134,10 @@ def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: 
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
-    """Probe the scene at states (t, q, u), projected onto the geometric constraints; and its constraints at
+    """Probe the scene at states (t, q, u), projected onto the geometric constraints, and its constraints at
     `u_other`. `generic`: marks of random states.
 
-    `limits`: of `assemble`. `Unsupported` where a call has no derivative in JAX.
+    `limits`: as of `assemble`. Raises `Unsupported` where a call has no derivative in JAX.
     """
     return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(u_other)
 
@@ -149,8 +149,8 @@ def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Ass
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
-    """Return whether these velocity rows are combinations of the others wherever positions meet the geometric
-    rows, at generic parameters; states as above.
+    """Return whether these velocity rows are combinations of the others wherever positions satisfy the
+    geometric rows, at generic parameters.
 
     `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side.
     """
@@ -235,8 +235,8 @@ class _AtStates:
         return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
-        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are
-        not numbers.
+        """Return speeds projected onto the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN
+        where rows are not numbers.
         """
         at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
@@ -258,7 +258,7 @@ class _AtStates:
         return moved(np.where(np.isfinite(last)[:, None], x, np.nan), every)
 
     def _assembled(self, q) -> Assembled:
-        """Return coordinates on geometric rows and unit norms, inside the domain where that can be."""
+        """Return coordinates projected onto geometric rows and unit norms, inside the domain if possible."""
         q = np.array(q, float)
         for first, _ in self.scene.coordinates.quaternions:
             length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
@@ -286,7 +286,9 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
 
 
 def _inverse_root(M: np.ndarray) -> np.ndarray:
-    """`L'^-1` with `M = L L'`; the identity where M is singular: then nearest in the scaled speeds."""
+    """Return `L'^-1` with `M = L L'`, or the identity if M is singular. The projection then makes the
+    smallest change of scaled speeds.
+    """
     try:
         root = np.linalg.cholesky(M)
     except np.linalg.LinAlgError:

@@ -36,7 +36,9 @@ def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
 
 
 def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
-    """Ranks of scaled rows, by the cut-off that the accelerations use, or by the error of the configuration they belong to."""
+    """Return the ranks of scaled rows. The cut-off is that of the accelerations or, if larger, the error of
+    the configuration.
+    """
     if not A.size:
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
@@ -47,7 +49,7 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
 def contradictions(
     who: str, names: Labels, A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
 ) -> Labels:
-    """Return which rows no speeds meet together at any of some random states, as a sentence.
+    """Return a sentence on the rows that no speeds satisfy together at some of the random states.
 
     A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
 
@@ -63,21 +65,23 @@ def contradictions(
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
     idle = [name for name, s in wrong if not A[:, s].any()]
     if idle:
-        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state relations between coordinates in `geometric_constraints`",)
+        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state relations "
+            "between coordinates in `geometric_constraints`",)
     several = ", ".join(f"`{name}`" for name, _ in wrong)
-    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of {len(A)} random states; omit one, or correct it",)
+    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of "
+        f"{len(A)} random states; omit one, or correct it",)
 
 
 def redundant_rows(
     found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: Labels, far: Callable[[], Scaled]
 ) -> Labels:
     """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
-    state, and does not come near to losing it.
+    state and stays far from losing it.
 
-    A row that is omitted is a combination of the others. Where its coefficients are large somewhere, they
-    have no bounds: so those of one wheel's row
-    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
-    `far`: rows at full turns of all angles.
+    An omitted row is a combination of the others. Large coefficients count as unbounded. For example, the
+    coefficients that express a wheel's row along y by its row along x and those of the wheel beside it are
+    tangents of the heading. `generic`: which of the states `found` are random; `far`: rows at full turns of
+    all angles.
     """
     if not ranks:  # no state serves, which is a fault of its own
         return ()
@@ -96,8 +100,8 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Return the coefficients of the rows `rest` in row s, each in its usual length, at states of full rank;
-    infinite where they do not give it.
+    """Return the coefficients of the rows `rest` in row s, each in its typical length, at states of full
+    rank; infinite where they do not determine it.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)
@@ -111,8 +115,8 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
 
 
 def _are_bounded(c: np.ndarray) -> bool:
-    """Return whether coefficients at many states are: none is large, nor far beyond its usual size with both
-    signs, as tangents are.
+    """Return whether coefficients stay bounded over many states. They do not if one is large, or exceeds its
+    usual size with both signs, as a tangent does.
     """
     usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(eps_of(c))
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
@@ -120,17 +124,18 @@ def _are_bounded(c: np.ndarray) -> bool:
 
 
 def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tuple[int, ...]:
-    """Return numbers of the privileged speeds with these names. ValueError for unknown names, and for others
-    than `freedoms` speeds.
+    """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and unless
+    there are `freedoms` of them.
     """
     check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
     chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
     if len(set(chosen)) != len(chosen):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(names))}); name independent ones")
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice "
+            f"({', '.join(as_names(names))}); name independent ones")
     if len(chosen) != freedoms:
         raise ValueError(
-            f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "
-            f"name {freedoms} independent speeds"
+            f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has "
+            f"{freedoms} degrees of freedom; name {freedoms} independent speeds"
         )
     return chosen
 
@@ -143,8 +148,8 @@ def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray
 
 
 def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
-    """Return the smallest of the pivots over the domain: zero if the determinant of A_z changes sign between
-    probes, since it then vanishes between them.
+    """Return the smallest pivot over the domain; zero if the determinant of A_z changes sign between probes,
+    since it then vanishes between them.
     """
     if rank and scaled.shape[1] == rank:
         signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
@@ -154,8 +159,8 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
 
 
 def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
-    """Return the independent speeds whose complement has the largest worst pivot over all probes (the largest
-    typical one among equals).
+    """Return the independent speeds for which the worst pivot over all probes is largest; among equals the
+    largest typical pivot decides.
     """
     if rank == 0:
         return tuple(range(count))

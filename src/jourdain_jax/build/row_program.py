@@ -29,7 +29,9 @@ Matrix = dict[tuple[int, int], int]  # row and column -> node, of entries that a
 
 @dataclass(frozen=True, eq=False)
 class RowProgram:
-    """Nodes of a graph; compared by identity, so that it can be a static argument of compiled functions. Matrices by (row, column), without zeros."""
+    """Nodes of a graph, compared by identity, so that they can be a static argument of compiled functions.
+    Matrices are dictionaries by (row, column), without zeros.
+    """
 
     graph: Graph
     parameters: tuple[tuple[int, ...], ...]  # of each leaf of the scene, entry by entry; -1 for what is not needed
@@ -48,7 +50,7 @@ class RowProgram:
 
 @once_per_class
 def row_program(scene: Scene) -> RowProgram | None:
-    """Return the program of a class of scenes; None where a part of it is no scalar program."""
+    """Return the program of a class of scenes; None if a part of it has no scalar program."""
     scene = with_reference_parameters(scene)
     try:
         nodes = looked_at(scene)
@@ -79,13 +81,12 @@ def row_program(scene: Scene) -> RowProgram | None:
 
 
 def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
-    """Return the node of a truth value, and the coordinates of other states on which it depends.
+    """Return the node of a truth value, true for valid parameters, and the coordinates of other states on
+    which it depends.
 
-    Every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters
-    decide. Numbers
-    that no parameter decides are judged where the scene is probed. Where geometric rows depend on parameters,
-    these
-    decide coordinates.
+    Parameters are valid if each is finite, has its sign, and causes no fault of `plausibility.CHECKS`. Faults
+    that do not depend on parameters are found where the scene is probed. If geometric rows depend on
+    parameters, so do the coordinates of these states.
     """
     g, traced = looked.graph, looked.traced
     states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0

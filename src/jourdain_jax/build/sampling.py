@@ -20,7 +20,7 @@ NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
 class NoStateFoundError(ValueError):
-    """No state of a scene's domain was found that is on its geometric rows and at which its rows are numbers."""
+    """No state in a scene's domain lies on its geometric rows with rows that are numbers."""
 
 
 @of_known_numbers
@@ -28,8 +28,8 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     """Return at most `count` random admissible states (t, q, u) from the scene's domain, on the constraints,
     each with a leading axis of states.
 
-    `seed`: of the generator. ValueError where no state meets the geometric rows, or rows are numbers at none; a DifferentiationModeError where the
-    scene's parameters are traced.
+    `seed`: of the generator. Raises ValueError where no state satisfies the geometric rows, or rows are
+    numbers at none; DifferentiationModeError where the scene's parameters are traced.
     """
     scene = as_scene(scene)
     checked_whole(count, "`count`", 1, expected="of states, at least 1")
@@ -47,19 +47,21 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
-    """The error of a scene whose rows are numbers at none of `count` random states."""
+    """Return the error of a scene whose rows are not numbers at any of `count` random states."""
     low, high = coordinate_bounds(scene)
     attitude = {first + k for first, _ in scene.coordinates.quaternions for k in range(4)}
     spans = [f"`{name}` from {low[i]:.4g} to {high[i]:.4g}" for i, name in enumerate(scene.coordinate_names.entries) if i not in attitude]
     return NoStateFoundError(
-        f"the rows of `{type(scene).__name__}` are numbers at none of {count} random states, with {', '.join(spans)}: a pose, a contact or a row is no number "
-        "there, such as the square root of a negative number; state a `domain` inside which they are numbers, "
+        f"the rows of `{type(scene).__name__}` are numbers at none of {count} random "
+        f"states, with {', '.join(spans)}: a pose, a contact or a row is no number "
+        "there, such as the square root of a negative number; state a `domain` inside "
+        "which they are numbers, "
         'as in `domain = {"x": (-0.1, 0.1)}`'
     )
 
 
 def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield states from the domain, not yet projected; then, if these fail, states near the scene's example,
+    """Yield states from the domain, not yet projected; if these fail, yield states near the scene's example,
     if it has one.
     """
     yield random_states(scene, count, generator)
@@ -71,8 +73,8 @@ def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> It
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
-    """Yield configurations near q: of the `states` on the constraints (nearest in coordinates that are not
-    `free` first), and elsewhere in the domain.
+    """Yield configurations near q: first of the `states` on the constraints (nearest in coordinates that are
+    not `free`), then elsewhere in the domain.
     """
     on = array_module(q)
     q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
@@ -86,10 +88,10 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "gue
 
 
 def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:
-    """Return marks of usable states: on the geometric constraints to round-off, and inside the domain; if few
-    random ones are inside, the nearest ones as well.
+    """Return marks of usable states: on the geometric constraints to round-off and inside the domain. If few
+    random states are inside, the nearest ones count as well.
 
-    ValueError where no random state lies on the rows.
+    Raises ValueError where no random state lies on the rows.
     """
     good = np.isfinite(found.error)
     if not good[generic].any():
@@ -97,15 +99,16 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
             ""
             if np.isfinite(found.position_error[generic]).any()
             else (
-                "; no row is a finite number anywhere: a contact finds no point where a ball is larger than the cylinder or sphere that it rolls in, "
-                "or where the gradient of a surface vanishes"
+                "; no row is a finite number anywhere: a contact finds no point where a ball is larger than "
+                "the cylinder or sphere that it rolls in, or where the gradient of a surface vanishes"
             )
         )
         raise NoStateFoundError(
-            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by "
-            f"{np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, "
-            "or an `example` on the rows, or check the geometric rows against each other (where parameters are traced, numbers near their defaults stood in "
-            f"for them, or near one where they have none: give defaults near the values in use){nowhere}"
+            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the "
+            f"geometric rows by {np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer "
+            "to an assembled configuration, or an `example` on the rows, or check the geometric rows against "
+            "each other (traced parameters were replaced by numbers near their defaults, or near one without "
+            f"a default: give defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
     # with fewer than 8 random states inside the domain, those nearest to it are used as well
@@ -113,7 +116,9 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
-    """Zero, and right angles (within the domain) in one or two coordinates; of many coordinates, in some of them one by one."""
+    """Return configurations with zero and right angles (within the domain) in one or two coordinates; of many
+    coordinates, in some of them one by one.
+    """
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}

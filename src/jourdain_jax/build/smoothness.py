@@ -24,13 +24,16 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
 SPEEDS_WOULD_JUMP = (
-    "speeds would have to jump there, by an impulse that no acceleration holds. Let it change within a short time, as by a `jj.Sampled` input, or end the "
-    "motion there and start another with the speeds after the jump"
+    "speeds would have to jump there, by an impulse that no acceleration holds. Let it change within a short "
+    "time, as by a `jj.Sampled` input, or end the motion there and start another with the speeds after the "
+    "jump"
 )
 
 
 def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
-    """Bodies, rows and coordinates that jump, or whose velocity jumps, one sentence each; `q`, `u`: some states."""
+    """Return one sentence for each body, row or coordinate that jumps or whose velocity jumps; `q`, `u`: some
+    states.
+    """
     nodes = looked_at(scene)
     at, geometric = nodes.traced.at, len(nodes.traced.at.closure)
     smooth = owned(scene, **{name: getattr(at, name) for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")})
@@ -44,7 +47,9 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
         return Probes(nodes.graph, named_values(scene, points[:, 0], points[:, 1:], *others))(wanted).T
 
     def met(wanted: list[int], a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Return which node jumps, and the points before and behind it, for every interval with a jump between the points `a` and `b`."""
+        """Return, for every interval between points `a` and `b` that holds a jump, the node that jumps and
+        the points before and behind the jump.
+        """
         for k, *sides in jumps(lambda points: values(wanted, points), a, b):
             yield wanted[k], np.stack(sides)
 
@@ -53,7 +58,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
         if node in smooth:
             found.setdefault(smooth[node], _said(scene, smooth[node], f"at t = {sides[1, 0]:.6g} s"))
         elif np.allclose(*values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9):  # where rows change, a state may meet both
-            found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
+            found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = "
+                f"{sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
     # three kinks along coordinates make a look-up: a single one may lie where no motion comes
     for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(q))).items():
         if count >= 3:
@@ -62,7 +68,9 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
 
 
 def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Intervals of time at one of some states `q`: 192 in the usual span, and around up to 128 numbers in each array of the scene, which may be knots."""
+    """Return intervals of time for one of the states `q`: 192 in the usual span, and others around the
+    numbers in the scene's arrays (up to 128 of each), which may be knots.
+    """
     span = float(scene.example_span)
     t = np.linspace(1e-6 * span, span, 193)
     low, high = [t[:-1]], [t[1:]]
@@ -80,7 +88,8 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """48 intervals on each of 6 lines across the box that holds some states `q`, at random times."""
+    """Return 48 intervals on each of 6 lines across the box that contains some states `q`, at random times.
+    """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))
     points = ends[0] + np.linspace(0.0, 1.0, across + 1)[:, None, None] * (ends[1] - ends[0])
@@ -91,7 +100,8 @@ def _across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _said(scene: Scene, what: str, where: str) -> str:
     return (
-        f"{what} of `{type(scene).__name__}` is not smooth: it jumps, or its velocity does, {where}, as by a piecewise linear interpolation, a look-up or a "
-        "branch. A jump has no force of inertia, since the second derivative is zero on either side. Give samples as `jj.Spline(ts, values)`, and let "
-        "pieces meet with equal slopes"
+        f"{what} of `{type(scene).__name__}` is not smooth: it jumps, or its velocity does, {where}, as by a "
+        "piecewise linear interpolation, a look-up or a branch. A jump has no force of inertia, since the "
+        "second derivative is zero on either side. Give samples as `jj.Spline(ts, values)`, and let pieces "
+        "meet with equal slopes"
     )

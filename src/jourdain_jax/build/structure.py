@@ -76,7 +76,8 @@ class Structure:
 
     @property
     def rheonomic(self) -> bool:
-        """Whether anything depends on time by itself: rows, poses, inertias, coordinate rates, loads or potentials."""
+        """Whether anything depends explicitly on time: rows, poses, inertias, coordinate rates, loads or
+        potentials."""
         return bool(self.timed)
 
     @property
@@ -96,19 +97,18 @@ class Structure:
 
     @property
     def dependent_rows(self) -> bool:
-        """Whether rows depend on each other although none may be omitted: each is needed somewhere."""
+        """Whether rows depend on each other although none may be omitted, since each is needed somewhere."""
         return len(self.kept_rows) > self.rank
 
     @property
     def rows_may_contradict(self) -> bool:
-        """Return whether constraints are redundant and prescribe motion even at rest: then the omitted ones
-        do not follow from the others automatically.
-        """
+        """Return whether constraints are redundant and prescribe motion even at rest. Then the omitted ones
+        do not automatically follow from the others."""
         return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
 
     @property
     def has_minimal_state(self) -> bool:
-        """Whether coordinates and privileged speeds are the state that is integrated, unless the user asks for another."""
+        """Whether the integrated state is by default the coordinates and privileged speeds."""
         return self.affine and self.well_conditioned
 
     @property
@@ -124,7 +124,7 @@ def _moves(rates: np.ndarray) -> bool:
 
 
 def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
-    """Return whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows
+    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because rows
     may be stated in any unit.
     """
     size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
@@ -151,7 +151,8 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         return replace(found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u)))
     except Unsupported as reason:
         raise ValueError(
-            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give that part a rule with `jax.custom_jvp`"
+            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
+            "that part a rule with `jax.custom_jvp`"
         ) from None
 
 
@@ -174,9 +175,9 @@ def structure_of(scene: Scene) -> Structure:
     conditioning, kinds of constraints; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers
-    replace traced parameters.
-    ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
-    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
+    replace traced parameters. Raises ValueError where no admissible state is found, where bodies do not move
+    smoothly, where a free motion has no inertia, or where `privileged` names unknown or too few speeds; for
+    known parameters also for impossible numbers of bodies or planes, and for contradictory rows.
     """
     structure = structure_whatever_its_faults(scene)
     # numbers that replace traced parameters prove nothing of bodies and grounds
@@ -191,15 +192,14 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def is_judged(scene: Scene) -> bool:
-    """Return whether the parameters of a scene are known, so that what is found at its probed states is its
-    own.
+    """Return whether the parameters of a scene are known, so that findings at its probed states apply to it.
     """
     return not is_traced(scene)
 
 
 def trust(scene: Scene) -> float:
-    """Return the reliability of typical lengths: a thousandth for traced parameters, whose replacements may
-    be of another order.
+    """Return the reliability of typical lengths: one, or a thousandth for traced parameters, whose true
+    values may be of another magnitude.
     """
     return 1.0 if is_judged(scene) else 1e-3
 
@@ -210,7 +210,8 @@ def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
-    """Typical lengths of the geometric rows and of quaternion norms in the coordinates, for `project_positions`; of the former as rates."""
+    """Return typical lengths of the geometric rows (of their rates) and of quaternion norms in the
+    coordinates, for `project_positions`."""
     geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
     return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
 
@@ -242,7 +243,8 @@ def _probed_structure(scene: Scene) -> Structure:
     if not faults and not usable.any():
         finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
-        faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
+        faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected "
+            "numbers; check how they are computed",)
     if usable.any() and not usable[generic].any():
         raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone tell no rank
     typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
@@ -306,9 +308,8 @@ def _probed_structure(scene: Scene) -> Structure:
 
 
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Return times, speeds, marks of random states, and findings: at the given random states and at the
-    symmetric ones.
-    """
+    """Return times, speeds, marks of random states, and findings, at the given random states and at symmetric
+    ones."""
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES
@@ -321,7 +322,8 @@ def _is_singular(M: np.ndarray) -> bool:
 
 
 def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
-    """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
+    """Raise ValueError with the names of the speeds along which free motion meets no inertia of a body at
+    every generic state."""
     moved = []
     for A, M, c in zip(found.A, found.M, found.c, strict=True):
         free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
@@ -336,15 +338,14 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
     raise ValueError(
         f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
-        "constraint determines it, so that its acceleration is not "
-        "determined; give a body that moves with it a mass (or inertia), add a constraint, or omit the coordinate"
+        "constraint determines it, so that its acceleration is not determined; give a body that moves with "
+        "it a mass (or inertia), add a constraint, or omit the coordinate"
     )
 
 
 def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
-    """Return scaled rows with coordinates up to half a turn away from the given ones, where these satisfy the
-    geometric constraints.
-    """
+    """Return scaled rows at coordinates up to half a turn away from the given ones that satisfy the geometric
+    constraints."""
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
     turned = q + generator.uniform(-np.pi, np.pi, q.shape)
@@ -363,11 +364,12 @@ def _describe(scene: Scene, q: np.ndarray) -> str:
 class Reference:
     """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
 
-    Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
-    arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
+    Two references are equal if their scenes lead to the same decisions (`Structure.decisions`), and then
+    share one program. So the arguments of a call determine what it runs, not the order of calls. Parameters
+    that are already traced are replaced by the class's defaults.
 
-    `varied`: names of parameters that differ between lanes; other numbers near by replace these, so
-    that what holds by chance does not count; None: all.
+    `varied`: names of parameters that differ between lanes (None: all); numbers near them replace these, so
+    that coincidences do not count.
     """
 
     def __init__(self, scene: Scene, varied: Iterable[str] | None = None):

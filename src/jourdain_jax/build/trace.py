@@ -95,7 +95,7 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
-    """Return the traced quantities, computed on numbers; `of_inputs`: numbers of the loads whose potential
+    """Return the traced quantities, evaluated at numbers; `of_inputs`: indices of the loads whose potential
     depends on inputs.
     """
     at = At(scene, motion) if scene.switching.contacts else None
@@ -135,10 +135,10 @@ def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Ar
 
 
 def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: At | None = None) -> Float[Array, "events rows"]:
-    """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the energy
-    stored by the loads `of_inputs`.
+    """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the stored
+    energy of the loads `of_inputs`.
 
-    Without rows where all events stop the motion.
+    The arrays have no rows if all events stop the motion.
     """
     every = events_of(scene, motion) | (contact_changes(at or At(scene, motion)) if scene.switching.contacts else {})
     events = [event for _, event in sorted(every.items())]
@@ -174,7 +174,7 @@ class Variables:
 
 @dataclass
 class TracedScene(Variables):
-    """A graph with the scene's inputs and its quantities at the level of velocities, as arrays of nodes."""
+    """A graph with the scene's inputs and its quantities on the level of velocities, as arrays of nodes."""
 
     at: VelocityQuantities
     particulars: Particulars
@@ -200,10 +200,9 @@ class TracedScene(Variables):
 
 
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
-    """Return the scene as a new graph; parts without scalar form, and those with their own derivative, are
-    calls.
+    """Return the scene as a new graph. Parts without a scalar form, or with their own derivative, are calls.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs.
+    `of_inputs`: indices of the loads whose potential depends on inputs.
     """
     closed, shape = jaxpr_of_scene(scene, of_inputs)
     try:
@@ -217,7 +216,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
     and inputs, and their shapes.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs. ValueError where a method reads what JAX is tracing elsewhere.
+    `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError where a method
+    reads a value that JAX traces elsewhere.
     """
     leaves, treedef = jax.tree.flatten(scene)
     real = real_type()
@@ -234,8 +234,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     if is_traced(closed.consts):
         raise ValueError(
             f"a method of `{type(scene).__name__}`, or a function that it calls, reads a number that JAX is "
-            "tracing (jit, grad, vmap) and that is not a field of the scene; "
-            "make it one, `name: float = jj.parameter(unit=...)`, and pass it to the scene"
+            "tracing (jit, grad, vmap) and that is not a field of the scene; make it one, `name: float = "
+            "jj.parameter(unit=...)`, and pass it to the scene"
         )
     return closed, shape
 
@@ -265,7 +265,7 @@ def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
 
 
 def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
-    """Return node -> its owner, in words, for nodes of some fields of `VelocityQuantities`; the first owner
+    """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`; the first owner
     counts.
     """
     of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {"mass": "mass of", "inertia": "inertia of"}
@@ -285,21 +285,23 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -
 
 
 def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Scalar:
-    """Return the part of `rate_of_work` that needs no accelerations: of loads without a potential, of
-    potentials that depend on time or on inputs; W.
+    """Return the part of `rate_of_work` without accelerations, W: loads without a potential, and potentials
+    that depend on time or on inputs.
 
     sum F.v + L.omega + Q_k u_k           loads without a potential
     dV/dt at fixed poses                  potentials that depend on time
     F_i.v + L_i.omega + Q_i u - dV_i/dt   loads whose potential depends on inputs, in place of that potential
 
-    `loads`: of the scene at this motion, where they are known already.
+    `loads`: those of the scene at this motion, if they are already known.
     """
     by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
     return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
 
 
 def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
-    """Rate of the scene's own potential as poses move at `u = 0`: its forces stand on the speeds, along which no such motion is."""
+    """Return the rate of the scene's own potential due to poses that move while `u = 0`. Its forces act on
+    the speeds, and so do no work in this motion.
+    """
     if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(motion.t)
     t, q = motion.t, motion.q.array
@@ -321,7 +323,8 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ..
 def power_of_loads(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
 ) -> Scalar:
-    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
+    """Return `sum F.v + L.omega + Q_k u_k` in W, over loads with a potential (`conservative=True`), without
+    one (`False`), or with the indices `among`.
 
     `loads`: as in `explicit_power`.
     """
@@ -332,7 +335,9 @@ def power_of_loads(
 
 
 def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
-    """`dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u = 0`."""
+    """Return `dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u
+    = 0`.
+    """
     q = motion.q.array
     nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
 
@@ -344,8 +349,8 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
 
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """Return `f` without the parts that its result does not need: forces stated by the same loads need not
-    have a derivative.
+    """Return `f` reduced to the operations that its result needs. Forces of the same loads that do not matter
+    may then lack a derivative.
     """
     pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

@@ -34,12 +34,13 @@ from jourdain_jax.calculus.markers import lanes_first, lanes_of, with_lanes_firs
 from jourdain_jax.calculus.reals import with_usual_promotion
 
 SECOND_ORDER_MESSAGE = (
-    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which machine code alone has; where XLA, dense matrices or a "
-    "solver of diffrax integrate, take forward mode of forward mode, `jax.jacfwd(jax.jacfwd(f))`"
+    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which machine "
+    "code alone has; where XLA, dense matrices or a solver of diffrax integrate, take forward mode of "
+    "forward mode, `jax.jacfwd(jax.jacfwd(f))`"
 )
 THIRD_ORDER_MESSAGE = (
-    "`simulate` was differentiated three times, and not in forward mode alone; pass backend='xla' and take forward mode of any order, "
-    "`jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
+    "`simulate` was differentiated three times, and not in forward mode alone; pass backend='xla' and take "
+    "forward mode of any order, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
 )
 
 
@@ -54,12 +55,13 @@ class OtherDeviceError(RuntimeError):
     """Raised where machine code would become part of a program for another process, or for a device without machine code."""
 
     def __init__(self, program: str) -> None:
-        super().__init__(f'machine code of this process cannot be part of a program {program}; give `backend="xla"` to `jj.simulate`, or to `jj.build`')
+        super().__init__(f'machine code of this process cannot be part of a program {program}; give '
+            '`backend="xla"` to `jj.simulate`, or to `jj.build`')
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """A linear map between arrays, which depends on the arrays `at` which it is evaluated."""
+    """A linear map between arrays that depends on other arrays, `at`."""
 
     apply: Callable[[Sequence, Sequence], list]  # (at, arrays)
     shapes: Sequence[jax.ShapeDtypeStruct]  # of its values
@@ -90,7 +92,9 @@ def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
 
 
 def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
-    """Return the derivative of a map along so many arrays of its arguments, in forward mode."""
+    """Return the derivative of a map with respect to the first `count` arrays of its arguments, in forward
+    mode.
+    """
 
     def pushed(at, arrays):
         return jax.jvp(lambda *new: own.apply(put(at[:count], which, new), at[count:]), tuple(at[i] for i in which), tuple(arrays))[1]
@@ -99,8 +103,8 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """Return the derivative for a batch, along these axes of the arguments, and along the first axis of the
-    arrays.
+    """Return the derivative for a batch. Each argument has its batch axis where stated; tangents have it
+    first.
     """
     transposed = own.transposed
 
@@ -117,8 +121,8 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
 
 
 def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
-    """Return a second derivative, of arrays with their lanes along these axes, or the same in all lanes, in
-    place of arrays with their lanes first.
+    """Return a second derivative for arrays whose lanes lie along these axes, or that all lanes share, from
+    one for arrays with lanes first.
     """
     transposed = own.transposed
 
@@ -173,8 +177,8 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """A linear map with x like the `leaves` and values like `found`, with numbers at the `places`, in both
-    modes.
+    """A linear map, in both modes: x has the form of `leaves`, its value that of `found`, with numbers at the
+    `places`.
     """
 
     rates: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves and of their tangents: tangents of numbers
@@ -199,7 +203,9 @@ class BothWays(NamedTuple):
         return LinearMap(pulled, [self.leaves[i] for i in moving], lambda: self.pushes(moving), lambda others: self._bends(moving, others))
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of pushes along others of the leaves; it is taken at the tangents too."""
+        """Return the derivative of Jacobian-vector products with respect to other leaves. It also depends on
+        the tangents.
+        """
         count = len(self.leaves) + len(self.found)
 
         def pulled(at, g):
@@ -209,7 +215,9 @@ class BothWays(NamedTuple):
         return replace(own, transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further))
 
     def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of pulls along others of the leaves; it is taken at the cotangents too."""
+        """Return the derivative of vector-Jacobian products with respect to other leaves. It also depends on
+        the cotangents.
+        """
         count, end = len(self.leaves), len(self.leaves) + len(self.found)
         if reason := self.reason_against_second([*moving, *others]):
             raise DifferentiationModeError(reason)
@@ -227,8 +235,8 @@ class BothWays(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Derivative rules of a function; trees of tangents and cotangents have None for zeros. An inapplicable
-    rule raises an error with the reason.
+    """Derivative rules of a function. Trees of tangents and cotangents have None for zeros. A rule that does
+    not apply raises an error with the reason.
     """
 
     push: Callable  # (arguments, tangents): the result and its tangents; JAX differentiates it forward
@@ -264,7 +272,7 @@ def filled(tangent):
 
 
 def _with_rates(run: Callable, rates: Callable) -> Callable:
-    """Return `run` with a derivative; `rates`: (arguments as leaves, leaves, which of them move, how, result)
+    """Return `run` with a derivative. `rates`: (arguments as leaves, leaves, which of them move, how, result)
     -> tangents of the result.
     """
 
@@ -284,9 +292,10 @@ def _with_rates(run: Callable, rates: Callable) -> Callable:
 
 
 def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
-    """Return `run` with the derivatives of `differentiable`, which computes the same and which JAX differentiates.
+    """Return `run` with the derivatives of `differentiable`, which computes the same values and can be
+    differentiated by JAX.
 
-    Both take trees of arrays and of anything else, and return trees of arrays.
+    Both take trees of arrays and of other objects, and return trees of arrays.
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
@@ -306,9 +315,10 @@ def pushed_by_jax(run: Callable) -> Callable:
 
 
 def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -> Callable:
-    """Return `forward`, which JAX differentiates forward, with the reverse mode of `reverse`, which computes the same.
+    """Return `forward`, which JAX differentiates in forward mode, with the reverse mode of `reverse`, which
+    computes the same values.
 
-    `reason_against_second`: why reverse mode takes part in no second derivative, in words.
+    `reason_against_second`: why there is no second derivative with reverse mode, in words.
     """
 
     def pull(perturbed: tuple, arguments: tuple, found, g):
@@ -320,9 +330,10 @@ def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -
 
 
 def with_rules(run: Callable, rules: Rules) -> Callable:
-    """Return `run`, which JAX cannot differentiate, with derivatives by rules, in both modes and to the second order.
+    """Return `run`, which JAX cannot differentiate, with derivatives by rules, in both modes and to the
+    second order.
 
-    It takes trees of arrays and of anything else, and returns trees of arrays.
+    It takes trees of arrays and of other objects, and returns trees of arrays.
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
@@ -335,7 +346,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
             return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
 
         def pulled(moving: list[int]) -> Callable:
-            """Return cotangents of the moving leaves, as a function of the leaves, of the result and of
+            """Return cotangents of the moving leaves, as a function of the leaves, the result and the
             cotangents of its numbers.
             """
             varies = perturbed(moving)

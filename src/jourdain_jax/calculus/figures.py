@@ -14,7 +14,9 @@ DATA, MODEL, QUIET = "#d1495b", "#1b4f72", "#888888"
 
 
 def figure(draw: Callable[[Any], None], width: float, height: float, caption: str = "") -> str:
-    """Return HTML of the matplotlib figure that `draw` fills, `width` by `height` pixels; a sentence where matplotlib is not installed."""
+    """Return HTML of the matplotlib figure that `draw` fills, `width` by `height` pixels; a sentence if
+    matplotlib is not installed.
+    """
     try:
         # a pixel of a page is 1/96 inch
         drawn = needed("matplotlib.figure", "a figure", "plot").Figure((width / 96, height / 96), dpi=96, layout="constrained")

@@ -23,42 +23,48 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|n
 
 
 def read_bytes(path: str | os.PathLike, limit: int, what: str = "a file") -> bytes:
-    """Return the content of the file `path`, of at most `limit` bytes; `what`: its kind, for the error, such
-    as "a URDF file".
+    """Return the content of the file `path`, at most `limit` bytes; `what`: its kind, for the error, such as
+    "a URDF file".
     """
     try:
         with open(path, "rb") as file:
             content = file.read(limit + 1)
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
         said = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of {what}{_near(Path(path), error)}") from None
+        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of "
+            f"{what}{_near(Path(path), error)}") from None
     if len(content) > limit:
         raise ValueError(f"{path}: larger than {limit} bytes, expected {what}")
     return content
 
 
 def read_text(path: str | os.PathLike, limit: int, what: str = "a text file") -> str:
-    """Return the text of the file `path`, which is UTF-8 without zero bytes; arguments as of `read_bytes`."""
+    """Return the text of the file `path`, which must be UTF-8 without zero bytes; arguments as of
+    `read_bytes`.
+    """
     content = read_bytes(path, limit, what)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}), expected {what}") from None
+        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}), "
+            f"expected {what}") from None
     if "\0" in text:
         raise ValueError(f"{path}: a binary file (it contains zero bytes), expected {what}")
     return text
 
 
 def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> float:
-    """Return the number that `text` is: ASCII digits, a point, an exponent; with `finite=False` also inf and nan.
+    """Convert `text` to a number: ASCII digits, a point, an exponent; with `finite=False` also inf and nan.
 
-    `what`: source and name of the number, for the error; `advice`: what to do, at its end. Digits in groups (`1_0`) and those of other scripts are refused.
+    `what`: source and name of the number, for the error; `advice`: the end of the message. Digits in groups
+    (`1_0`) and digits of other scripts are refused.
     """
     plain = text.strip(" \t\r\n")
     value = float(plain) if _NUMBER.fullmatch(plain) else None
     if value is None or (finite and not math.isfinite(value)):
         hint = ", with `.` as the decimal point" if "," in plain else ""
-        raise ValueError(f"{what} is `{shortened(plain)}`, expected a {'finite ' if value is not None else ''}number{hint}{advice}")
+        raise ValueError(f"{what} is `{shortened(plain)}`, expected a "
+            f"{'finite ' if value is not None else ''}number{hint}{advice}")
     return value
 
 
@@ -79,7 +85,8 @@ def parsed(parse: Callable, content, source: str, what: str):
     except RecursionError:
         raise _too_deep(source) from None
     except Exception as error:
-        raise ValueError(f"{source}: is no {what} ({shortened(error, 200) or type(error).__name__})") from None
+        raise ValueError(f"{source}: is no {what} "
+            f"({shortened(error, 200) or type(error).__name__})") from None
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
@@ -115,7 +122,8 @@ _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for
 
 
 def check_place(path: str | os.PathLike) -> None:
-    """Raise a ValueError where a file cannot be written at `path`: its folder does not exist, or it is one itself."""
+    """Raise ValueError where no file can be written at `path`: its folder does not exist, or it is a folder.
+    """
     check_kind(path, str | os.PathLike, "`path`", "the name of a file")
     place, folder = os.fspath(path), os.path.dirname(path) or "."
     if not os.path.isdir(folder):
@@ -125,7 +133,9 @@ def check_place(path: str | os.PathLike) -> None:
 
 
 def write_whole(path: str | os.PathLike, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:
-    """Put a file of this `content` in the place `path`; `wait`: until it is on the disk; `mode`: who may read and write it, as of `open`."""
+    """Write a file with this `content` to `path` as a whole; `wait`: until it is on the disk; `mode`: its
+    permissions, as of `open`.
+    """
     path = Path(path)
     beside = f"{path.parent}/.{path.name[:200]}.{secrets.token_hex(8)}"
     file = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)

@@ -29,8 +29,8 @@ def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, numbe
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """Return `closed` with only the operations that its `outputs` (their numbers, in order; default: all)
-    need, also inside calls.
+    """Return `closed` with only the operations that its `outputs` need (by index, in order; default: all),
+    also inside calls.
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
@@ -38,8 +38,8 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
-    """Return the function that an operation of this name calls, if it does nothing else; None for other
-    operations.
+    """Return the function that an operation of this name calls, if the operation does nothing else; None for
+    other operations.
     """
     if name not in _CALLS:
         return None
@@ -48,10 +48,10 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 
 
 def parts_of_scan(equation) -> tuple[int, int]:
-    """Return the numbers of constant and of carried inputs of a scan: these have equal axes inside and
+    """Return the numbers of constant and of carried inputs of a scan. These have equal axes inside and
     outside its body, all others one less.
 
-    The parameters that report it are not the same in all versions of JAX.
+    The names of these parameters differ between versions of JAX.
     """
     body = equation.params["jaxpr"].jaxpr
     whole, carried = (

@@ -12,7 +12,8 @@ from jaxtyping import Float
 def jumps(
     values: Callable[[np.ndarray], np.ndarray], a: Float[np.ndarray, "intervals variables"], b: Float[np.ndarray, "intervals variables"]
 ) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
-    """For every interval from `a` to `b` in which something jumps: which entry does most, and the points before and behind its jump.
+    """Return, for every interval from `a` to `b` that holds a jump, the entry that jumps most and the points
+    before and behind the jump.
 
     `values`: of many points, (points, entries).
     """

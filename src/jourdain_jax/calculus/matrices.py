@@ -24,7 +24,7 @@ from jourdain_jax.calculus.reals import Count, rank_cutoff, with_usual_promotion
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
-    """Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.
+    """Return the Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.
 
     Differentiable to any order in forward and reverse mode where the rank does not change.
     """
@@ -65,12 +65,15 @@ def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -
 
 
 def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Null-space basis from the full singular value decomposition; columns of the row space are zero."""
+    """Return a null-space basis from the full singular value decomposition; columns of the row space are
+    zero.
+    """
     return _null_space(A, _svd_basis, None)
 
 
 def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns columns"]:
-    """Null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space are zero.
+    """Return a null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space
+    are zero.
 
     Pivots below `cutoff` times the largest count as zero (default: `rank_cutoff`).
     """
@@ -78,7 +81,9 @@ def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) 
 
 
 def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first, as a diagnostic: no derivative passes through them."""
+    """Return magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first. They
+    serve as a diagnostic and have no derivative.
+    """
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)
     _, R, _ = jax.lax.linalg.qr(jax.lax.stop_gradient(A).T, full_matrices=True, pivoting=True)

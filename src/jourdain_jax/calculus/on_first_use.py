@@ -37,14 +37,15 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
     """Return an optional package, or a `module` of one; if it is missing, raise an ImportError with its
     purpose and the command that installs it.
 
-    `extra`: of this package, that brings it.
+    `extra`: the extra of this package that installs it.
     """
     try:
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
         install = f"'jourdain-jax[{extra}]'" if extra else package
-        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from error
+        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it "
+            f"with: pip install {install}") from error
 
 
 def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = MappingProxyType({})) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

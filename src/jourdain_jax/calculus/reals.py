@@ -42,15 +42,18 @@ def real_type() -> np.dtype:
 
 
 def rank_cutoff(dtype: jnp.dtype) -> float:
-    """Singular values below this fraction of the largest one count as zero: 4096 units of round-off of `dtype`."""
+    """Return the fraction of the largest singular value below which others count as zero: 4096 units of
+    round-off of `dtype`.
+    """
     return 4096 * float(jnp.finfo(dtype).eps)
 
 
 def passing_cutoff(dtype: jnp.dtype) -> float:
-    """Return the cut-off for motions *through* a loss of rank of rows that are well conditioned elsewhere:
+    """Return the cut-off for motions *through* a loss of rank, with rows that are well conditioned elsewhere:
     the root of the round-off of `dtype`.
 
-    Round-off e of a row of size sigma is a velocity e/sigma and an acceleration e/sigma^2; the step size resolves them down to about sqrt(e).
+    A round-off e in a row of size sigma is a velocity e/sigma and an acceleration e/sigma^2; the step size
+    resolves them down to about sqrt(e).
     """
     return max(rank_cutoff(dtype), float(jnp.finfo(dtype).eps) ** 0.5)
 
@@ -59,21 +62,22 @@ def undecided(dtype: jnp.dtype) -> float:
     """Return the relative size of a row below which round-off decides the branch of a motion: 8 roots of the
     round-off of `dtype`.
 
-    Where two branches of g = 0 cross, g = e is a hyperbola that turns from one into the other, as near as the root of e to their crossing.
+    Where two branches of g = 0 cross, g = e is a hyperbola that leads from one branch to the other, at a
+    distance of about sqrt(e) from the crossing.
     """
     return 8 * float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def is_array(x) -> bool:
-    """Return whether x is an array, of JAX, of NumPy or of a kind of its own."""
+    """Return whether x is an array, of JAX, of NumPy or of another kind."""
     return hasattr(x, "__array__") and not isinstance(x, type)
 
 
 def as_real(x) -> Float[Array, "*shape"]:
-    """Return `x` as a floating-point array: integers become the default float, floats keep their type; never
-    weakly typed, so that one trace suffices.
+    """Return `x` as a floating-point array. Integers become the default float; floats keep their type. It is
+    never weakly typed, which would cause a second trace.
 
-    TypeError for complex numbers, whose imaginary parts are not dropped, and truth values.
+    Raises TypeError for complex numbers, whose imaginary parts are not dropped, and for truth values.
     """
     array = _of_jax(x)
     if jnp.issubdtype(array.dtype, jnp.floating):
@@ -84,7 +88,9 @@ def as_real(x) -> Float[Array, "*shape"]:
 
 
 def _of_jax(x) -> Array:
-    """`x` as an array of JAX, which has no extended precision. TypeError for a quantity with a unit."""
+    """Return `x` as an array of JAX, which has no extended precision. Raises TypeError for a quantity with a
+    unit.
+    """
     if isinstance(x, jax.Array):
         return x
     if has_unit(x):
@@ -94,11 +100,13 @@ def _of_jax(x) -> Array:
         # without a type, JAX compiles a program for each shape of NumPy's arrays
         return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if isinstance(x, np.ndarray) and x.dtype.kind == "f" else None)
     except OverflowError:
-        raise ValueError("an integer is larger than all floating-point numbers, expected real numbers") from None
+        raise ValueError("an integer is larger than all floating-point numbers, expected real "
+            "numbers") from None
 
 
-def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
-    """`value` as a floating-point array.
+def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is "
+    "put together") -> Array:
+    """Return `value` as a floating-point array.
 
     **Arguments**
     - `value`: a number, an array, or a list of numbers; integers and extended precision are converted, other floating-point arrays keep their type.
@@ -126,8 +134,11 @@ def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, ad
     return found
 
 
-def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> np.ndarray:
-    """`value`, which is not traced, as a NumPy array of the default float, also inside `jit`. Arguments and errors: as of `checked_real`."""
+def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is "
+    "put together") -> np.ndarray:
+    """Return `value`, which is not traced, as a NumPy array of the default float, also inside `jit`.
+    Arguments and errors: as of `checked_real`.
+    """
     if type(value) is float and not shape:
         return np.array(value, real_type())
     try:
@@ -141,8 +152,8 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
 
 
 def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):
-    """Return `value` in the default float: on NumPy if known, also inside `jit`; a JAX array if traced.
-    ValueError as in `checked_real`.
+    """Return `value` in the default float: a NumPy array if known, also inside `jit`; a JAX array if traced.
+    Raises ValueError as `checked_real` does.
     """
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())
@@ -150,7 +161,8 @@ def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None
 
 
 def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
-    """Return a whole number from `low` to `high`. ValueError, with the `expected` range, for anything else.
+    """Return a whole number from `low` to `high`. Raises ValueError with the `expected` range for anything
+    else.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low or (high is not None and value > high):
         raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
@@ -163,8 +175,8 @@ def holds(condition: Callable, *numbers) -> bool:
 
 
 def has_unit(x) -> bool:
-    """Return whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a
-    number: 1,300 g would be 1,300 kg.
+    """Return whether `value` is a quantity with a unit, or a list that holds one. As a plain number it would
+    lose the unit: 1,300 g would become 1,300 kg.
     """
     if isinstance(x, list | tuple):
         return any(has_unit(part) for part in x if type(part) is not float)
@@ -196,7 +208,7 @@ def check_kind(value, kind, what: str, expected: str) -> None:
 
 
 def described(value) -> str:
-    """Return a value in an error message: `None`, the text 'abc', the class `Skate`, a list."""
+    """Describe a value for an error message: `None`, the text 'abc', the class `Skate`, a list."""
     if value is None:
         return "`None`"
     if has_unit(value):
@@ -222,12 +234,14 @@ def is_traced(*trees) -> bool:
 
 
 def known_numbers(x) -> np.ndarray:
-    """Return numbers for a check if they are known; none otherwise, so that the check passes."""
+    """Return the numbers if they are known, for a check; an empty array if they are traced, so that the check
+    passes.
+    """
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 
 def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False):
-    """Return the largest magnitude in an array, of JAX or of NumPy, or along axes of it; zero if it is empty.
+    """Return the largest magnitude in an array, of JAX or of NumPy, or along its axes; zero if it is empty.
     """
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
 
@@ -253,14 +267,16 @@ def array_module(x) -> ModuleType:
 
 
 def nothing_is_traced() -> bool:
-    """Return whether this call stands outside of every transformation: no function around it is being traced,
-    and so no argument.
+    """Return whether this call is outside of every transformation: no function around it is traced, and so no
+    argument is.
     """
     return jax.extend.core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
 
 
 def at_once():
-    """Return a context in which known numbers are computed at once, also where a function around this call is being traced."""
+    """Return a context in which known numbers are evaluated immediately, even if a surrounding function is
+    traced.
+    """
     return nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval()
 
 
@@ -283,7 +299,9 @@ F = TypeVar("F", bound=Callable)
 
 
 def with_usual_promotion(function: F) -> F:
-    """Return the function, run and traced in JAX's default modes, even when JAX calls it later."""
+    """Return the function so that it always runs, and is traced, in JAX's default modes of type promotion,
+    whoever calls it.
+    """
 
     @wraps(function)
     def called(*args, **kwargs):
@@ -303,8 +321,9 @@ RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
     """Compile as `equinox.filter_jit` does; compiled programs live as long as the returned function.
 
-    `options`: for XLA on a CPU, or a function that chooses them, called once for arguments of one structure with a mark in place of each array. They have
-    no effect in calls inside another transformation: JAX takes options of whole programs only.
+    `options`: for XLA on a CPU, or a function that chooses them, called once for arguments of one structure
+    with a placeholder for each array. They have no effect inside another transformation, since JAX takes
+    options for whole programs only.
     """
 
     @lru_cache(maxsize=1024)  # structures of arguments, arrays left out

@@ -44,10 +44,12 @@ class Root(eqx.Module):
 
 
 def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
-    """x with `residual(x) = 0` near `guess`; `residual` may close over anything, traced numbers included.
+    """Return x with `residual(x) = 0` near `guess`; `residual` may close over anything, including traced
+    numbers.
 
-    `scale`: the size of each unknown, against which round-off counts; infinite for an unknown that need not be looked at. Iterates until the
-    corrections no longer shrink; what then is still larger than round-off to the power 0.6 has not converged.
+    `scale`: the size of each unknown, relative to which round-off is judged; infinite for an unknown to
+    ignore. It iterates until the corrections no longer shrink; if they are then still larger than round-off
+    to the power 0.6, it has not converged.
     """
 
     eps = eps_of(guess)
@@ -106,11 +108,11 @@ class Search(eqx.Module):
 
 
 def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
-    """Search for x near `guess` from `low` to `high` with no residual above the `tolerance`; it ends at the
-    smallest residual. J is per size of an unknown.
+    """Search for x near `guess`, between `low` and `high`, at which no residual exceeds the `tolerance`;
+    otherwise end at the smallest residual. J is per size of an unknown.
 
-    `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
-    by their size.
+    `rows`: x -> f and J. `size`: the unit of the steps of each unknown; zero for a held one. Rows should be
+    of order one where unknowns change by their size.
     """
 
     def look(x):
@@ -136,11 +138,11 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
 
 
 def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80) -> Unknowns:
-    """Return the root near a guess, differentiable: a search without derivative, then steps `x <- x - J+
-    R(x)` with the J found, which carry one order each.
+    """Return the root near a guess, differentiable to any order. A search without derivatives is followed by
+    steps `x <- x - J+ R(x)` with a constant J, each of which makes one more order correct.
 
-    `look`: x -> R and J, of numbers without derivatives; `rows`: x -> R; `x`: values of what is held (of size zero), with their derivatives; `cutoff`: of J+.
-    All else is as for `damped_search`.
+    `look`: x -> R and J, for numbers without derivatives; `rows`: x -> R; `x`: values of held unknowns (size
+    zero), with their derivatives; `cutoff`: of J+. Other arguments: as of `damped_search`.
     """
     found = jax.lax.stop_gradient(damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps))
     inverse = size[:, None] * pseudo_inverse(found.J, cutoff)
@@ -148,10 +150,10 @@ def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolera
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Count]:
-    """Return the root found from the first successful one of the `guesses`, and its number; without any, the
-    nearest approach.
+    """Return the root from the first successful one of the `guesses`, and the index of that guess; without a
+    root, the nearest approach.
 
-    A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.
+    A root has residuals of at most `good`. Other arguments, including the `bounds`: as of `damped_search`.
     """
     count = guesses.shape[0]
     # 50_000 slopes are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
@@ -177,9 +179,9 @@ ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
 
 
 def fixed_point(step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None) -> Float[Array, "entries"]:
-    """Return x after at most so many steps; a value that is NaN has settled.
+    """Return x after at most `most` steps; a NaN counts as settled.
 
-    `prepare`: takes a to what steps are given in its place, a pair whose second has no derivatives.
+    `prepare`: turns a into the argument of the steps, a pair whose second part is not differentiated.
     """
     return _iterated((a, x), step=step, most=most, prepare=prepare)
 
@@ -216,7 +218,7 @@ def _iterated_jvp(primals, tangents, *, step, most, prepare):
 
 
 def _loop(step: Callable, carry: tuple, most: int) -> tuple:
-    """Take so many steps of a tuple, whose first entry tells when it has settled."""
+    """Take at most `most` steps of a tuple whose first entry says whether it has settled."""
     if most <= QUIET:
         return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=most)[0]
 
@@ -242,7 +244,8 @@ def nearest_root(
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
     1 + |x|, infinite where they are NaN.
 
-    `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry, and none leads out of the bounds `within`.
+    `solve`: from G and g to the shortest d with G d = g. No step exceeds `longest` in an entry or leaves the
+    bounds `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):
@@ -262,7 +265,9 @@ def nearest_root(
 
 
 def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return the shortest d with G d = g at every state; least squares where the rows are (nearly) dependent, or shorter than they typically are."""
+    """Return the shortest d with G d = g at every state; a least-squares solution where rows are (nearly)
+    dependent, or shorter than typical.
+    """
     return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]
 
 

@@ -19,8 +19,8 @@ Attitude = Float[Array, "4"]
 
 
 def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v =
-    z x k, s = |v|, c = z.k; half a turn about x to -z.
+    """Return the shortest rotation from z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x
+    k, s = |v|, c = z.k; for -z half a turn about x.
     """
     k = direction / np.linalg.norm(direction)
     v = np.cross([0.0, 0.0, 1.0], k)
@@ -31,7 +31,8 @@ def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _angle(angle: Number) -> Scalar:
-    return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
+    return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for "
+        "many")
 
 
 def _turned(angle: Number, rows: Callable) -> Matrix3:
@@ -81,11 +82,12 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
     """Return the rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero
     (the formula divides by the squared norm).
 
-    ValueError where it is known to be zero; NaN where a traced one is.
+    Raises ValueError for a known zero quaternion; a traced one gives NaN.
     """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
     if not holds(np.any, quaternion):
-        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; give (w, x, y, z) of nonzero length, such as (1, 0, 0, 0) for no rotation")
+        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; give (w, x, y, z) of nonzero "
+            "length, such as (1, 0, 0, 0) for no rotation")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)
@@ -99,7 +101,7 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
 
 
 def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Float[np.ndarray, "matrices 4"]:
-    """Unit quaternions (w, x, y, z) of known rotation matrices, body to space; of the two signs either.
+    """Return unit quaternions (w, x, y, z) of known rotation matrices, body to space, with either sign.
 
     The largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2 is found from the diagonal, the others by dividing by its root (Shepperd 1978).
     """
@@ -116,7 +118,9 @@ def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Flo
 
 
 def quaternion_rate(quaternion: Attitude, omega_body: Vector3) -> Attitude:
-    """`d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body` (rad/s)."""
+    """Return `d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body`
+    (rad/s).
+    """
     return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))
 
 

@@ -59,8 +59,8 @@ def quotient(x, y):
 
 
 def root(x):
-    """Return the square root of a; its derivative is 1/(2 sqrt(a)), and a bound of twice that also holds
-    where a is no larger than its own.
+    """Return the square root of a. Its derivative is 1/(2 sqrt(a)); as a bound on errors, twice this holds
+    even if a is smaller than its own error.
     """
     a, ea = halves(x)
     value = np.sqrt(a)
@@ -68,7 +68,9 @@ def root(x):
 
 
 def wave(function: Callable) -> Callable:
-    """Return a sine or cosine, which changes no faster than its argument and lies between -1 and 1."""
+    """Return an operation that bounds errors like a sine or cosine: it changes no faster than its argument
+    and lies between -1 and 1.
+    """
 
     def bounded(x):
         a, ea = halves(x)

@@ -18,7 +18,9 @@ from jourdain_jax.calculus.roots import shortest
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Structurally nonzero entries of matrices of rows; their values have a leading axis of states."""
+    """Positions of the structurally nonzero entries of matrices, by rows. Their values have a leading axis of
+    states.
+    """
 
     rows: np.ndarray  # of each entry
     columns: np.ndarray
@@ -47,9 +49,10 @@ class Pattern:
         return np.sqrt(_summed(self.rows, self.shape[0], values**2))
 
     def shortest(self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return the shortest x with `G x = right` at every state; as of `gauss_newton.shortest` where sparse matrices find none.
+        """Return the shortest x with `G x = right` at every state; where the sparse solution fails, by dense
+        matrices as `gauss_newton.shortest` does.
 
-        `typical`: lengths of the rows, where one may be shorter.
+        `typical`: lengths of the rows, if some may be shorter.
         """
         if not self.is_sparse:
             return shortest(self.dense(values), right, typical)
@@ -65,8 +68,8 @@ class Pattern:
         return found
 
     def solved(self, values: np.ndarray, f: np.ndarray) -> np.ndarray:
-        """Return `(G G')^-1 f` at every state, all as one sparse system; NaN where it is singular, or not
-        finite.
+        """Return `(G G')^-1 f` at every state, from one sparse system for all; NaN where it is singular or
+        not finite.
         """
         from scipy import sparse
         from scipy.sparse.linalg import splu
@@ -86,7 +89,7 @@ class Pattern:
 
 
 def _summed(groups: np.ndarray, count: int, values: np.ndarray) -> np.ndarray:
-    """Return sums of the values in each of so many groups, with a leading axis of states."""
+    """Return the sums of the values in each of `count` groups; values have a leading axis of states."""
     found = np.zeros((len(values), count))
     np.add.at(found, (slice(None), groups), values)
     return found

@@ -15,9 +15,11 @@ DEMO = "Rigid"  # a measured bicycle with all sigmas and a stable range
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    job = verbs.add_parser("bicycle", help="stability speeds with uncertainty, and rides, of measured bicycles")
+    job = verbs.add_parser("bicycle", help="stability speeds with uncertainty, and rides, of measured "
+        "bicycles")
     job.add_argument(
-        "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements (*Measured.txt), or names of shipped bicycles"
+        "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements "
+            "(*Measured.txt), or names of shipped bicycles"
     )
     _options(job, "bicycle-results")
     job.set_defaults(run=_job)
@@ -29,7 +31,8 @@ def add(verbs) -> None:
 
 def _options(parser, folder: str) -> None:
     parser.add_argument("--out", default=folder, help=f"folder for tables and figures (default: {folder})")
-    parser.add_argument("--samples", type=int, default=2000, help="bicycles in the Monte Carlo (default 2000)")
+    parser.add_argument("--samples", type=int, default=2000, help="bicycles in the Monte Carlo (default "
+        "2000)")
     parser.add_argument("--seed", type=int, default=0, help="of the Monte Carlo (default 0)")
     parser.add_argument("--no-figures", action="store_true", help="numbers only")
     parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
@@ -44,7 +47,8 @@ def _job(options) -> bool:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"cannot make the folder `{out}`: {error.strerror}; choose another with --out") from None
+        raise ValueError(f"cannot make the folder `{out}`: {error.strerror}; choose another with "
+            "--out") from None
     studies = run(paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr))
     write_results(studies, out / "result.json")
     written = [out / "result.json"]
@@ -58,8 +62,8 @@ def _job(options) -> bool:
 
 
 def prefixes(names: list[str]) -> list[str]:
-    """Return prefixes of file names of figures: empty for one bicycle; otherwise the bicycle's name, with a
-    number for repeated names.
+    """Return prefixes of file names of figures: empty for one bicycle, otherwise the bicycles' names,
+    numbered if they repeat.
     """
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     return (

@@ -28,7 +28,8 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="jourdain-jax",
         description="Dynamics of holonomic and nonholonomic mechanical systems.",
-        epilog="exit codes: 0 well; 1 a check failed, a motion did not reach its end, or a file was refused; 2 wrong usage or unknown name",
+        epilog="exit codes: 0 well; 1 a check failed, a motion did not reach its end, or a file was refused; "
+            "2 wrong usage or unknown name",
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version_of('jourdain-jax')}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -49,7 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return USAGE
     options = parser().parse_args(arguments)
     if jaxlib.__version__.startswith("0.10."):  # less effort on programs that run once; another series may not know the flags
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false "
+            "--xla_backend_optimization_level=0")
     try:
         return OK if options.run(options) else FAILED
     except (ValueError, InUseError, ImportError) as error:
@@ -60,5 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except OSError as error:
         where = f"`{error.filename}`: " if error.filename else ""
-        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
+        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check the path and its "
+            "permissions", file=sys.stderr)
         return USAGE

@@ -24,12 +24,14 @@ from jourdain_jax.scene.scene import Scene
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    listing = verbs.add_parser("models", help="list the models, or describe one: parameters, coordinates, speeds, a typical start")
+    listing = verbs.add_parser("models", help="list the models, or describe one: parameters, coordinates, "
+        "speeds, a typical start")
     listing.add_argument("model", nargs="?", help="name of the one to describe (default: list all)")
     listing.add_argument("--json", action="store_true", help="machine-readable: a list of objects")
     listing.set_defaults(run=_models)
 
-    about = verbs.add_parser("report", help="report on a model: freedoms, constraints, integrability, cyclic coordinates")
+    about = verbs.add_parser("report", help="report on a model: freedoms, constraints, integrability, cyclic "
+        "coordinates")
     _model_options(about)
     about.set_defaults(run=_report)
 
@@ -78,7 +80,8 @@ def _scene(options) -> Scene:
     for name in counts_of(kind):
         if name in values:
             if not values[name].is_integer():
-                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a count, expected a whole number")
+                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a count, "
+                    "expected a whole number")
             values[name] = int(values[name])
     return model(options.model, **values)
 
@@ -201,7 +204,7 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
 
 
 def plain(x):
-    """Return numbers, texts and lists of them for JSON; values without a JSON number are null."""
+    """Return numbers, texts and lists of them for JSON; values that are no JSON number become null."""
     if isinstance(x, Mapping):
         return {key: plain(value) for key, value in x.items()}
     if isinstance(x, tuple | list):

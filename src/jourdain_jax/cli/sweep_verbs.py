@@ -52,12 +52,15 @@ KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "keep_every", "chun
 
 def add(verbs) -> None:
     """Add the verb to the parser."""
-    sweep = verbs.add_parser("sweep", help="many motions: run a study that a TOML file describes; `sweep status|resume|export|merge FOLDER`")
+    sweep = verbs.add_parser("sweep", help="many motions: run a study that a TOML file describes; `sweep "
+        "status|resume|export|merge FOLDER`")
     sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="a TOML file; or one of " + ", ".join(ACTIONS) + ", and folders of studies")
-    sweep.add_argument("--out", help="folder of the study to create or continue; for `export`, the file to write (.nc)")
+    sweep.add_argument("--out", help="folder of the study to create or continue; for `export`, the file to "
+        "write (.nc)")
     sweep.add_argument("--workers", type=int, default=1, help="processes that compute (default 1)")
     sweep.add_argument("--memory", help="memory for all of them together, such as 2GB")
-    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for `sweep merge` later")
+    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for "
+        "`sweep merge` later")
     sweep.add_argument("--quiet", action="store_true", help="no bar")
     sweep.add_argument("--json", action="store_true", help="machine-readable")
     sweep.set_defaults(run=_sweep)
@@ -67,12 +70,14 @@ def _sweep(options) -> bool:
     action, *paths = options.words
     if action not in ACTIONS:
         if paths:
-            raise ValueError(f"`{action}` is not a verb of `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
+            raise ValueError(f"`{action}` is not a verb of `sweep`; {nearest(action, ACTIONS)} To run a "
+                "study: jourdain-jax sweep FILE.toml --out FOLDER")
         # bytes of a file, whose tables may have a row for each sample
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
-        raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")
+        raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a "
+            "study")
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
@@ -93,7 +98,8 @@ def _run(text: str, source: str, out: str, options) -> bool:
         asked_here = {"processes": options.workers, "shard": _shard(options.shard), "progress": not options.quiet}
         found = study.run(out, command=text, **asked_here, **how)
     except KeyboardInterrupt as stopped:
-        print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
+        print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume "
+            f"{out}", file=sys.stderr)
         return False
     except (RuntimeError, MemoryError) as error:
         if isinstance(error, InUseError):
@@ -106,13 +112,12 @@ def _run(text: str, source: str, out: str, options) -> bool:
 
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
-    """Return the study that a file describes, whose processes may hold so much memory, and how it is to be
-    run.
-    """
+    """Return the study that a file describes, with its bound on memory, and the arguments of its run."""
     check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):
-            raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
+            raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with "
+                "entries below it")
     known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
     check_names(asked.get("options", {}), known_options, "`{}` is no entry of [options]")
     if "model" not in asked:
@@ -131,10 +136,12 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
 def _varying(name: str, how):
     kinds = (*VARYING, "levels", "table")
     if not isinstance(how, Mapping) or len(how) != 1:
-        raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
+        raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = "
+            "[1.0, 0.1] }")
     ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
-        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of numbers; {nearest(kind, kinds)}")
+        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of "
+            f"numbers; {nearest(kind, kinds)}")
     if kind not in VARYING:
         return Levels(numbers) if kind == "levels" else numbers
     if len(numbers) != 2:
@@ -146,7 +153,8 @@ def _output(name: str, how):
     stated = dict(how) if isinstance(how, Mapping) else {}
     unit = stated.pop("unit", "")
     if len(stated) != 1 or (kind := OUTPUTS.get(*stated)) is None:
-        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = 'rad' }}. {nearest(str([*stated][:1]), OUTPUTS)}")
+        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = "
+            f"'rad' }}. {nearest(str([*stated][:1]), OUTPUTS)}")
     return kind(*stated.values(), *(() if kind in (EventTime, Happened) else (unit,)))
 
 

@@ -60,7 +60,7 @@ class Accelerations(eqx.Module):
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
-    """Return all reductions by short name, set up with the scene's privileged velocities.
+    """Return all reductions by short name, with the scene's privileged velocities where they need them.
 
     Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     """
@@ -76,7 +76,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
 
 
 def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
-    """Return a reduction from a short name, or the object itself; the null space by QR for None."""
+    """Return a reduction from its short name, or the object itself; for None the null space by QR."""
     if reduction is None:
         return NullSpaceQR()
     if isinstance(reduction, str):
@@ -90,7 +90,8 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
     chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
     if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
-        raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its name")
+        raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the "
+            "reduction by its name")
     return reduction
 
 
@@ -108,10 +109,11 @@ def accelerations(
         M udot + h = Q + A' lambda,   A udot = -drift
 
     - `inputs`: values of the scene's inputs (default: zero), which count as constant.
-    - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt",
+      "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: as
-      found for this scene).
+    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default:
+      those of this scene).
 
     Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is
     constant. Check `applicable`
@@ -148,8 +150,8 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
 
 
 def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced:
-    """Return accelerations and constraint force alone, as `accelerations` but without multipliers and
-    diagnostics: for use inside integration.
+    """Return only accelerations and constraint force, for use inside the integration; arguments as of
+    `accelerations`.
     """
     return reduced_at(scene, t, q, u, inputs, reduction, None, usual_rows(scene))[0]
 

@@ -26,8 +26,9 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     """Return the constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega -
     L` (N m, about the mass centre); (1)-(3).
 
-    Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of the scene's inputs (default: zero).
-    Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
+    Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of
+    the scene's inputs (default: zero). Impressed forces that the scene states on its speeds, not on bodies,
+    count as constraint forces here.
     """
     q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
@@ -41,8 +42,8 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
 
 def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
-    """Return the scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N'
-    dV/dq` at fixed poses on the speeds.
+    """Return the forces of the scene's own potential: `-dV/dr` and torques `-dV/dtheta` on the bodies, and
+    `-N' dV/dq` at fixed poses on the speeds.
     """
     t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
     zero = jnp.zeros((len(pose.bodies), 3), q.dtype)

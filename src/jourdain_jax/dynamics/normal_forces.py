@@ -29,9 +29,11 @@ def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float
     """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
     determined.
 
-    - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: what no load and no row exerts on them.
-    - `spare`: what the rows exert for multipliers that change no motion, with a leading axis; zero where the rows are independent.
-    - `size`: of the forces at hand, N.
+    - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: forces on them that come
+      neither from loads nor from rows.
+    - `spare`: forces of the rows for multipliers that change no motion, with a leading axis; zero where the
+      rows are independent.
+    - `size`: the magnitude of the forces, N.
     """
     carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
     found: dict[str, tuple] = {}
@@ -88,7 +90,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
 
 
 def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], here):
-    """Force and moment about a point of every set of bodies, one after the other."""
+    """Return force and moment about a point for each of several sets of bodies."""
     moment = wrench.torque + jnp.cross(positions - here, wrench.force)
     summed = [[jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)]
     return tuple(jnp.concatenate(parts, axis=-1) for parts in summed)

@@ -49,8 +49,8 @@ class Power(eqx.Module):
 
 
 def needs_work(scene: Scene, structure: Structure) -> bool:
-    """Return whether anything changes T + V, so that the work done must be integrated beside the motion: any
-    term above that is not zero by structure.
+    """Return whether anything changes T + V: then the work must be integrated with the motion. Terms that are
+    zero by structure do not count.
     """
     by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
     return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
@@ -61,7 +61,7 @@ def _rows_work(structure: Structure) -> bool:
 
 
 def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
-    """Return the power that changes T + V, in W, split by where it comes from."""
+    """Return the power that changes T + V, in W, by its causes."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
     return Power(
@@ -75,10 +75,11 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 
 
 def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Scalar:
-    """Return the integrand of work, in W: the power, with the forces of the loads `of_inputs` in place of
+    """Return the integrand of the work, in W: the power, in which forces of the loads `of_inputs` replace
     their potentials.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
+    `of_inputs`: indices of the loads whose potential depends on inputs. Their stored energy
+    (`stored_by_inputs`) is added to the integral.
     """
     return power(scene, motion, accelerations).total + forces_for_potentials(scene, motion, of_inputs)
 

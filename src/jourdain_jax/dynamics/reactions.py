@@ -34,8 +34,8 @@ from jourdain_jax.scene.validated import contacts_of
 
 
 class RowReactions(eqx.Module):
-    """The constraint force of every constraint on every body, and its direct part on the speeds; along a
-    motion with a first axis of times.
+    """The constraint force of every constraint on every body, and its direct part on the speeds. Along a
+    motion the first axis is that of times.
     """
 
     multipliers: Float[Array, "*times rows"]
@@ -72,7 +72,8 @@ class ContactForce(eqx.Module):
 
 @eager_if_concrete
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
-    """Constraint forces per row and per body at (t, q, u), from the multipliers of known `accelerations`.
+    """Return constraint forces per row and per body at (t, q, u), from the multipliers of known
+    `accelerations`.
 
     Their generalized forces add up to `A' lambda`: `sum_s beta' R^s + gamma' T^s + direct^s`.
     """
@@ -88,7 +89,7 @@ def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowRea
 
 
 def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
-    """Return the forces of constraints (leading axes) on bodies and on speeds for unit multipliers; and
+    """Return the forces on bodies and on speeds for unit multipliers of each constraint (leading axes), and
     `_spare_multipliers`.
     """
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
@@ -108,14 +109,17 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Arr
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
-    """Return the motion with other velocities of the bodies, and other speeds, each on its own."""
+    """Return the motion with velocities of the bodies and speeds replaced by given ones, which need not
+    agree.
+    """
     bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
     qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
 def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]) -> Float[Array, "rows rows"]:
-    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent.
+    """Return multipliers, as columns, that change no motion, `A' lambda = 0`; all zero where the rows are
+    independent.
 
     `typical`: lengths of the rows, as in `row_scale`.
     """
@@ -127,14 +131,16 @@ def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray
 
 @eager_if_concrete
 def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> dict[str, ContactForce]:
-    """Normal and tangential force of every rolling contact, and the friction coefficient it needs to roll without slip.
+    """Return the normal and tangential force of every rolling contact, and the friction coefficient that it
+    needs to roll without slip.
 
-    The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the multiplier of the
-    height row; with `height="coordinates"` it comes from Newton's equations (row S1) of the bodies that the contact carries, forces and moments:
-    `sum N n = sum (m a - F - R_rows)` and its moment, over all contacts that touch these bodies; of minimum norm, and marked as not determined, where
-    they do not tell it (four wheels on a plane). Contacts share what the forces alone leave open according to the moments; where moments are left
-    that no contact can bear (a guide keeps a robot level), such a share is marked as not determined, too. Forces given directly on speeds
-    (`generalized_force`) are taken to have no resultant force or moment on these bodies.
+    The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the
+    multiplier of the height row. With `height="coordinates"` it comes from Newton's equations (row S1),
+    forces and moments, of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)` and its
+    moment, over all contacts of these bodies. If these do not determine it (four wheels on a plane), it has
+    minimum norm and is marked as not determined. So is a share where moments remain that no contact can exert
+    (a guide keeps a robot level). Forces on speeds (`generalized_force`) are assumed to have no resultant
+    force or moment on these bodies.
     """
     motion = motion_at(scene, t, q, u, inputs)
     contacts = contacts_of(scene, motion.pose())

@@ -57,9 +57,11 @@ class Dependence(eqx.Module):
 
 
 def cyclic_coordinates(scene: Scene) -> Labels:
-    """Dependent coordinates that appear neither in B, b, beta, gamma, R I R' nor in the impressed forces.
+    """Return the dependent coordinates that appear neither in B, b, beta, gamma, R I R' nor in the impressed
+    forces.
 
-    None where rows are nonlinear in the speeds. A quaternion is never cyclic: its own rate depends on it.
+    There are none where rows are nonlinear in the speeds. A quaternion is never cyclic: its own rate depends
+    on it.
     """
     if not structure_of(scene).affine:
         return ()
@@ -68,9 +70,9 @@ def cyclic_coordinates(scene: Scene) -> Labels:
 
 
 def ignorable_coordinates(scene: Scene) -> Labels:
-    """Return coordinates that the privileged accelerations do not depend on; a quaternion is named whole.
+    """Return coordinates on which the privileged accelerations do not depend; a quaternion counts as a whole.
 
-    None where rows are nonlinear in the speeds.
+    There are none where rows are nonlinear in the speeds.
     """
     if not structure_of(scene).affine:
         return ()
@@ -78,8 +80,8 @@ def ignorable_coordinates(scene: Scene) -> Labels:
 
 
 def _named(scene: Scene, chosen) -> Labels:
-    """Return names of the chosen coordinates; of a quaternion its own name where all four are chosen, none
-    otherwise.
+    """Return names of the chosen coordinates; a quaternion is named only if all four of its entries are
+    chosen.
     """
     names: list[str] = []
     groups = {first: group for group, first, _ in scene.coordinate_names.groups}
@@ -95,10 +97,10 @@ def _named(scene: Scene, chosen) -> Labels:
 
 @once_per_values
 def dependence(scene: Scene) -> Dependence:
-    """Find the dependence of quantities on coordinates, by displacing each coordinate alone at random states.
+    """Find the dependence of quantities on coordinates by displacing each coordinate alone at random states.
 
-    The states lie off the geometric rows, so that a coordinate is not found absent only because its value is held. Rows must be
-    affine in the speeds.
+    The states do not satisfy the geometric rows: if they did, a held coordinate would seem to have no
+    influence. Rows must be affine in the speeds.
     """
     generator = np.random.default_rng(0)
     t, q, u = sample_states(scene, 8)
@@ -111,8 +113,8 @@ def dependence(scene: Scene) -> Dependence:
 
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
-    """Return which entries change with which coordinate at any state; values (states, 1 + coordinates,
-    entries), undisplaced ones first.
+    """Return, for each entry and coordinate, whether the entry changes with it at any state. Values have
+    shape (states, 1 + coordinates, entries); the first are without displacement.
     """
     size = np.max(np.abs(values), initial=np.finfo(values.dtype).tiny)
     limit = DEPENDS if values.dtype == np.float64 else 1e-4
@@ -121,7 +123,9 @@ def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
 
 @eval_numpy
 def _probe(scene: Scene, t, q, u, shifts):
-    """Quantities by name at every state, undisplaced and with one coordinate after another displaced; whose rate is one speed."""
+    """Return quantities by name at every state, without displacement and with each coordinate displaced in
+    turn. Only coordinates whose rate is one speed are displaced.
+    """
 
     def one(t, q, u, shifts):
         displaced = q + jnp.concatenate([jnp.zeros((1, q.shape[0])), jnp.diag(shifts)])
@@ -136,8 +140,8 @@ def _probe(scene: Scene, t, q, u, shifts):
 
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
-    """Return the rates `B y + b`, the privileged accelerations, and the terms from which a cyclic coordinate
-    must be absent (inertial frame).
+    """Return the rates `B y + b`, the privileged accelerations, and the terms on which a cyclic coordinate
+    must have no effect (inertial frame).
     """
     structure = structure_of(scene)
     chosen = np.array(structure.independent, int)
@@ -164,7 +168,7 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
 
 
 def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
-    """C, c, B and b at one state of a scene whose rows are affine in the speeds."""
+    """Return C, c, B and b at one state of a scene whose rows are affine in the speeds."""
     structure = structure_of(scene)
     y = u[jnp.array(structure.independent, jnp.int32)]
     return _rates_of(scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y))
@@ -181,7 +185,7 @@ def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
 
 @dataclass(frozen=True)
 class ReducedCoordinates:
-    """Which coordinates the reduced equations keep, and in which groups the dropped ones are recovered."""
+    """The coordinates that the reduced equations keep, and the groups in which the others are recovered."""
 
     kept: Labels
     dropped: tuple[Labels, ...]  # groups, in the order of their recovery
@@ -194,13 +198,13 @@ class ReducedCoordinates:
 
 
 def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
-    """Return the coordinates to keep and to omit; a ValueError for constraints nonlinear in the speeds, which
-    have no linear B and b.
+    """Return the coordinates to keep and to omit. Raises ValueError for constraints nonlinear in the speeds,
+    which have no linear B and b.
     """
     structure = structure_of(scene)
     if not structure.affine:
-        raise ValueError(f"`{type(scene).__name__}` has constraints nonlinear in the speeds, and therefore no "
-            "reduced equations; integrate all coordinates and speeds")
+        raise ValueError(f"`{type(scene).__name__}` has constraints nonlinear in the speeds, and therefore "
+            "no reduced equations; integrate all coordinates and speeds")
     found, names = dependence(scene), scene.coordinate_names.entries
     cyclic_or_ignorable = (~found.cyclic_quantities & ~found.privileged) | ~found.accelerations
     groups = _groups(set(np.flatnonzero(cyclic_or_ignorable).tolist()), found.rates)
@@ -213,7 +217,9 @@ def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
 
 
 def _groups(droppable: set[int], needs) -> list[list[int]]:
-    """Groups of coordinates that quadrature recovers one after another; `needs[i, j]`: the rate of i depends on j."""
+    """Return groups of coordinates that quadrature recovers one after another; `needs[i, j]`: whether the
+    rate of i depends on j.
+    """
     while True:
         groups, known = [], set(range(len(needs))) - droppable
         needed_by_kept = {j for j in droppable if any(needs[i, j] for i in known)}
@@ -227,7 +233,9 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
 
 
 def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y) -> Float[Array, "freedoms"]:
-    """Privileged accelerations of the reduced equations (42) from time, kept coordinates and privileged speeds alone."""
+    """Return privileged accelerations of the reduced equations (42) as a function of time, kept coordinates
+    and privileged speeds only.
+    """
     structure = structure_of(scene)
     places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]
     q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)  # the dropped ones at the reference

@@ -15,9 +15,10 @@ from jourdain_jax.eager.numpy_backend import applied
 
 
 def eval_numpy(f: Callable) -> Callable:
-    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced.
+    """Run `f` immediately on concrete arguments, uncompiled. Return NumPy arrays, even if something else is
+    being traced.
 
-    The function takes `lanes`, too: further arguments with an axis of lanes first, of which `f` gets those of one lane.
+    `lanes`: further arguments whose first axis is that of lanes; `f` receives those of one lane.
     """
 
     @lru_cache(maxsize=32)
@@ -37,10 +38,11 @@ def eval_numpy(f: Callable) -> Callable:
 
 
 def eager_if_concrete(f: Callable) -> Callable:
-    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced
-    values, unchanged.
+    """Run `f` uncompiled if its arguments are numbers, so that a first call at a prompt takes a tenth of the
+    time. Traced values run it as usual.
 
-    What `f` finds out by the scene's own numbers (rank, privileged speeds) must be among its arguments: inside, the numbers are traced.
+    Inside `f` the scene's numbers are traced. Decisions that depend on them (rank, privileged speeds) must
+    therefore be arguments.
     """
     known, parameters = eval_numpy(f), signature(f)
 
@@ -56,9 +58,10 @@ def eager_if_concrete(f: Callable) -> Callable:
 
 
 def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
-    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first.
+    """Run `f`, a function of trees of arrays of one lane, on NumPy for arrays whose first axis is that of
+    lanes.
 
-    The first `shared` arguments are those of all lanes; None: all are, and there are no lanes.
+    All lanes share the first `shared` arguments; None: they share all, and there are no lanes.
     """
 
     @lru_cache(maxsize=64)

@@ -76,8 +76,8 @@ def _while(equation, inputs) -> list[np.ndarray]:
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
-            f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; bound the number of iterations, "
-            "such as `lambda state: (state[0] < 50) & ...`, and check its condition"
+            f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; bound the "
+            "number of iterations, such as `lambda state: (state[0] < 50) & ...`, and check its condition"
         )
     # where some lanes have ended, what the others would have found is not known
     return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]
@@ -144,8 +144,8 @@ def _round(equation, x):
 
 
 def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
-    """Return the operands of `dot_general` as matrices whose product is its result, but for the shape; axes
-    of a batch first.
+    """Return the operands of `dot_general` as matrices whose product is its result except for the shape;
+    batch axes come first.
     """
     (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
@@ -175,7 +175,9 @@ def _select(equation, which, *cases):
 
 
 def _window(x, starts, sizes) -> tuple[slice, ...]:
-    """Return the part of an array of these sizes that begins at `starts`, or as near to them as it fits."""
+    """Return the part of an array that has these sizes and begins at `starts`, moved inside the array if
+    necessary.
+    """
     begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
     return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 
@@ -220,7 +222,9 @@ def _triangular_solve(equation, A, b):
 
 
 def _lu(equation, A):
-    """LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their permutation, for all matrices together."""
+    """Return the LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their
+    permutation, for all matrices at once.
+    """
     *lanes, rows, columns = A.shape
     LU = np.array(A).reshape(-1, rows, columns)
     every, swaps = np.arange(len(LU)), np.zeros((len(LU), min(rows, columns)), np.int32)
@@ -236,7 +240,7 @@ def _lu(equation, A):
 
 
 def _platform(equation):
-    """Return which of several implementations: the one for CPUs, or the one for all platforms."""
+    """Return the index of an implementation: that for CPUs, or that for all platforms."""
     return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
 
 
@@ -271,7 +275,7 @@ def gathered(equation, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
 
 
 def _places(x: np.ndarray, axes, lanes, lanes_of_indices, indices: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Index arrays for the axes `(*lanes, *axes)` of x; None where one is out of bounds."""
+    """Return index arrays for the axes `(*lanes, *axes)` of x; None where one is out of bounds."""
     sizes = np.array([x.shape[axis] for axis in axes], int)
     if not np.all((indices >= 0) & (indices < sizes)):
         return None

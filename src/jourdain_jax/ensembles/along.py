@@ -21,9 +21,11 @@ FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 
 
 def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
-    """Times and values of a quantity (a name, or a function of a trajectory that gives its values at all times), and how many of them count.
+    """Return times and values of a quantity (a name, or a function of a trajectory that returns its values at
+    all times), and the number of valid ones.
 
-    These are the saved times that were reached, and the end where it is none of them, in place of the last where it is near; all others repeat the end.
+    Times are the saved ones that were reached, followed by the end. The end replaces the last saved time if
+    that is very near. Remaining entries repeat the end.
     """
     reached, ts = jnp.sum(motion.valid), jnp.asarray(motion.ts)
     before, last = (ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
@@ -40,12 +42,15 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
     if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
-        raise ValueError(f"the quantity of an output is {described(values)}, expected its real values at all {times.shape[0]} times of the motion")
+        raise ValueError(f"the quantity of an output is {described(values)}, expected its real values at all "
+            f"{times.shape[0]} times of the motion")
     return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 
 
 def largest(times: Values, values: Values, count: Count) -> Scalar:
-    """The largest of the first `count` of `values`, and between them. Its derivative is that of the quantity at the time of the largest value."""
+    """Return the largest of the first `count` of `values`, also between them. Its derivative is that of the
+    quantity at the time of the largest value.
+    """
     k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
     if times.shape[0] < FOR_EXTREMES:
         return values[k]
@@ -64,7 +69,9 @@ def integral(times: Values, values: Values, count: Count) -> Scalar:
     """The integral over time of the first `count` of `values`."""
 
     def over(i):
-        """The integral from time i to the next: h (y_i + 4 p(middle) + y_next) / 6; the trapezoid of fewer values than a polynomial needs."""
+        """Return the integral from time i to the next: h (y_i + 4 p(middle) + y_next) / 6, or the trapezoid
+        if there are fewer values than a polynomial needs.
+        """
         even = 0.5 * (values[i] + values[i + 1])
         middle = even
         if times.shape[0] >= FOR_INTEGRALS:
@@ -77,9 +84,10 @@ def integral(times: Values, values: Values, count: Count) -> Scalar:
 
 
 def _window(times, values, count, first, zero, points: int):
-    """Number of the first of so many neighbouring values, if possible the one asked for; their times from the time `zero` on, in units of the window; values.
+    """Return the index of the first of `points` neighbouring values (if possible `first`), their times in
+    units of the window since `zero`, and the values.
 
-    Of fewer values than `points`: times that differ, so that nothing divides by zero.
+    If there are fewer values than `points`, the missing times are made up, so that nothing divides by zero.
     """
     first = jnp.clip(first, 0, jnp.maximum(count - points, 0))
     some = first + jnp.arange(points)

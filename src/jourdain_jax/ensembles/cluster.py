@@ -14,7 +14,9 @@ from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_
 
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
-    """What `run` takes as its workers; ValueError where `client` is no client of Dask, or the task cannot be sent to another process."""
+    """Return the workers of `run`. Raises ValueError where `client` is no client of Dask, or the task cannot
+    be sent to another process.
+    """
     distributed = needed("distributed", "a cluster", "cluster")
     check_kind(client, distributed.Client, "`client`", "a `dask.distributed.Client`")
     sent = sent_to_others(task)
@@ -36,7 +38,9 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
 
 
 def _places(distributed, client) -> dict[object, int] | None:
-    """Number of each worker by its name, where all workers are of one thread, of this machine and of this process; None otherwise."""
+    """Return the index of each worker by name if all workers have one thread each, on this machine, in
+    separate processes; otherwise None.
+    """
     cluster = client.cluster
     threads = client.nthreads().values()
     if type(cluster) is not distributed.LocalCluster or not cluster.processes or set(threads) != {1}:
@@ -45,7 +49,9 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
-    """Compute and keep a chunk in this worker; `asking`: the process that asks; `places`: as `_places` says."""
+    """Compute and store a chunk in this worker; `asking`: the process that requests it; `places`: as returned
+    by `_places`.
+    """
     if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
         from distributed import get_worker
 

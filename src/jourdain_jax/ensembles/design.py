@@ -27,14 +27,16 @@ MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
 
 @dataclass(frozen=True, repr=False)
 class Design(Printed):
-    """The samples of a study: names and what varies, how samples are drawn, how many.
+    """The samples of a study: names and distributions of what varies, the sampler, the number of samples.
 
-    - `variables`: name -> a distribution (`Normal`, `Uniform`, `LogNormal`, `LogUniform`), `Levels` of a grid, or a column of a table (one number per sample).
-      All of one kind.
-    - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); grids and tables have none.
-    - `samples`: how many; a grid has as many as levels cross, a table as many as rows. `seed`: sample k follows from the seed and k alone (of a Latin
-      hypercube from their number as well).
-    - `correlation`: pair of names -> correlation coefficient, of normal distributions (of others, of the normal scores of their ranks).
+    - `variables`: name -> a distribution (`Normal`, `Uniform`, `LogNormal`, `LogUniform`), `Levels` of a
+      grid, or a column of a table (one number per sample). All must be of one kind.
+    - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); grids and tables
+      have none.
+    - `samples`: their number; a grid has all combinations of its levels, a table one for each row. `seed`:
+      sample k follows from the seed and k alone (in a Latin hypercube also from the number of samples).
+    - `correlation`: pair of names -> correlation coefficient, of normal distributions (of others, of the
+      normal scores of their ranks).
 
         design = jj.Design({"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
         design.values(0, 8)["mass"]                               # of samples 0 to 7, in kg
@@ -51,7 +53,8 @@ class Design(Printed):
         kinds = {self._kind(name, what) for name, what in self.variables.items()}
         if len(kinds) != 1:
             found = "nothing varies" if not kinds else f"there are {' and '.join(sorted(kinds))} at once"
-            raise ValueError(f"{found}; give distributions, or `Levels` that are crossed, or the columns of one table")
+            raise ValueError(f"{found}; give distributions, or `Levels` that are crossed, or the columns of "
+                "one table")
         kind = kinds.pop()
         checked_whole(self.seed, "`seed`", 0, 2**63 - 1, expected="from 0 to 2^63 - 1")
         if kind == "distributions":
@@ -71,42 +74,53 @@ class Design(Printed):
         except ValueError:  # rows of unequal length
             column = np.empty(0)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
-            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
+            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as "
+                "jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
         if not np.all(np.isfinite(column)):
-            raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; leave these rows out")
+            raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are "
+                "not finite; omit these rows")
         return "columns"
 
     def _check_sampler(self) -> None:
         if self.sampler in (GRID, TABLE):
             name, what = next(iter(self.variables.items()))
-            raise ValueError(f"a {self.sampler} takes {'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as {what!r}")
+            raise ValueError(f"a {self.sampler} takes "
+                f"{'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as "
+                f"{what!r}")
         if not isinstance(self.sampler, str) or self.sampler not in SAMPLERS:
-            raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} Grids take `jj.Levels`, tables columns.")
-        samples = checked_whole(self.samples, "`samples`", 1, MOST_SAMPLES, expected=f"of at least 1 and at most {MOST_SAMPLES}")
+            raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} "
+                "Grids take `jj.Levels`, tables columns.")
+        samples = checked_whole(self.samples, "`samples`", 1, MOST_SAMPLES, expected="of at least 1 and at "
+            f"most {MOST_SAMPLES}")
         if self.sampler in ("sobol", "saltelli") and samples > MOST_SOBOL:
-            raise ValueError(f"`samples` is {samples}, expected at most {MOST_SOBOL} for a Sobol sequence; take sampler='random'")
+            raise ValueError(f"`samples` is {samples}, expected at most {MOST_SOBOL} for a Sobol sequence; "
+                "take sampler='random'")
         group = len(self.variables) + 2
         if self.sampler == "saltelli" and (samples % group or self.correlation):
             wrong = "variables are correlated, for which Sobol' indices are not defined" if self.correlation else f"`samples` is {samples}"
-            raise ValueError(f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of {group} samples (variables + 2)")
+            raise ValueError(f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of "
+                f"{group} samples (variables + 2)")
 
     def _check_given(self, kind: str) -> None:
         if self.correlation:
             raise ValueError(f"a {kind} has no `correlation`; give distributions")
         if self.sampler not in ("random", kind):
-            raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}, which draws nothing; leave it out")
+            raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}, which draws "
+                "nothing; omit it")
         if kind == GRID:
             count = math.prod(len(levels.levels) for levels in self.variables.values())
             if count > MOST_CROSSED:
-                raise ValueError(f"these levels cross to {count} samples, expected at most {MOST_CROSSED}; give fewer, or distributions")
+                raise ValueError(f"these levels cross to {count} samples, expected at most {MOST_CROSSED}; "
+                    "give fewer, or distributions")
         else:
             object.__setattr__(self, "variables", {name: np.asarray(column, float) for name, column in self.variables.items()})
             lengths = {name: len(column) for name, column in self.variables.items()}
             if len(set(lengths.values())) > 1:
-                raise ValueError("columns differ in length: " + ", ".join(f"`{name}` has {length}" for name, length in lengths.items()))
+                raise ValueError("columns differ in length: " + ", ".join(f"`{name}` has "
+                    f"{length}" for name, length in lengths.items()))
             count = next(iter(lengths.values()))
         if self.samples not in (None, count):
-            raise ValueError(f"`samples` is {self.samples}, but the {kind} has {count}; leave `samples` out")
+            raise ValueError(f"`samples` is {self.samples}, but the {kind} has {count}; omit `samples`")
         object.__setattr__(self, "sampler", kind)
         object.__setattr__(self, "samples", count)
 
@@ -117,11 +131,14 @@ class Design(Printed):
         matrix = np.eye(len(names))
         for pair, value in self.correlation.items():
             if not isinstance(pair, tuple) or len(pair) != 2:
-                raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as ({names[0]!r}, {names[-1]!r}): 0.5")
-            value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"))
+                raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as "
+                    f"({names[0]!r}, {names[-1]!r}): 0.5")
+            value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number "
+                "between -1 and 1"))
             check_names(pair, names, "`correlation` names `{}`, which does not vary")
             if len(set(pair)) != 2 or not -1 < value < 1:
-                raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1")
+                raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number "
+                    "between -1 and 1")
             if (back := self.correlation.get(pair[::-1], value)) != value:
                 raise ValueError(f"the correlation of {pair} is both {value} and {back}; give it once")
             i, j = map(names.index, pair)
@@ -129,7 +146,8 @@ class Design(Printed):
         try:
             return np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:
-            raise ValueError(f"no quantities have these correlations: the matrix\n{matrix}\nis not positive definite; make them smaller") from None
+            raise ValueError(f"no quantities have these correlations: the matrix\n{matrix}\nis not positive "
+                "definite; make them smaller") from None
 
     @property
     def names(self) -> Labels:
@@ -140,16 +158,18 @@ class Design(Printed):
         return int(self.samples)  # type: ignore[arg-type]
 
     def values(self, first: int = 0, last: int | None = None) -> dict[str, np.ndarray]:
-        """The values of samples `first` to `last` - 1 (default: all), by name, each of shape (last - first,)."""
+        """Return the values of samples `first` to `last` - 1 (default: all), by name, each of shape (last -
+        first,).
+        """
         last = len(self) if last is None else last
         if not 0 <= first <= last <= len(self):
             raise ValueError(f"samples {first} to {last} are not among 0 to {len(self)}")
         return self._at(np.arange(first, last))
 
     def _at(self, index, on_device: bool = False) -> dict:
-        """The values of samples with these numbers, in order.
+        """Return the values of samples with these indices, in order.
 
-        What is drawn `on_device` are arrays of JAX with the bits of the host; grids and tables draw nothing.
+        Values drawn `on_device` are arrays of JAX with the bits of the host. Grids and tables draw nothing.
         """
         if self.sampler == TABLE:
             return {name: column[index] for name, column in self.variables.items()}
@@ -163,7 +183,9 @@ class Design(Printed):
         return {name: values(distribution, u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
 
     def probabilities(self, first: int, last: int) -> np.ndarray:
-        """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN for grids, tables."""
+        """Return the probabilities at which the distributions are evaluated, for samples `first` to `last` -
+        1, shape (last - first, variables); NaN for grids and tables.
+        """
         if self.sampler in (TABLE, GRID):
             return np.full((last - first, len(self.variables)), np.nan)
         return self._drawn(np.arange(first, last))

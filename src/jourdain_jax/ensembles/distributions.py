@@ -21,7 +21,7 @@ class Distribution:
     _positive: ClassVar[str] = ""  # which number must be above zero
 
     def __post_init__(self):
-        """Make the numbers floats; ValueError where one is not finite, or they are out of their ranges."""
+        """Convert the numbers to floats. Raises ValueError where one is not finite or out of its range."""
         kind, known = type(self).__name__, dict(vars(self))
         for name, value in known.items():
             known[name] = float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number"))
@@ -29,18 +29,23 @@ class Distribution:
             if not np.isfinite(known[name]):
                 raise ValueError(f"`{name}` of {kind} is {value}, expected a finite number")
         if known.get("sigma", 0.0) < 0:
-            raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation of at least 0")
+            raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation of at "
+                "least 0")
         if not known.get("low", 0.0) < known.get("high", 1.0):
-            raise ValueError(f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low < high")
+            raise ValueError(f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low "
+                "< high")
         if self._positive and known[self._positive] <= 0:
-            raise ValueError(f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a positive number")
+            raise ValueError(f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a "
+                "positive number")
 
     def values(self, u):
         """The values at the probabilities `u`, which lie between 0 and 1."""
         return self._inverse(u, *vars(self).values())
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Derivatives of `values(u)` with respect to the numbers of the distribution, by their names: its imaginary part beside them, exact to round-off."""
+        """Return derivatives of `values(u)` with respect to the numbers of the distribution, by name. They
+        are imaginary parts (complex step), exact to round-off.
+        """
         known, tiny = vars(self), 1e-30
         return {name: np.imag(self._inverse(u, *(known | {name: known[name] + 1j * tiny}).values())) / tiny for name in known}
 
@@ -52,7 +57,9 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Normal(Distribution):
-    """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of what varies; sigma = 0: always the mean."""
+    """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of the
+    quantity; with sigma = 0 it always takes the mean.
+    """
 
     mean: Any
     sigma: Any
@@ -76,7 +83,9 @@ class Uniform(Distribution):
 
 @dataclass(frozen=True)
 class LogNormal(Distribution):
-    """A positive quantity whose logarithm is normal: `median` in the unit of what varies, `sigma` the standard deviation of its natural logarithm."""
+    """A positive quantity whose logarithm is normal: `median` in the unit of the quantity, `sigma` the
+    standard deviation of its natural logarithm.
+    """
 
     median: Any
     sigma: Any
@@ -89,7 +98,9 @@ class LogNormal(Distribution):
 
 @dataclass(frozen=True)
 class LogUniform(Distribution):
-    """A positive quantity whose logarithm is even between those of `low` and `high`, in the unit of what varies."""
+    """A positive quantity whose logarithm is uniform between those of `low` and `high`, in the unit of the
+    quantity.
+    """
 
     low: Any
     high: Any
@@ -102,12 +113,15 @@ class LogUniform(Distribution):
 
 @dataclass(frozen=True)
 class Levels:
-    """The `levels` that a quantity takes in a grid (in its unit): every one is crossed with every one of the other quantities; the last named changes first."""
+    """The `levels` of a quantity in a grid (in its unit). A grid has all combinations of levels; the last
+    quantity changes first.
+    """
 
     levels: tuple[float, ...]
 
     def __init__(self, levels: Sequence[float]):
         found = np.asarray(checked_known(levels, "`levels`", advice="give a list of numbers"), float)
         if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
-            raise ValueError(f"`levels` has the shape {found.shape}, expected a list of finite numbers, at least one")
+            raise ValueError(f"`levels` has the shape {found.shape}, expected a list of finite numbers, at "
+                "least one")
         object.__setattr__(self, "levels", tuple(found.tolist()))

@@ -19,13 +19,16 @@ class InUseError(RuntimeError):
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock file `path`; an `InUseError` that says who holds it otherwise. The system lets go of it when its owner dies, in whatever way."""
+    """Hold the lock file `path`, or raise `InUseError` with the name of its holder. The system releases it
+    when its owner dies, for whatever reason.
+    """
     with open(path, "a+b") as file:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InUseError(f"`{path.parent.parent}` is in use{_owner(file)}; wait for that run, or end it, or give another folder") from None
+                raise InUseError(f"`{path.parent.parent}` is in use{_owner(file)}; wait for that run, or end "
+                    "it, or give another folder") from None
         file.truncate(0)
         file.write(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
         file.flush()

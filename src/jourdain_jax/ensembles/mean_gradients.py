@@ -35,11 +35,14 @@ SHIFT = "shift"  # of all values of a column of a table, or of all levels of a g
 class MeanGradients(Printed):
     """Means of outputs and their derivatives.
 
-    - `outputs`, `names`: rows and columns of `gradient`; a column is a parameter of the scene that all lanes share, or a number of a distribution, such as
-      "radius.sigma", or "radius.shift", which moves all values of a table or grid alike.
-    - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the output over that of the number; standard errors are
-      those of independent samples (those of a Sobol sequence or a Latin hypercube are smaller). NaN where the derivative does not exist.
-    - `lanes`: how many lanes each output has; `failed`: how many motions failed and are left out; `warnings`: what may be wrong with the numbers.
+    - `outputs`, `names`: rows and columns of `gradient`. A column is a parameter of the scene that all lanes
+      share, or a number of a distribution, such as "radius.sigma"; "radius.shift" moves all values of a table
+      or grid alike.
+    - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the
+      output over that of the number. Standard errors are those of independent samples (a Sobol sequence or a
+      Latin hypercube has smaller ones). NaN where the derivative does not exist.
+    - `lanes`: the number of lanes of each output; `failed`: the number of failed motions, which are omitted;
+      `warnings`: reasons to doubt the numbers.
     """
 
     outputs: Labels
@@ -52,21 +55,27 @@ class MeanGradients(Printed):
     warnings: Labels
 
     def of(self, output: str, name: str) -> float:
-        """The derivative of the mean of `output` with respect to `name`; ValueError for unknown names."""
+        """Return the derivative of the mean of `output` with respect to `name`. Raises ValueError for unknown
+        names.
+        """
         for given, known in ((output, self.outputs), (name, self.names)):
             check_name(given, known, f"there is no `{given}`")
         return float(self.gradient[self.outputs.index(output), self.names.index(name)])
 
     def _text(self) -> str:
-        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (f"; {self.failed} failed and are left out" if self.failed else "")]
+        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (f"; {self.failed} "
+            "failed and are left out" if self.failed else "")]
         for i, output in enumerate(self.outputs):
             lines.append(f"  {output}: mean {self.mean[i]:.6g}")
-            lines += [f"    by {name}: {self.gradient[i, j]:.6g} +- {self.standard_error[i, j]:.2g}" for j, name in enumerate(self.names)]
+            lines += [f"    by {name}: {self.gradient[i, j]:.6g} +- "
+                f"{self.standard_error[i, j]:.2g}" for j, name in enumerate(self.names)]
         return "\n".join([*lines, *(f"  warning: {text}" for text in self.warnings)])
 
 
 def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
-    """The gradients of the means of all outputs of a task, also with respect to the parameters `shared` by all lanes."""
+    """Return the gradients of the means of all outputs of a task, also with respect to the parameters
+    `shared` by all lanes.
+    """
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
     # 2048 lanes with their tangents, at once
@@ -92,13 +101,16 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
     for name in shared:
         if name not in known or name in task.design.names:
             said = "varies over the lanes, and has its derivatives without being named" if name in known else "is no parameter of the scene"
-            raise ValueError(f"`{name}` {said}; {nearest(name, [one for one in known if one not in task.design.names])}")
+            raise ValueError(f"`{name}` {said}; "
+                f"{nearest(name, [one for one in known if one not in task.design.names])}")
         if known[name]:
             raise ValueError(f"parameter `{name}` is an array; give parameters that are one number")
 
 
 def _of_block(task: Task, columns: Sequence[str]):
-    """Columns by name -> outputs (lanes, outputs), their derivatives with respect to each column (columns, lanes, outputs), and how lanes ended (lanes,)."""
+    """Return the outputs (lanes, outputs) of a block of columns by name, their derivatives with respect to
+    each column (columns, lanes, outputs), and the result of each lane.
+    """
 
     def outputs(drawn: Mapping):
         starts, parameters = task.starts_and_parameters(drawn)
@@ -114,7 +126,9 @@ def _of_block(task: Task, columns: Sequence[str]):
 
 
 def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[tuple[str, str, np.ndarray]]:
-    """The numbers with respect to which means are differentiated: column, name, and dx/dtheta (lanes,) of the column."""
+    """Return the numbers with respect to which means are differentiated: column, name, and dx/dtheta (lanes,)
+    of the column.
+    """
     u, even = task.design.probabilities(first, last), np.ones(last - first)
     found = []
     for i, (name, how) in enumerate(task.design.variables.items()):
@@ -124,7 +138,9 @@ def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[t
 
 
 def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray) -> MeanGradients:
-    """Means over the lanes that have an output; `values` (lanes, outputs), `derivatives` (lanes, outputs, names)."""
+    """Return means over the lanes that have an output; `values` (lanes, outputs), `derivatives` (lanes,
+    outputs, names).
+    """
     there = np.isfinite(values)[:, :, None]
     count = there.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -134,17 +150,20 @@ def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, en
     warned = []
     failed = int(np.sum(ends == -2))
     if failed:
-        warned.append(f"{failed} of {len(values)} motions failed without being tried in another way, as `run` would, and are left out")
+        warned.append(f"{failed} of {len(values)} motions failed without being tried in another way, as "
+            "`run` would, and are left out")
     if np.unique(ends[ends != -2]).size > 1:
         of_event = np.array([isinstance(output, OfEvent) for output in task.outputs.values()])
         gradient[of_event] = error[of_event] = np.nan
         if of_event.any():
             none = ", ".join(name for name, is_one in zip(task.outputs, of_event, strict=True) if is_one)
-            warned.append(f"which lanes end at an event depends on what varies: the means of {none} have no pathwise derivative; take differences")
+            warned.append(f"which lanes end at an event depends on what varies: the means of {none} have no "
+                "pathwise derivative; take differences")
         if not of_event.all():
             warned.append(
-                f"{int(np.sum(ends >= 0))} of {len(values)} lanes end at an event, others do not, or at another one: where an output jumps from one "
-                "end to another, the share of lanes that pass between them is missing; compare with differences of the mean"
+                f"{int(np.sum(ends >= 0))} of {len(values)} lanes end at an event, others do not, or at "
+                "another one: where an output jumps from one end to another, the share of lanes that pass "
+                "between them is missing; compare with differences of the mean"
             )
     for text in warned:
         warn(text, SensitivityWarning)

@@ -19,7 +19,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Output:
-    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times` says whether it looks at saved times, or only at the end."""
+    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times`: whether it uses saved
+    times or only the end.
+    """
 
     unit: str = ""
     over_times: bool = True
@@ -34,13 +36,14 @@ class Output:
 
 def _check_name(output: Output, name, scene: Scene) -> None:
     valid = (*scene.coordinate_names, *scene.speed_names)
-    check_name(name, valid, f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed")
+    check_name(name, valid, f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such "
+        "coordinate or speed")
 
 
 @dataclass(frozen=True)
 class End(Output):
-    """The value of the coordinate or speed `name` at the end of the motion: its last time, or an event.
-    `unit`: text stored with it.
+    """The value of the coordinate or speed `name` at the end of the motion: at its last time or at an event.
+    `unit`: a text stored with it.
     """
 
     name: str
@@ -59,9 +62,10 @@ class End(Output):
 
 @dataclass(frozen=True)
 class _Along(Output):
-    """A number of a `quantity` along the motion: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times, such as
-    `lambda motion: jnp.hypot(motion["x"], motion["y"])`. Between saved times it is a polynomial: a smooth quantity of which values are saved every h seconds
-    is found to the fifth order of h, its integral to the fourth.
+    """A number that summarises a `quantity` along the motion: the name of a coordinate or speed, or a
+    function of a trajectory that returns its values at all times, such as `lambda motion:
+    jnp.hypot(motion["x"], motion["y"])`. Between saved times it is a polynomial: for a smooth quantity saved
+    every h seconds, extremes are accurate to the fifth order of h, integrals to the fourth.
     """
 
     quantity: str | Callable
@@ -82,9 +86,11 @@ class _Along(Output):
 
 @dataclass(frozen=True)
 class Largest(_Along):
-    """The largest value of a `quantity` at the saved times, between them, and at the end. `unit`: text that is kept with it.
+    """The largest value of a `quantity` at the saved times, between them, and at the end. `unit`: a text
+    stored with it.
 
-    `quantity`: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times.
+    `quantity`: the name of a coordinate or speed, or a function of a trajectory that returns its values at
+    all times.
     """
 
     _number = staticmethod(largest)
@@ -92,7 +98,7 @@ class Largest(_Along):
 
 @dataclass(frozen=True)
 class Smallest(_Along):
-    """The smallest value of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
+    """The smallest value of a `quantity`, computed like `Largest`. `unit`: a text stored with it."""
 
     @staticmethod
     def _number(times, values, count):
@@ -101,7 +107,7 @@ class Smallest(_Along):
 
 @dataclass(frozen=True)
 class LargestMagnitude(_Along):
-    """The largest magnitude of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
+    """The largest magnitude of a `quantity`, computed like `Largest`. `unit`: a text stored with it."""
 
     @staticmethod
     def _number(times, values, count):
@@ -110,7 +116,8 @@ class LargestMagnitude(_Along):
 
 @dataclass(frozen=True)
 class Integral(_Along):
-    """The integral of a `quantity` over time, from the start to the end of the motion. `unit`: text that is kept with it, of the quantity times s.
+    """The integral of a `quantity` over time, from the start to the end of the motion. `unit`: a text stored
+    with it, that of the quantity times s.
 
     `quantity`: as of `Largest`.
     """
@@ -120,7 +127,7 @@ class Integral(_Along):
 
 @dataclass(frozen=True)
 class OfEvent(Output):
-    """A number of a stop event, by `event`, its name; of any where that is None."""
+    """A number of the stop event named `event`, or of any event if that is None."""
 
     event: str | None = None
     over_times = False
@@ -128,9 +135,11 @@ class OfEvent(Output):
     def check(self, scene: Scene) -> None:
         valid = names_of_events(scene)
         if not valid:
-            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no stop events; give it a method `events`")
+            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no "
+                "stop events; give it a method `events`")
         if self.event is not None and self.event not in valid:
-            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such stop event; {nearest(self.event, valid)}")
+            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such "
+                f"stop event; {nearest(self.event, valid)}")
 
     def _happened(self, motion: Trajectory):
         stopped = motion.result == EVENT
@@ -139,7 +148,9 @@ class OfEvent(Output):
 
 @dataclass(frozen=True)
 class EventTime(OfEvent):
-    """The time (s) at which the stop event `event` ended the motion (default: any event); NaN where it did not."""
+    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN where it did
+    not.
+    """
 
     unit = "s"
 
@@ -149,7 +160,9 @@ class EventTime(OfEvent):
 
 @dataclass(frozen=True)
 class Happened(OfEvent):
-    """1 where the stop event `event` ended the motion (default: any event), otherwise 0: its mean is the fraction of lanes."""
+    """1 where the stop event `event` (default: any event) ended the motion, otherwise 0. Its mean is the
+    fraction of such lanes.
+    """
 
     def of(self, motion: Trajectory) -> Scalar:
         return jnp.where(self._happened(motion), 1.0, 0.0)
@@ -157,7 +170,7 @@ class Happened(OfEvent):
 
 @dataclass(frozen=True)
 class Quantity(Output):
-    """A number computed by `function` from a `Trajectory` by operations of JAX, with its `unit` as a text.
+    """A number that `function` computes from a `Trajectory` by operations of JAX, with its `unit` as a text.
 
     jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """
@@ -169,22 +182,28 @@ class Quantity(Output):
         found = self.function(motion)
         shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
         if shape != () or jnp.iscomplexobj(found):
-            raise ValueError(f"an output is {described(found)}, expected one real number for a motion; take an entry or reduce it, or give one output for each")
+            raise ValueError(f"an output is {described(found)}, expected one real number for a motion; take "
+                "an entry or reduce it, or give one output for each")
         return jnp.asarray(found, motion.q_end.dtype)
 
 
 def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
-    """Outputs by name, checked; functions become a `Quantity`; None: the end values of all coordinates and speeds."""
+    """Check the outputs and return them by name. A function becomes a `Quantity`; None means the end values
+    of all coordinates and speeds.
+    """
     if outputs is None:
         outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names, *scene.speed_names)}
     if not isinstance(outputs, Mapping) or not outputs:
-        raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as {{"final lean": jj.End("lean", "rad")}}')
+        raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as '
+            '{"final lean": jj.End("lean", "rad")}')
     found = {}
     for name, output in outputs.items():
         if not isinstance(name, str) or not name or {"/", "\\"} & {*name} or name.startswith(("_", ".")):
-            raise ValueError(f"an output is called {name!r}, expected a text without `/` and `\\` that begins with neither `_` nor `.`")
+            raise ValueError(f"an output is called {name!r}, expected a text without `/` and `\\` that "
+                "begins with neither `_` nor `.`")
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
-            raise ValueError(f"output `{name}` is {described(output)}, expected an output such as jj.End('lean'), or a function of a trajectory")
+            raise ValueError(f"output `{name}` is {described(output)}, expected an output such as "
+                "jj.End('lean'), or a function of a trajectory")
         found[name] = output if isinstance(output, Output) else Quantity(output)
         found[name].check(scene)
     return found

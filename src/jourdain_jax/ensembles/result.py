@@ -27,7 +27,7 @@ LEVELS = (0.025, 0.5, 0.975)
 
 @dataclass(frozen=True, repr=False)
 class Lane(Printed):
-    """One lane of a study: what it takes to repeat it alone, and what is kept of it."""
+    """One lane of a study: the data to repeat it alone, and its stored results."""
 
     task: Task
     number: int
@@ -36,7 +36,9 @@ class Lane(Printed):
     kept: dict[str, float]  # result code, steps, outputs; empty where nothing is kept of single lanes
 
     def simulate(self, **options) -> Trajectory:
-        """The motion of this lane, with the options of the study; `options` replace some, such as `ts=` or `rtol=`."""
+        """Simulate this lane with the options of the study; `options` replace some of them, such as `ts=` or
+        `rtol=`.
+        """
         task = self.task
         own = task.scene.replace(**self.parameters) if self.parameters else task.scene
         return simulate(own, self.starts, **dict(task.span) | {"options": task.options} | options)
@@ -53,8 +55,9 @@ class Lane(Printed):
 class StudyResult(Printed):
     """Results of a study, read from its folder.
 
-    `store.path` is the folder; it opens with `xarray.open_zarr` too. Numbers cover the chunks that are done: `complete` says whether all are.
-    `left_out`: numbers of chunks whose receipt is damaged or of another study, so that they do not count; `study.run` computes them again.
+    `store.path` is the folder; `xarray.open_zarr` also opens it. Numbers cover finished chunks; `complete`:
+    whether all are finished. `left_out`: indices of chunks whose receipt is damaged or belongs to another
+    study. They do not count, and `study.run` computes them again.
     """
 
     def __init__(self, store: Store, task: Task | None = None):
@@ -97,9 +100,11 @@ class StudyResult(Printed):
         if there is none.
         """
         if not 0 <= number < len(self):
-            raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}")
+            raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to "
+                f"{len(self) - 1}")
         if self.task is None:
-            raise ValueError("which scene this was is not known here; call `study.run` with the same arguments, which computes nothing twice")
+            raise ValueError("the scene of this study is not known here; call `study.run` with the same "
+                "arguments, which computes nothing again")
         kept = {}
         if self.store.columns:
             self.store.check_arrays({number // self.store.chunk}.intersection(self.store.receipts()))
@@ -112,7 +117,8 @@ class StudyResult(Printed):
         """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
         grid = self.store.read_grid()
         if grid is None or not self._done:
-            raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
+            raise ValueError(f"no chunk of `{self.store.path}` is finished, or `run/grid.json` is damaged; "
+                "run the study, which computes it")
         return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 
     def mean(self, output: str) -> float:
@@ -136,7 +142,9 @@ class StudyResult(Printed):
         return self.statistics.quantile(output, level)
 
     def histogram(self, output: str, cells: int = 64) -> tuple[np.ndarray, np.ndarray]:
-        """Lanes per cell of an `output` and the edges of the cells, some `cells` in number, each of several of the cells in which lanes are counted."""
+        """Return the number of lanes per cell of an `output`, and the edges of the cells. There are about
+        `cells` cells, each made of several cells of the stored grid.
+        """
         if cells < 1:
             raise ValueError(f"`cells` is {cells}, expected at least 1")
         self._place(output)
@@ -150,15 +158,20 @@ class StudyResult(Printed):
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
     def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The histogram, and which of its cells reach beyond the grid: lanes lie anywhere in them."""
+        """Return the histogram, and which of its cells extend beyond the grid (their lanes may lie anywhere
+        in them).
+        """
         (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
         return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])
 
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
-        """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""
+        """Return first-order and total Sobol' indices of an `output`, with intervals that contain each with
+        the given `confidence`. Requires sampler="saltelli".
+        """
         self._place(output)
         if self.store.study["sampler"] != "saltelli":
-            raise ValueError(f"Sobol' indices need sampler='saltelli'; this study has '{self.store.study['sampler']}'")
+            raise ValueError("Sobol' indices need sampler='saltelli'; this study has "
+                f"'{self.store.study['sampler']}'")
         if self.store.study["save"] == "statistics" or not self.complete:
             raise ValueError("Sobol' indices need all lanes of a study with save='outputs'" + ("" if self.complete else "; run it to its end"))
         return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
@@ -168,9 +181,10 @@ class StudyResult(Printed):
         return self.outputs.index(output)
 
     def to_xarray(self):
-        """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1.
+        """Return all arrays as an `xarray.Dataset` with names and units, read on use. Unfinished lanes are
+        NaN and have the result -1.
 
-        Raises ValueError where arrays are not those that were written; for this all are read once here.
+        Raises ValueError for damaged arrays; all are read once here to check them.
         """
         self.store.check_arrays(self.store.receipts())
         return self._opened()
@@ -179,7 +193,7 @@ class StudyResult(Printed):
         return needed("xarray", "a study as labelled arrays", "studies").open_zarr(self.store.path, chunks=None, consolidated=True)
 
     def to_netcdf(self, path: str | os.PathLike) -> None:
-        """Write all arrays to the NetCDF file `path`, by whichever engine of xarray is installed."""
+        """Write all arrays to the NetCDF file `path`, by any installed engine of xarray."""
         found = self.to_xarray().load()
         found.attrs = {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.attrs.items()}
         found.attrs.pop("coordinates", None)
@@ -190,7 +204,9 @@ class StudyResult(Printed):
         found.to_netcdf(path)
 
     def plot(self, *outputs: str, path: str | os.PathLike | None = None):
-        """Histograms of `outputs` (default: all) in one figure, which is returned, and written to `path` where that is given. Needs matplotlib."""
+        """Draw histograms of `outputs` (default: all). Return the figure, and write it to `path` if given.
+        Needs matplotlib.
+        """
         plt = needed("matplotlib.pyplot", "a plot", "plot")
         names = outputs or self.outputs
         drawn = plt.figure(figsize=(3.6 * len(names), 3.0), layout="constrained")
@@ -200,7 +216,9 @@ class StudyResult(Printed):
         return drawn
 
     def _draw(self, whole, names: Sequence[str], cells: int = 64) -> None:
-        """Draw lanes per cell of outputs beside each other; cells that reach beyond the grid are pale, the mean is a line."""
+        """Draw lanes per cell of outputs side by side. Cells that extend beyond the grid are pale; a line
+        marks the mean.
+        """
         for k, name in enumerate(names):
             axis, (counts, edges, beyond) = whole.add_subplot(1, len(names), k + 1), self._bars(name, cells)
             axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
@@ -221,7 +239,9 @@ class StudyResult(Printed):
         return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
 
     def _in_short(self, output: str, level: float) -> str:
-        """A quantile as one number, the middle of its cell; of one beyond the grid the side on which it is."""
+        """Return a quantile as one number, the middle of its cell. For a quantile beyond the grid, name the
+        side.
+        """
         (low, high), grid, i = self.quantile(output, level), self.statistics.grid, self._place(output)
         beyond = (">", low) if low >= grid.high[i] else ("<", high) if high <= grid.low[i] else None
         return f"{beyond[0]} {beyond[1]:.5g}" if beyond and low < high else f"{(low + high) / 2:.5g}"
@@ -236,9 +256,11 @@ class StudyResult(Printed):
         if tally.again[0]:
             lines.append(f"  {tally.again[0]} were run again in another way")
         if done:
-            lines.append(f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} rejected a lane")
+            lines.append(f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} "
+                "rejected a lane")
             width = max(map(len, self.outputs))
-            lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} {'median':>12} {'97.5 %':>12}")
+            lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} "
+                f"{'median':>12} {'97.5 %':>12}")
             for i, name in enumerate(self.outputs):
                 middle = (f"{self._in_short(name, level):>12}" for level in LEVELS)
                 numbers = f"{self.statistics.lanes[i, i]:>9} {self.statistics.mean[i]:12.5g} {self.statistics.deviation[i]:12.5g} {' '.join(middle)}"
@@ -247,11 +269,11 @@ class StudyResult(Printed):
 
 
 def load_study(path: str | os.PathLike) -> StudyResult:
-    """Open the results in the folder `path` of a study, finished or not, without its scene: `study.run` with
-    equal arguments also gives `.lane(k).simulate()`.
+    """Open the results of a study in the folder `path`, finished or not, without its scene. `study.run` with
+    equal arguments also offers `.lane(k).simulate()`.
 
-    A warning names chunks that are damaged: their lanes do not count (`left_out`). Raises ValueError where the folder holds no study, one of a format that this
-    version does not know, or one whose description is damaged.
+    A warning names damaged chunks, whose lanes do not count (`left_out`). Raises ValueError where the folder
+    holds no study, a study of an unknown format, or one with a damaged description.
     """
     found = StudyResult(Store(path))
     if found.left_out:
@@ -261,10 +283,11 @@ def load_study(path: str | os.PathLike) -> StudyResult:
 
 
 def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) -> StudyResult:
-    """Copy chunks from the folders `shares`, which hold shares of one study (`study.run(..., shard=(k, n))`),
-    into the folder `path`, itself one of them.
+    """Copy chunks from the folders `shares` of one study (`study.run(..., shard=(k, n))`) into the folder
+    `path`, which is one of them.
 
-    Chunks that are damaged are left out; what is missing afterwards is computed by `study.run` as always. Raises ValueError where a folder holds another study.
+    Damaged chunks are omitted; `study.run` then computes what is missing. Raises ValueError where a folder
+    holds another study.
     """
     target = Store(path)
     with target.lock():
@@ -274,7 +297,8 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
             different = [name for name in ("identity", "chunk", "block", "samples") if other.study[name] != target.study[name]]
             grid, own = other.read_grid(), target.read_grid()
             if different or (grid and own and grid != own):
-                raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
+                raise ValueError(f"`{share}` holds no share of the study in `{path}`: "
+                    f"{' and '.join(different) or 'the grid of statistics'} differ")
             if grid and not own:
                 target.write_grid(grid)
             for number in other.receipts():

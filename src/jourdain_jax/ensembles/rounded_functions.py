@@ -60,10 +60,10 @@ def library(x):
 
 
 def apart(x, u):
-    """Return x, which a compiler leaves as it is.
+    """Return x unchanged, in a way that keeps a compiler from combining it with other operations.
 
-    `u`: an argument of the program, above zero, of which it does not know that: its sign, 0, goes into that
-    of x.
+    `u`: a positive argument of the program. Its sign, which the compiler cannot know to be positive, is
+    combined with x.
     """
     if not isinstance(u, jax.Array):
         return x
@@ -126,11 +126,10 @@ def normal_probability(x, u):
 
 
 def correlated(factor, u):
-    """Return the probabilities of correlated numbers from those of independent ones, samples by variables.
+    """Return probabilities of correlated numbers from those of independent ones, (samples, variables).
 
-    Normal numbers of these probabilities are multiplied by the rows of `factor`, one after another: a product
-    of
-    matrices may round otherwise.
+    Normal numbers with these probabilities are multiplied by the rows of `factor` one after another, since a
+    product of matrices may round differently.
     """
     xp, z, rows = library(u), normal_quantile(u), []
     for row in range(u.shape[1]):
@@ -150,7 +149,9 @@ def _outer_quantile(y, u):
 
 
 def normal_quantile(u):
-    """The number below which a standard normal one lies with the probability u, 0 < u < 1; u an argument of the program."""
+    """Return the number below which a standard normal number lies with the probability u, 0 < u < 1. u is an
+    argument of the program.
+    """
     xp = library(u)
     upper = u > 1.0 - _TAIL
     y = xp.where(upper, 1.0 - u, u)

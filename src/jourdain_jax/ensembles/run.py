@@ -36,9 +36,10 @@ PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr"
 
 @dataclass(frozen=True)
 class Lanes:
-    """What a block of lanes gave: what is kept of it, by column; how its lanes ended, by the names of `OF_LANES`, and all outputs (lanes, outputs).
+    """Results of a block of lanes: the stored values by column, the ends of lanes by the names of `OF_LANES`,
+    and all outputs (lanes, outputs).
 
-    The last two are on the device, and may have more lanes, which do not count.
+    The last two are on the device, and may have additional lanes, which do not count.
     """
 
     lanes: range
@@ -48,9 +49,10 @@ class Lanes:
 
 
 class Runner:
-    """Computes and keeps chunks of one task in this process.
+    """Computes and stores chunks of one task in this process.
 
-    The first block is computed first in every process: it gives the grid of the statistics, and what was compiled for it serves all others.
+    Every process first computes the first block: it gives the grid of the statistics, and its compiled
+    programs serve all others.
     """
 
     def __init__(self, task: Task, store: Store):
@@ -63,13 +65,13 @@ class Runner:
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
             warn(
-                f"the first {task.block} lanes of `{store.path}` come out with other bits here than where the study was begun (another machine, or other "
+                f"the first {task.block} lanes of `{store.path}` have other bits here than where the study began (another machine, or other "
                 "versions); results are right, but not bit-equal to those of one machine"
             )
         self.grid = Grid.from_dict(kept, len(task.outputs))
 
     def run(self, number: int) -> tuple[int, int]:
-        """Compute and keep a chunk; how many lanes it has, and how many of them failed."""
+        """Compute and store a chunk. Return the number of its lanes and of the failed ones."""
         first, last = self.store.span(number)
         kept, tallies = [], []
         for number_of_block in range(first // self.task.block, -(-last // self.task.block)):
@@ -116,9 +118,10 @@ def _rows(array, index):
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
-    """The task with blocks of the size with which its folder was begun, and otherwise of a size that keeps a process below `allowed` bytes; its chunk.
+    """Return the task and its chunk, with blocks of the size used in its folder, or else of a size that keeps
+    a process below `allowed` bytes.
 
-    `here`: whether this process computes. ValueError where blocks or chunks would need more.
+    `here`: whether this process computes. Raises ValueError where blocks or chunks would need more.
     """
     begun = Store(path) if Store.is_taken(path) else None
     if begun:
@@ -135,13 +138,15 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
             chunk = min(_chunk(task, None), max(unit, most // unit * unit))
     lanes = begun.chunk if begun else _chunk(task, chunk)
     if (need := memory.BLOCKS * task.block * task.bytes_of_lane + memory.CHUNKS * lanes * task.bytes_of_kept_lane) > room:
-        text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB, and `memory` leaves {room / 1e6:.0f} MB to each process"
-        raise ValueError(f"{text}: give more, fewer processes, a smaller `chunk`, fewer times `ts`, or trajectories of fewer lanes by `keep_every`")
+        text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB"
+        text += f", but `memory` leaves only {room / 1e6:.0f} MB for each process"
+        raise ValueError(f"{text}; give more memory, fewer processes, a smaller `chunk`, fewer times `ts`, "
+            "or a larger `keep_every`")
     return replace(task, memory=allowed), chunk
 
 
 def opened(task: Task, path, chunk: int | None, command: str) -> Store:
-    """The folder of the task: a new one, or the one that holds it already; ValueError where it holds another study."""
+    """Open the folder of the task, new or existing. Raises ValueError where it holds another study."""
     columns = task.columns()
     if Store.is_taken(path):
         store = Store(path)
@@ -161,12 +166,15 @@ def _constants(task: Task) -> dict[str, tuple]:
 
 
 def _chunk(task: Task, chunk: int | None) -> int:
-    """Lanes of a chunk: whole blocks, whole strides of saved lanes; by default about a thousandth of all."""
+    """Return the lanes of a chunk: whole blocks and whole strides of saved lanes, by default about a
+    thousandth of all.
+    """
     unit = np.lcm(task.block, task.stride)
     if chunk is None:
         return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
-        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are computed together in this study")
+        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so "
+            "many are computed together in this study")
     return int(chunk)
 
 
@@ -202,7 +210,9 @@ def attributes(task: Task) -> dict:
 
 
 def _as_text(x) -> object:
-    """Numbers as they are, other options as they show themselves, without the places in memory of functions, which are others in every process."""
+    """Return the options as text, except numbers, without memory addresses of functions, which differ in
+    every process.
+    """
     return np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
 
 
@@ -212,17 +222,21 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     if other:
         was, now = store.attributes, json.loads(json.dumps(attributes(task)))
         what = ", ".join(_difference(name, was, now) for name in other)
-        raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new name, or ask for the same")
+        raise ValueError(f"`{store.path}` holds another study; different are: {what}; give a new folder, or "
+            "the arguments of that study")
     if chunk is not None and chunk != store.chunk:
-        raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
+        raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is "
+            f"{chunk}; omit `chunk`")
     now = versions()
     changed = [f"{name} {held} (now {now[name]})" for name, held in store.study["versions"].items() if now.get(name) != held]
     if changed:
-        warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits")
+        warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; new results may differ from the stored ones in their last digits")
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
-    """A part of a study that differs; of a scene, its options or its start with the names of what differs in it."""
+    """Name a part of a study that differs; for a scene, its options or its start, with the names of what
+    differs.
+    """
     kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part)
     if kept is None:
         return part
@@ -254,10 +268,10 @@ def _interruptions() -> Iterator[Callable[[], bool]]:
 
 
 def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int, int], command: str, workers: Callable) -> Store:
-    """Compute what is missing of a task in the folder `path`.
+    """Compute the missing part of a task in the folder `path`.
 
-    `shard`: (k, n), the chunks whose number is k - 1 modulo n; `workers`: (store, numbers, interrupted) -> numbers of lanes and of failed lanes, chunk by
-    chunk.
+    `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
+    numbers of lanes and of failed lanes, chunk by chunk.
     """
     store = opened(task, path, chunk, command)
     with store.lock():
@@ -279,7 +293,8 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
             Runner(task, store)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
-            raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same call goes on from there")
+            raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same "
+                "call continues from there")
     return store
 
 

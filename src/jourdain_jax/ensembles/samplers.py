@@ -29,14 +29,16 @@ _STEPS = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
 
 
 def _mixed(x):
-    """Words whose bits each depend on all bits of x (splitmix64; Steele, Lea and Flood 2014)."""
+    """Mix the bits of x, so that each bit of the result depends on all of them (splitmix64; Steele, Lea and
+    Flood 2014).
+    """
     x = (x ^ (x >> np.uint64(30))) * _M1
     x = (x ^ (x >> np.uint64(27))) * _M2
     return x ^ (x >> np.uint64(31))
 
 
 def _philox(counter, key: int):
-    """The four words of Philox 4x64-10 for each of the counters, whose upper words are 0."""
+    """Return the four words of Philox 4x64-10 for each of the counters, whose upper words are 0."""
     zero = counter ^ counter
     a, b, c, d = counter, zero, zero, zero
     for turn in range(10):
@@ -46,7 +48,9 @@ def _philox(counter, key: int):
 
 
 def random(seed: int, index, variables: int, samples: int):
-    """The samples with these numbers, independent of each other, shape (len(index), variables): the middles of 2^53 cells."""
+    """Return independent samples with these indices, shape (len(index), variables): the middles of 2^53
+    cells.
+    """
     groups = -(-variables // 4)  # one step of the counter gives four words
     if isinstance(index, jax.Array):
         words = [word for group in range(groups) for word in _philox((index * groups + (1 + group)).astype(np.uint64), seed)]
@@ -95,7 +99,9 @@ def latin_hypercube(seed: int, index, variables: int, samples: int):
 
 @lru_cache(maxsize=16)
 def _directions(seed: int, variables: int, bits: int) -> np.ndarray:
-    """The words of a scrambled Sobol sequence: of its first point, and what each of so many bits of the Gray code of k adds to them."""
+    """Return the words of a scrambled Sobol sequence: the word of its first point, and the words that the
+    bits of the Gray code of k add to it.
+    """
     engine = qmc.Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
     points = []
     for bit in range(bits + 1):  # the Gray code of 2^b - 1 is 2^(b - 1)

@@ -22,7 +22,9 @@ special = module_on_first_use("scipy.special")
 
 @dataclass(frozen=True, repr=False)
 class SobolIndices(Printed):
-    """Sobol' indices of one output by the quantities that vary; each is known to `value +- half-width` with the stated confidence."""
+    """Sobol' indices of one output by the varying quantities; each lies in `value +- half-width` with the
+    stated confidence.
+    """
 
     names: tuple[str, ...]
     first: np.ndarray  # (quantities,)
@@ -36,34 +38,40 @@ class SobolIndices(Printed):
     def _text(self) -> str:
         width = max(map(len, self.names))
         note = f"; {self.left_out} groups with a sample that has no value are left out" if self.left_out else ""
-        lines = [f"Sobol' indices from {self.groups} groups of samples, with limits of {100 * self.confidence:g} %{note}"]
+        lines = [f"Sobol' indices from {self.groups} groups of samples, with limits of "
+            f"{100 * self.confidence:g} %{note}"]
         lines.append(f"  {'':<{width}} {'first order':>22} {'total':>22}")
         rows = zip(self.names, self.first, self.first_half_width, self.total, self.total_half_width, strict=True)
-        lines += [f"  {name:<{width}} {f'{s:.4f} +- {ds:.4f}':>22} {f'{st:.4f} +- {dst:.4f}':>22}" for name, s, ds, st, dst in rows]
+        lines += [f"  {name:<{width}} {f'{s:.4f} +- {ds:.4f}':>22} "
+            f"{f'{st:.4f} +- {dst:.4f}':>22}" for name, s, ds, st, dst in rows]
         return "\n".join(lines)
 
 
 def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> SobolIndices:
-    """Sobol' indices of a quantity from its `values` on a design with sampler "saltelli", whose variables are called `names`.
+    """Return Sobol' indices of a quantity from its `values` on a design with sampler "saltelli", whose
+    variables are called `names`.
 
         design = jj.Design({"a": jj.Uniform(-1.0, 1.0), "b": jj.Uniform(0.0, 1.0)}, sampler="saltelli", samples=4 * 1024)
         at = design.values()
         print(jj.sobol_indices(at["a"] + at["b"] ** 2, design.names))
 
-    `confidence`: with which each interval is to hold. Groups in which some value is not finite are left out, and counted; where these are not few and random,
-    indices are of what is left. Raises ValueError where the number of values is no multiple of variables + 2, or nothing varies.
+    `confidence`: that of each interval. Groups with a value that is not finite are omitted and counted; if
+    these are many or not random, the indices describe only the rest. Raises ValueError where the number of
+    values is no multiple of variables + 2, or nothing varies.
     """
     values, names = np.asarray(values, float), tuple(names)
     group = len(names) + 2
     if values.ndim != 1 or values.size % group or not values.size:
-        raise ValueError(f"there are {values.size} values, expected a multiple of {group}: of a design of {len(names)} variables with sampler='saltelli'")
+        raise ValueError(f"there are {values.size} values, expected a multiple of {group}: of a design of "
+            f"{len(names)} variables with sampler='saltelli'")
     if not 0 < confidence < 1:
         raise ValueError(f"`confidence` is {confidence}, expected a number between 0 and 1")
     groups = values.reshape(-1, group)
     sound = np.isfinite(groups).all(axis=1)
     groups = groups[sound]
     if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # those whose variance is divided by
-        raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' indices need a quantity that varies")
+        raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' "
+            "indices need a quantity that varies")
     generator = np.random.default_rng(0)
     drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(200)])
     half = special.ndtri(0.5 + confidence / 2) * drawn.std(axis=0, ddof=1)

@@ -29,7 +29,9 @@ CELLS = 4096
 
 @dataclass(frozen=True)
 class Grid:
-    """Where values are counted: `CELLS` equal cells from `low` to `high`, and the `centre` of sums, for every output."""
+    """The grid of the histograms: `CELLS` equal cells from `low` to `high`, and the `centre` of sums, for
+    every output.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -57,10 +59,13 @@ class Grid:
 
     @classmethod
     def from_dict(cls, found: dict, outputs: int) -> "Grid":
-        """The grid that `as_dict` wrote, of so many outputs; ValueError where its numbers are not finite, or not in order."""
+        """Return the grid that `as_dict` wrote, for this number of `outputs`. Raises ValueError where its
+        numbers are not finite or not in order.
+        """
         low, high, centre = numbers = [np.array(found[name], float) for name in ("low", "high", "centre")]
         if any(x.shape != (outputs,) or not np.isfinite(x).all() for x in numbers) or np.any((centre < low) | (centre > high)):
-            raise ValueError(f"the grid of the statistics is {found}, expected finite numbers in order, one each for {outputs} outputs")
+            raise ValueError(f"the grid of the statistics is {found}, expected finite numbers in order, one "
+                f"each for {outputs} outputs")
         return cls(low, high, centre)
 
 
@@ -78,7 +83,9 @@ class Tally:
 
     @classmethod
     def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
-        """The tally of a block of `lanes`, by how they ended and their values (lanes, outputs); what follows them in the arrays does not count."""
+        """Return the tally of the first `lanes` of a block, from their results and their values (lanes,
+        outputs).
+        """
         with jax.enable_x64(True):
             counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
         failed = np.zeros(0, np.int64)
@@ -108,7 +115,9 @@ class Tally:
 
     @classmethod
     def checked(cls, arrays: Mapping[str, np.ndarray], lanes: range, outputs: int) -> "Tally":
-        """The tally of some `lanes` that these arrays hold; ValueError where their numbers are out of their ranges."""
+        """Return the tally in these arrays of some `lanes`. Raises ValueError where its numbers are out of
+        their ranges.
+        """
         codes, again, steps, failed, sums, (place, counts), extremes = (arrays[name] for name in cls.__dataclass_fields__)
         shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
         numbers = codes.sum() == len(lanes) and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
@@ -120,7 +129,9 @@ class Tally:
 
 @jax.jit
 def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
-    """The fields of a tally of the first so many lanes but its failed ones; `cells`: lanes in all cells."""
+    """Return the fields of a tally of the first `lanes` lanes without failed ones; `cells`: lanes in all
+    cells.
+    """
     counts = jnp.arange(len(values)) < lanes
     values, finite = values.astype(float), jnp.isfinite(values) & counts[:, None]
     x, m = jnp.where(finite, values - centre, 0.0), finite.astype(float)
@@ -159,7 +170,9 @@ class Statistics:
         return np.sqrt(np.diag(self.covariance))
 
     def histogram(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Lanes per cell of the output `name`, and the edges of the cells; lanes beyond the grid are in cells that reach to the extremes."""
+        """Return lanes per cell of the output `name`, and the edges of the cells. Lanes beyond the grid are
+        in outer cells that extend to the extremes.
+        """
         i = self.names.index(name)
         counts, (least, largest) = self.counts[i], self.extremes[:, i]
         first, last = int(not counts[0]), len(counts) - int(not counts[-1])
@@ -167,7 +180,9 @@ class Statistics:
         return counts[first:last], edges[first : last + 1]
 
     def quantile(self, name: str, level: float) -> tuple[float, float]:
-        """Two numbers between which the quantile `level` (0 to 1) of the output `name` lies: of the n values, the one with number ceil(level n)."""
+        """Return two bounds of the quantile `level` (0 to 1) of the output `name`, which is number ceil(level
+        n) of the n sorted values.
+        """
         counts, edges = self.histogram(name)
         i, total = self.names.index(name), counts.sum()
         if total == 0:

@@ -41,7 +41,9 @@ _MANIFEST, _GRID = "run/manifest.json", "run/grid.json"
 
 @dataclass(frozen=True)
 class Column:
-    """One array of a study: its type, axes after the first (name, length), what stands for nothing, attributes. `every`: of which lanes it is kept."""
+    """One array of a study: its type, its axes after the first (name, length), its value for missing entries,
+    and attributes. `every`: it has one lane in this many.
+    """
 
     dtype: str
     fill: float | int
@@ -66,7 +68,8 @@ class Receipt:
         return self.last - self.first, self.tally.failed.size
 
     def packed(self) -> bytes:
-        """Bytes: a first line, a line of JSON that says what follows, the arrays, and the CRC-32C of all that."""
+        """Return bytes: a first line, a line of JSON that describes the rest, the arrays, and the CRC-32C of
+        all of it."""
         arrays = vars(self.tally) | {"cells": self.tally.cells.astype(np.int32)}
         listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
         head = vars(self) | {"checksums": dict(self.checksums), "arrays": listed}
@@ -75,7 +78,9 @@ class Receipt:
 
     @staticmethod
     def unpacked(content: bytes, outputs: int) -> "Receipt":
-        """The receipt in these bytes, of a study with so many outputs; ValueError, or another error of what reads it, where they are torn."""
+        """Return the receipt in these bytes, for a study with this number of `outputs`. Raises ValueError, or
+        another error of the reader, where they are damaged.
+        """
         if not content.startswith(_BEGIN) or content != _ended(content[:-4]):
             raise ValueError("the receipt of a chunk is torn")
         end = content.index(b"\n", len(_BEGIN))
@@ -104,7 +109,8 @@ class Store:
 
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
-        """A new folder, whole or absent; an existing one is not touched. `constants`: name -> axis, values, attributes."""
+        """Create a folder, whole or not at all; an existing one is not changed. `constants`: name -> axis,
+        values, attributes."""
         zarr = needed("zarr", "storing a study", "studies")
         path = Path(path)
         if fault := _beyond(study):
@@ -165,7 +171,9 @@ class Store:
         return found
 
     def _read_manifest(self) -> dict[str, str]:
-        """The digests of files that are written once, by name; every file but the grid, which can be found again, is there and has its digest."""
+        """Return the digests of the files that are written once, by name, after a check that each file exists
+        and matches. The grid is excepted, since it can be computed again.
+        """
         found = self._json(_MANIFEST)
         digests = found.get("digests")
         if not isinstance(digests, dict) or found.get("digest") != _digest_of(digests):
@@ -187,7 +195,8 @@ class Store:
         return read_bytes(self.path / name, 100_000_000, "the folder of a study with all its files")
 
     def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
-        return ValueError(f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move the folder away and run it anew")
+        return ValueError(f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move "
+            "the folder away and run it anew")
 
     @property
     def attributes(self) -> dict:
@@ -219,7 +228,9 @@ class Store:
         return number * self.chunk, min((number + 1) * self.chunk, self.lanes)
 
     def _file(self, name: str, number: int) -> Path:
-        """The file of a chunk: of an array with more axes than that of lanes, which are not cut, every chunk has a folder of its own."""
+        """Return the file of a chunk. An array with several axes has one folder for every chunk, since only
+        the axis of lanes is divided.
+        """
         return (self.path / name / "c" / str(number)).joinpath(*["0"] * len(self.columns[name].more))
 
     def _write(self, name: str, number: int, content: bytes) -> None:
@@ -259,7 +270,8 @@ class Store:
             write_whole(self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed())
 
     def receipt(self, number: int) -> Receipt | None:
-        """The receipt of a chunk; None where there is none, or it is torn, or of another chunk, study or grid."""
+        """Return the receipt of a chunk; None if there is none, if it is damaged, or if it belongs to another
+        chunk, study or grid."""
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
             own = [self.identity, self._digests.get(_GRID, found.of[-1])]
@@ -272,15 +284,16 @@ class Store:
         try:
             names = os.listdir(self.path / "run" / "chunks")
         except OSError as error:
-            raise ValueError(f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was moved or removed") from None
+            raise ValueError(f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was "
+                "moved or removed") from None
         return sorted(int(name) for name in names if name.isdecimal() and name == str(int(name)) and int(name) < self.chunks)
 
     def is_whole(self, number: int) -> bool:
-        """Whether a chunk has its receipt and all its arrays, and all of them are as they were written."""
+        """Return whether a chunk has its receipt and all its arrays, unchanged."""
         return self._wrong(number) is None
 
     def _wrong(self, number: int) -> str | None:
-        """An array of a chunk whose file has not the length or the checksum of its receipt."""
+        """Return an array of a chunk whose file differs in length or checksum from its receipt."""
         receipt = self.receipt(number)
         for name, column in self.columns.items():
             size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
@@ -302,7 +315,8 @@ class Store:
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
-        """Numbers of the chunks that are whole, and of those that have a receipt and are not; the receipts of the latter are removed."""
+        """Return the indices of intact chunks, and of those that have a receipt but are damaged; the receipts
+        of the latter are removed."""
         receipts = self.receipts()
         whole = [number for number in receipts if self.is_whole(number)]
         torn = sorted(set(receipts) - set(whole))
@@ -311,7 +325,8 @@ class Store:
         return whole, torn
 
     def read_grid(self) -> dict | None:
-        """What `write_grid` kept; None where nothing was, or it is damaged (it is then found again)."""
+        """Return the content that `write_grid` stored; None if there is none or if it is damaged (it is then
+        computed again)."""
         self._digests = self._read_manifest()
         with contextlib.suppress(ValueError, OSError):
             content = self._read(_GRID)
@@ -336,7 +351,7 @@ class Store:
 
 
 def _beyond(study: Mapping) -> str:
-    """Which number of a study is out of its range, and the range; nothing where none is."""
+    """Return the number of a study that is out of its range, with the range; nothing if all are within."""
     for name, most in {"samples": MOST_SAMPLES, "chunk": MOST_LANES, "block": MOST_LANES}.items():
         value = study.get(name)
         if type(value) is not int or not 1 <= value <= most:

@@ -48,17 +48,19 @@ class TaskFields(MotionFields, total=False):
 class Study(Printed):
     """Many motions of one scene with varying parameters or start values.
 
-    - `scene`; `vary`: parameter -> how it varies; `start`: coordinate or speed -> how it varies, or one number for all lanes (the rest is solved for, as by
-      `jj.start`; default: the scene's example). How: a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of a grid, or
-      a list with one number per lane; all of one kind.
-    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Lane k follows from the seed and k alone.
+    - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
+      number for all lanes (the rest is solved for, as by `jj.start`; default: the scene's example). A
+      variation is a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of
+      a grid, or a list with one number per lane; all must be of one kind.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Lane k follows from the seed and k
+      alone.
 
         disc = jj.models.TiltingDisc()
         study = jj.Study(disc, vary={"radius": jj.Normal(0.5, 0.01)}, start={"lean": jj.Uniform(-0.6, 0.6), "spin_rate": -3.0}, sampler="sobol", samples=1024)
         result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.End("lean", "rad"), "fallen": jj.Happened("fallen")})
         print(result)
 
-    Raises ValueError for unknown names and for what cannot vary. Needs the extra `studies`.
+    Raises ValueError for unknown names and for quantities that cannot vary. Needs the extra `studies`.
     """
 
     scene: Any  # a scene, or a model, of which the scene is kept
@@ -82,29 +84,34 @@ class Study(Printed):
         object.__setattr__(self, "design", Design(varying, self.sampler, self.samples, self.seed, pairs or None))
 
     def _named(self) -> tuple[dict, dict]:
-        """What varies, by the names of its columns, and the start values that do not."""
+        """Return the varying quantities by the names of their columns, and the constant start values."""
         examples = {"vary": '{"mass": jj.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
         for what, example in examples.items():
             if (given := getattr(self, what)) is not None and not isinstance(given, Mapping):
-                raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as {example}")
+                raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as "
+                    f"{example}")
         known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
         varying = {}
         for name, how in (self.vary or {}).items():
             check_name(name, known, f"scene `{type(self.scene).__name__}` has no parameter `{name}`")
             if known[name]:
-                raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a parameter from which the scene makes that array")
+                raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a "
+                    "parameter from which the scene makes that array")
             if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
-                raise ValueError(f"parameter `{name}` is to vary as {described(how)}; set one value on the scene itself, or give a distribution")
+                raise ValueError(f"parameter `{name}` is to vary as {described(how)}; set one value on the "
+                    "scene itself, or give a distribution")
             varying[name] = how
         q, u = self.scene.coordinate_names, self.scene.speed_names
         groups = {group for names in (q, u) for group, _, _ in names.groups}
         constants = {}
         for name, how in (self.scene.example if self.start is None else self.start).items():
-            check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with")
+            check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed "
+                f"`{name}` to start with")
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
                 constants[name] = checked_real(how, f"start `{name}`", advice="give its value") if has_unit(how) else how
             elif name in groups:
-                raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its entries")
+                raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its "
+                    "entries")
             else:
                 varying[name + AT_START] = how
         return varying, constants
@@ -122,11 +129,13 @@ class Study(Printed):
         options=None,
         **by_name,
     ) -> Task:
-        """All that decides the numbers of a run. Arguments are those of `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`,
-        `by_name`."""
+        """Return a description of all that determines the results of a run. Arguments are those of `run`:
+        `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`, `by_name`.
+        """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
-            keep_every = checked_whole(keep_every, "`keep_every`", 1, expected="of at least 1, or None: trajectories of no lane are kept")
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, expected="of at least 1, or None: "
+                "trajectories of no lane are kept")
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
             options = replace(options, formulation=None)  # as for the scene by itself: a study may go on with other memory
@@ -135,8 +144,8 @@ class Study(Printed):
         if ts is None and keep_every is None and not any(output.over_times for output in known.values()):
             times = last[None]
         if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
-            text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
-            raise ValueError(f"{text}; let `ts` begin where the motion does")
+            text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would omit the time between"
+            raise ValueError(f"{text}; begin `ts` at the start of the motion")
         span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
         return Task(self.scene, self.design, self._constants, known, span, options, save, keep_every)
 
@@ -155,39 +164,47 @@ class Study(Printed):
         """Compute the missing part of the study in the folder `path`, which is created if necessary, and open
         it.
 
-        The same call on the same folder goes on where an earlier one ended, in whatever way it ended. Results are bit-equal over `chunk`, order and
-        interruptions.
+        The same call on the same folder continues an earlier one, however that ended. Results are bit-equal
+        for all `chunk` sizes, orders and interruptions.
 
-        - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) that outputs look at (default: 201 even ones; the end alone where
-          all outputs look at the end).
-        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`, `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a
-          function of a trajectory; default: the end values of all coordinates and speeds. NaN where a motion failed.
-        - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "statistics": counts, sums and histograms alone, and of
-          single lanes what `keep_every` says.
-        - `keep_every`: 1000: states at `ts` of one in a thousand lanes, those whose numbers are multiples of it, and with save="statistics" all else
-          of these lanes; 1: of all lanes; None: of none.
-        - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.
-        - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
-          `if __name__ == "__main__":`, and outputs that are no functions within functions.
-        - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
-        - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
-        - `progress`: a bar; `command`: text that is kept with the study.
-        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to `keep_every` above, are the `what` of the signature.
+        - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
+          are evaluated (default: 201 even ones; if all outputs use the end only, the end).
+        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`,
+          `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a trajectory; default: the end values
+          of all coordinates and speeds. They are NaN where a motion failed.
+        - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every lane;
+          "statistics" stores counts, sums and histograms only.
+        - `keep_every`: 1000 also stores the states at `ts` of every thousandth lane (with save="statistics"
+          its other results, too); 1: of all lanes; None: of none.
+        - `chunk`: lanes that are stored together (default: about a thousandth of all); after a crash at most
+          one chunk is computed again.
+        - `processes`: the number of computing processes, each with its share of the cores. More than one need
+          a script whose top level is guarded by `if __name__ == "__main__":`, and outputs that are no
+          functions within functions.
+        - `client`: a `dask.distributed.Client` whose workers compute, one chunk at a time each; all of them
+          must reach the folder.
+        - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
+          machines; `jj.merge_studies` combines them.
+        - `progress`: a bar; `command`: text that is stored with the study.
+        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to
+          `keep_every` above, are the `what` of the signature.
 
-        Where the scene is a model, `jj.build(scene, memory="2GB")`, that is what the processes of this machine that compute may hold together, the present
-        one with all that is in it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means
-        and covariances of studies with other blocks differ in their last digits.
+        If the scene is a model, `jj.build(scene, memory="2GB")`, its memory is the bound for all computing
+        processes of this machine together, including the present one; with `client`, for each worker. Blocks
+        and chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies
+        with other blocks differ in their last digits.
 
-        Raises ValueError where the folder holds another study or the memory is too little, MemoryError where it turned out to be, `InUseError` where another
-        process runs it, OSError where it cannot be written.
-        Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
+        Raises ValueError where the folder holds another study or the memory is too small, MemoryError where
+        it was exceeded, `InUseError` where another process runs the study, OSError where the folder cannot be
+        written. On Ctrl-C the current chunk ends, all results are kept, and KeyboardInterrupt is raised.
         """
         task = self.task(**what)
         if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
         checked_whole(processes, "`processes`", 1, expected="of at least 1")
         if client is not None and processes != 1:
-            raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
+            raise ValueError("`client` and `processes` are both given; give one of them: the workers of a "
+                "cluster, or processes of this machine")
         here = client is None and processes == 1
         memory = self._given.memory if isinstance(self._given, Model) else None
         task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
@@ -199,9 +216,9 @@ class Study(Printed):
         """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
         and to shared `parameters`.
 
-        They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
-        end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. This process computes it; nothing is
-        stored.
+        They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward
+        mode, for the samples of this study. Where lanes end at events, a `SensitivityWarning` (also in
+        `warnings` of the result) names the missing part. This process computes them; nothing is stored.
 
         - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 

@@ -77,7 +77,9 @@ class Task:
         return np.asarray(self.span["ts"])
 
     def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
-        """Start values, those that all lanes share among them, and parameters, from the columns of the design by name."""
+        """Return start values (with those that all lanes share) and parameters, from the columns of the
+        design by name.
+        """
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
         return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
 
@@ -92,7 +94,9 @@ class Task:
         return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:
-        """The arrays of the store. ValueError where two have one name, or that of an axis or of another file in the store."""
+        """Return the arrays of the store. Raises ValueError where two have one name, or the name of an axis
+        or of another file in the store.
+        """
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
         found: list[tuple[str, Column]] = []
         if self.save == "statistics" and self.keep_every is None:
@@ -117,7 +121,8 @@ class Task:
             found.append((name, Column("float64", math.nan, about, (("time", len(self.ts)),), self.stride)))
         names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are {', '.join(map(repr, names))}: call the output otherwise")
+            raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are "
+                f"{', '.join(map(repr, names))}: give the output another name")
         return dict(found)
 
     def identity(self) -> dict[str, str]:

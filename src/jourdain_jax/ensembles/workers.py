@@ -23,7 +23,8 @@ from jourdain_jax.scene.arguments import warn
 
 MOST_DEATHS = 3  # of processes on one chunk, before it is left out
 _NONE_BEGAN = (
-    "no worker of this study could begin, as what it printed says. Each imports the program that was started: run studies in it under "
+    "no worker of this study could begin, as what it printed says. Each imports the program that was "
+    "started: run studies in it under "
     '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
 )
 _runners: dict[tuple, Runner] = {}  # of this process: for the study that it worked on last, in one folder
@@ -31,7 +32,7 @@ _one_at_a_time = threading.Lock()
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
-    """What `run` takes as its workers; ValueError where the task cannot be sent to another process."""
+    """Return the workers of `run`. Raises ValueError where the task cannot be sent to another process."""
     sent = sent_to_others(task)
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
@@ -54,7 +55,9 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
 
 def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
-    """Compute and keep a chunk in this process, one at a time; what a process kept before it died is not computed again."""
+    """Compute and store a chunk in this process, one at a time. Chunks that a process stored before it died
+    are not computed again.
+    """
     with _one_at_a_time:
         which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
         if which not in _runners:
@@ -66,13 +69,15 @@ def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
 
 
 def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
-    """Compute the chunks `numbers`, whatever becomes of the processes that do; chunks on which they die again and again are left out, with a warning.
+    """Compute the chunks `numbers` even if processes die. Chunks on which they die repeatedly are omitted
+    with a warning.
 
-    - `compute(numbers, alone)`: a generator that yields lanes and failed lanes of each chunk, and returns the numbers of those under way when a process died.
-    - `attempts`: how often such a chunk is tried alone, so that no other is suspected.
+    - `compute(numbers, alone)`: a generator that yields lanes and failed lanes of each chunk, and returns the
+      indices of unfinished ones if a process died.
+    - `attempts`: how often such a chunk is tried alone, so that no other chunk can be the cause.
 
-    A process may die within a motion where a user's function calls other code, or where memory runs out. RuntimeError where it is the first block, which
-    every process computes.
+    A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
+    RuntimeError if this happens in the first block, which every process computes.
     """
     waiting, left_out = list(numbers), []
     while waiting and not interrupted():
@@ -91,8 +96,8 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
 
 
 _ADVICE = (
-    "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or simulate these lanes one by one, in a process of "
-    "their own, to see why"
+    "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or "
+    "simulate these lanes one by one, in a process of their own, to see why"
 )
 
 
@@ -110,9 +115,10 @@ def sent_to_others(task: Task) -> bytes:
 
 
 def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
-    """Lanes and failed lanes of chunks as they come, at most `most` of them under way; returns the numbers of those on which a process died.
+    """Yield lanes and failed lanes of chunks as they finish, at most `most` of them at once. Return the
+    indices of those on which a process died.
 
-    `submit(number)`: a future of `concurrent.futures`; `deadly`: the error of one whose process died.
+    `submit(number)`: a future of `concurrent.futures`; `deadly`: the error that reports a dead process.
     """
     left = iter(numbers)
     running: dict[Any, int] = {}
@@ -136,7 +142,9 @@ def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted
 
 
 def _begin(sent: bytes, places, begun) -> None:
-    """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's; `begun`: an event that is set where it can compute."""
+    """Start a worker: bind it to its cores, ignore Ctrl-C (which the parent handles), and end it with its
+    parent; `begun`: an event that is set when it can compute.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if parent := parent_process():
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -146,7 +154,9 @@ def _begin(sent: bytes, places, begun) -> None:
 
 
 def keep_to_share(place: int, count: int) -> None:
-    """Keep this thread, and all that it starts, to the cores of process number `place` of `count`; before JAX begins, for its threads are then one per core."""
+    """Bind this thread, and all that it starts, to the cores of process number `place` of `count`. Call it
+    before JAX begins, which then starts one thread per core.
+    """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
     own = cores[place::count] or cores
     os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
@@ -155,6 +165,8 @@ def keep_to_share(place: int, count: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent, a handle of the operating system, has ended, also where that was before this began."""
+    """End this process when its parent (a handle of the operating system) has ended, even if it ended
+    earlier.
+    """
     connection.wait([parent])
     os._exit(1)

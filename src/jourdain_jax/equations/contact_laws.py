@@ -32,8 +32,8 @@ def solved(
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
-    An unknown whose pivot vanishes is zero, as the force across a plane in which all bodies move; `vanishes`:
-    whether one may.
+    An unknown whose pivot vanishes becomes zero, such as the force across a plane in which all bodies move;
+    `vanishes`: whether a pivot may vanish.
     """
     count, inverses = len(K), []
     rows = [jnp.concatenate([a, b]) for a, b in zip(K, right, strict=True)]
@@ -56,7 +56,7 @@ def solved(
 
 
 class Modes(NamedTuple):
-    """The modes of all contacts as numbers 0 or 1, and the directions of those that slip."""
+    """The modes of all contacts, as numbers 0 or 1, and the directions of slip of those that slip."""
 
     closed: Float[Array, "contacts"]
     rolls: Float[Array, "contacts"]
@@ -79,7 +79,8 @@ def system(
 def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """Return `K^-1 right` of a `system`.
 
-    Tangents come first: then every pivot is positive, unless a slipping contact has no solution (Painleve).
+    Unknowns of tangents are eliminated first. Every pivot is then positive, unless a slipping contact has no
+    solution (Painleve's paradox).
     """
     count = len(K) // 3
     order = [3 * i + k for i in range(count) for k in (1, 2)] + [3 * i for i in range(count)]
@@ -177,7 +178,7 @@ def _improved(
 ) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
     """Return forces and directions of slip after one step of Newton's method.
 
-    Unknowns are P and the angles of the directions e that are to be found: n.w_t = 0 there, n = J e.
+    Unknowns are P and the angles of those directions e that are not known; for these n.w_t = 0, with n = J e.
     """
     (K, s), e = system(law.G, modes, law.friction), modes.direction
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
@@ -296,6 +297,6 @@ def impulse(
 
 
 def _one(G: Float[Array, "3 3"], friction: Scalar) -> Law:
-    """Return the law of one contact at rest whose normal speed is to rise by one."""
+    """Return the law of one contact at rest, whose normal speed must rise by one."""
     b, one, no = jnp.zeros(3, G.dtype).at[0].set(-1.0), jnp.ones(1, G.dtype), jnp.zeros(1, bool)
     return Law(G, b, 0 * one, friction * one, friction * one, ~no, no, no, jnp.zeros((1, 2), G.dtype))

@@ -22,7 +22,7 @@ from jourdain_jax.scene.validated import contacts_of, held_rows_of
 
 
 class ContactRows(eqx.Module):
-    """The rows of all contacts that switch, at one state: three for each of them."""
+    """The rows of all switching contacts at one state, three for each of them."""
 
     gap: Float[Array, "contacts"]
     w: Float[Array, "rows"]

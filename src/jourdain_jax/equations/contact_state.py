@@ -22,10 +22,10 @@ FLAT_BELOW = 1e-8  # the squared sine of the lean of a disc that counts as flat
 
 
 class At:
-    """The contacts that switch at the state of a motion, and how they respond to their forces.
+    """The switching contacts at the state of a motion, and their response to forces.
 
-    `found`: that response, if known. `responses`: all that were computed, here and at later states,
-    each after its coordinates, speeds and inputs.
+    `found`: the response, if it is already known. `responses`: all responses that were computed so far, each
+    stored with its coordinates, speeds and inputs.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
     """Return the Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4,
     up to terms without accelerations; (12)-(14).
 
-    `udot`: accelerations of all speeds, free: they need not obey the rows.
+    `udot`: accelerations of all speeds; they need not satisfy the rows.
     """
     q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     velocity, bias = bias_accelerations(scene, t, q, u)
@@ -56,7 +56,7 @@ def _gradient_and_hessian(f, x):
 class GibbsAppell(eqx.Module):
     """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
 
-    `independent`: indices of the privileged speeds. Not applicable where they do not determine the others.
+    `independent`: indices of the privileged speeds. It does not apply where they do not determine the others.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)

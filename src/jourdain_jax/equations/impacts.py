@@ -50,7 +50,9 @@ class Struck(NamedTuple):
 
 
 def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "contacts"], i: int) -> Struck:
-    """Return the impulses of an impact: by the law of contact i along its impulse, or of all at once."""
+    """Return the impulses of an impact, by the law of contact i along its impulse, or by the law for all
+    contacts at once.
+    """
     e_n = jnp.where(strikes & (-at.restitution * at.w[:, 0] > LEAST_REBOUND), at.restitution, 0.0)
     no, w = jnp.zeros_like(touches), at.found.rows.w
     target, mu = -e_n * at.w[:, 0], at.friction
@@ -70,9 +72,9 @@ def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "cont
 class After:
     """Speeds, modes and directions of slip after the changes of an event of contact i.
 
-    Impulses stop the slip of contacts, or are those of an impact where some strike; then the law at rest
-    decides whether contacts that do not slip open, stick or begin to. Where no solution is found, or an
-    impact would gain energy, the mode of contact i is a negative number that says why.
+    Impulses either stop the slip of contacts or, if a contact strikes, are those of the impact. Then the law
+    at rest decides whether contacts without slip open, stick or begin to slip. If there is no solution, or an
+    impact would gain energy, the mode of contact i is a negative number that gives the reason.
     """
 
     def __init__(self, at: At, i: int, changes: Changes):

@@ -64,7 +64,9 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
-    """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
+    """Return `beta`, `gamma` and `A`, the velocities and residuals themselves, and the motion to which they
+    belong.
+    """
     t, q, u = as_time(t), as_real(q), as_real(u)
 
     def level(u):
@@ -76,7 +78,9 @@ def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityL
 
 
 def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
-    """Velocities and residuals; `a_0`, `alpha_0` and the drift: their derivatives along `(1, qdot, 0)`; and the motion."""
+    """Return velocities and residuals, their derivatives along `(1, qdot, 0)` (`a_0`, `alpha_0` and the
+    drift), and the motion.
+    """
     t, q, u = as_time(t), as_real(q), as_real(u)
     qdot = coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)

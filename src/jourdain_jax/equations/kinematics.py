@@ -46,21 +46,25 @@ def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "c
 
 
 def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coordinates"]:
-    """`N'` of `qdot = N u + nu`, one row for each speed of the scene's own; none where speeds are rates of coordinates, or of quaternions."""
+    """Return `N'` of `qdot = N u + nu`, one row for each of the scene's own speeds; none where speeds are
+    rates of coordinates or of quaternions.
+    """
     if scene.speeds is None:
         return jnp.zeros((0, len(scene.coordinate_names)))
     return jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(jnp.zeros(len(scene.speed_names))).T
 
 
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
-    """Return poses of all bodies (m, inertial frame), sorted by name, the order of dictionaries in JAX."""
+    """Return poses of all bodies (m, inertial frame), sorted by name as in JAX's dictionaries."""
     t, q = as_time(t), as_coordinates(scene, q)
     named = scene.coordinate_names.view(q)
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero), or how they change."""
+    """Return poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the
+    scene's inputs (default: zero), or how they change.
+    """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs(t) if isinstance(inputs, ChangingInputs) else inputs, q.dtype)
     qdot = coordinate_rates(scene, t, q, u)
@@ -72,8 +76,8 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
-    """Return shapes of the values of `look(scene, motion)`, by tracing it without a state: with numbers, JAX
-    would compile each operation.
+    """Return the shapes of the values of `look(scene, motion)`. Only a trace is made, since JAX would compile
+    each operation for numbers.
     """
     numbers = [jax.ShapeDtypeStruct(shape, real_type()) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))]
     return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
@@ -114,7 +118,9 @@ def partial_velocities(scene: Scene, t, q, u) -> Velocities:
 
 
 def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
-    """Velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot, 0)`."""
+    """Return velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot,
+    0)`.
+    """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     qdot = coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: velocities(scene, t, q, u), (t, q), (jnp.ones_like(t), qdot))
@@ -126,8 +132,8 @@ def inertias(scene: Scene, t, q) -> Inertias:
 
 
 def inertias_of(pose: Pose | Motion) -> Inertias:
-    """Return masses and inertias of all bodies, from known poses; inertias are symmetrised, since `w . I w`
-    depends only on that part.
+    """Return masses and inertias of all bodies, from known poses. Inertias are symmetrised, since `w . I w`
+    depends on the symmetric part only.
     """
     bodies = [body.body for body in pose.bodies.values()]
     zero = jnp.zeros((3, 3), pose.q.array.dtype)

@@ -24,7 +24,8 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
     """
     if not speeds_are_rates(as_scene(scene)):
         raise ValueError(
-            f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
+            f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are "
+            "quasi-velocities; use Appell's equations"
         )
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
 

@@ -21,7 +21,7 @@ from jourdain_jax.equations.scaling import row_scale, speed_scale
 
 
 class Change(NamedTuple):
-    """The change, and the matrix that makes it of the residual, which has no derivative."""
+    """A change, and the matrix (without derivative) that computes it from the residual."""
 
     x: Float[Array, "moving"]
     K: Float[Array, "moving rows"]
@@ -37,12 +37,13 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """Return the map of least change in the metric `M` (None: that of the coordinates), within the `free`
-    ones; the identity if `M` is singular.
+    """Return the map that satisfies rows by the least change in the metric `M` (None: that of the
+    coordinates), of `free` entries only; with the identity as metric if `M` is singular.
 
-    `typical`: lengths of the rows, in the scaled speeds where there is a metric, by which one counts as vanishing (default: none does, unless it is zero).
-    Rows count as dependent below `cutoff` (default: `rank_cutoff`). Differentiable in any mode where the rank does not change.
-    `determined`: rows determine what is free, and can be met, so that the first term of the derivative is all of it.
+    `typical`: lengths of the rows, in scaled speeds if there is a metric, relative to which a row counts as
+    vanishing (default: only zero rows do). Rows count as dependent below `cutoff` (default: `rank_cutoff`).
+    Differentiable in any mode where the rank does not change. `determined`: the rows can be satisfied and
+    determine all that is free, so that the derivative has its first term only.
     """
     x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined)
     return Change(x, jax.lax.stop_gradient(K))

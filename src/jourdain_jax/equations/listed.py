@@ -51,8 +51,8 @@ def has_load_without_potential(scene: Scene) -> bool:
 
 @once_per_class
 def names_of_invariants(scene: Scene) -> tuple[str, ...]:
-    """Return names of the invariants that the scene states, sorted. A motion does not need them, so errors
-    are raised on access.
+    """Return the sorted names of the invariants that the scene states. A motion needs none of them, so errors
+    in them are raised only when they are read.
     """
     return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
 

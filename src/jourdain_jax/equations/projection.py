@@ -66,11 +66,11 @@ def project_positions(
     typical=None,
     by: RowFunctions = BY_AUTODIFF,
 ) -> Float[Array, "coordinates"]:
-    """Return coordinates on the geometric constraints, near q; only `free` coordinates move. At most so many
-    `iterations`.
+    """Return coordinates on the geometric constraints, near q, after at most `iterations` corrections; only
+    `free` coordinates move.
 
-    `typical`: lengths of the rows by which one counts as vanishing, from `closure_lengths` (default: none does, unless it is zero).
-    `by`: how rows are evaluated.
+    `typical`: lengths of the rows relative to which a row counts as vanishing, from `closure_lengths`
+    (default: only zero rows do). `by`: the evaluation of the rows.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
@@ -88,7 +88,7 @@ def project_positions(
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
-    """Return the limit of the iteration for unit norms only: `q / |q|` for every quaternion."""
+    """Return the result for unit norms only, which needs no iteration: `q / |q|` for every quaternion."""
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
         squared = wxyz @ wxyz
@@ -114,10 +114,11 @@ def project_speeds(
     """Return speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are
     `free` move.
 
-    Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
-    from `usual_rows` (default: none does, unless it is zero). `affine`: rows are, in the speeds, so that one step is exact; `iterations` do not count then.
-    `determined`: rows are affine and determine all speeds that are `free`, so that no metric is needed; `typical` is then in plain speeds.
-    `by`: how rows and the mass matrix are evaluated.
+    Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled
+    speeds relative to which a row counts as vanishing, from `usual_rows` (default: only zero rows do).
+    `affine`: rows are affine in the speeds, so that one step is exact and `iterations` does not matter.
+    `determined`: rows are affine and determine all `free` speeds, so that no metric is needed; `typical` is
+    then in plain speeds. `by`: the evaluation of rows and mass matrix.
     """
     if not names_of_rows(scene):
         return u

@@ -65,10 +65,10 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
-    """Return the last singular value of the usual rank, which vanishes at a loss of rank; if that rank is
-    unknown, the smallest above the cut-off.
+    """Return the last singular value of the usual rank, which vanishes at a loss of rank. If that rank is
+    unknown, return the smallest value above the cut-off.
 
-    1 if there is none.
+    If there is no such value, return 1.
     """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
@@ -90,18 +90,20 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
 
 
 def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Flag]:
-    """Return `M^-1 f` by Cholesky, and whether M is positive definite; NaN if it is not, so that no invented
-    number passes for a solution.
+    """Return `M^-1 f` by Cholesky, and whether M is positive definite. If it is not, the result is NaN, so
+    that no invented number passes for a solution.
     """
     factor, definite = cholesky(M)
     return jnp.where(definite, jax.scipy.linalg.cho_solve((factor, True), f), jnp.nan), definite
 
 
 class Privileged(Reduction):
-    """Appell's equations in privileged velocities: the speeds `independent` are free, the others follow from the rows.
+    """Appell's equations in privileged velocities: the speeds `independent` are free, and the rows determine
+    the others.
 
-    `zdot = B ydot + b` with `B = -A_z^-1 A_y`; with C from `udot = C yddot + c`, `C' (M (C yddot + c) + h - Q) = 0`.
-    Rows that are dependent everywhere are allowed (A_z of full column rank). Not applicable where A_z is singular.
+    `zdot = B ydot + b` with `B = -A_z^-1 A_y`; with C from `udot = C yddot + c`, `C' (M (C yddot + c) + h -
+    Q) = 0`. Rows may be dependent everywhere (A_z of full column rank). It does not apply where A_z is
+    singular.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)
@@ -157,13 +159,13 @@ class Partition(eqx.Module):
         return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
 
     def signed_pivot(self) -> Scalar:
-        """Return the pivot with the sign of det A_z where A_z is square: a change of sign along a motion
-        means that A_z was singular in between.
+        """Return the pivot with the sign of det A_z if A_z is square. A change of this sign along a motion
+        shows that A_z was singular in between.
         """
         return self.pivot() * self.orientation()
 
     def orientation(self) -> Scalar:
-        """Return the sign of det A_z, 1 where A_z is not square; a number to differentiation."""
+        """Return the sign of det A_z, or 1 where A_z is not square; it has no derivative."""
         square = self.A.shape[0] == len(self.dependent) > 0
         return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
 
@@ -190,8 +192,9 @@ def _by_null_space(problem: ScaledProblem, Z, cutoff: float | None = None):
 class NullSpaceQR(Reduction):
     """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
 
-    Applies wherever `Z'MZ` is positive definite. Independent of the choice of Z: geometrically, `F - m a` is orthogonal to it, (71)-(73).
-    `cutoff`: scaled rows count as dependent below this fraction (default: round-off, `rank_cutoff`).
+    It applies wherever `Z'MZ` is positive definite. The result does not depend on the choice of Z, since `F -
+    m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: scaled rows count as dependent below this
+    fraction (default: round-off, `rank_cutoff`).
     """
 
     cutoff: float | None = eqx.field(static=True, default=None)
@@ -213,7 +216,9 @@ class NullSpaceSVD(Reduction):
 
 
 def _refined(inverse, A, b):
-    """`A+ b` and one step of iterative refinement: an explicit inverse alone loses two digits more."""
+    """Return `A+ b` after one step of iterative refinement, which gains the two digits that an explicit
+    inverse loses.
+    """
     x = inverse @ b
     return x + inverse @ (b - A @ x)
 
@@ -221,7 +226,7 @@ def _refined(inverse, A, b):
 class Multipliers(Reduction):
     """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated where rows are dependent; (68)-(70).
 
-    With `f = Q - h`, `b = -drift`. M may be singular where no admissible velocity is without inertia.
+    With `f = Q - h`, `b = -drift`. M may be singular if every admissible velocity has inertia.
     """
 
     name = "multipliers (KKT)"

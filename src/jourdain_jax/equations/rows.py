@@ -64,19 +64,21 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
         rows[f"{name} slip"] = slip_of(contact, motion)
     for name, value in velocity_constraints_of(scene, motion).items():
         if name in rows:
-            raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every constraint a name of its own")
+            raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every "
+                "constraint a name of its own")
         rows[name] = value
     return rows
 
 
 def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
-    """Return the velocity of a contact's body at its point, beside that of the ground, along both tangents, m/s."""
+    """Return the velocity (m/s) of a contact's body at its point relative to the ground, along both tangents.
+    """
     return contact.plane.tangents @ (motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point))
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
-    """Return rates of named `values` of a pose along the velocities that the motion carries: they can be
-    differentiated by a body's velocity alone.
+    """Return rates of named `values` of a pose along the velocities of the motion. They can be differentiated
+    with respect to the velocity of a single body.
     """
 
     names: list[str] = []
@@ -98,7 +100,9 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """Return one name per scalar row: the given one, with an index where a constraint has several rows."""
+    """Return one name per scalar row: that of its constraint, with an index if the constraint has several
+    rows.
+    """
     names: list[str] = []
     for name, value in rows.items():
         names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]

@@ -37,10 +37,11 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
 
 
 def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
-    """Return one over the length of each row, or over its `typical` length where it is shorter; 1 for a
+    """Return one over the length of each row, or over its `typical` length if it is shorter; 1 for a
     vanishing row without a typical length.
 
-    So a row that shrinks along a motion counts less and less, and not at all once it is round-off of what it typically is.
+    A row that shrinks along a motion therefore counts less and less. It does not count at all once it is only
+    round-off relative to its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
     if typical is not None:

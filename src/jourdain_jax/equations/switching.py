@@ -94,7 +94,7 @@ def contact_changes(at: At) -> dict[str, Event]:
 def _event(
     after: "After", jumps: Flag, mode: Scalar | int, e: Float[Array, "2"], u: Speeds | None = None
 ) -> Event:
-    """Return an event: where speeds jump, all modes come from `after`, otherwise contact i gets `mode`."""
+    """Return an event. If speeds jump, all modes come from `after`; otherwise contact i gets `mode`."""
     at, i, names = after.at, after.i, after.at.scene.switching.contacts
     numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(mode))
     u, e = (
@@ -128,7 +128,7 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
     """Return `u + M^-1 A' T P`, `(T G T + 1 - T) P = -T w`, for contacts in these modes.
 
-    T projects w onto the part that vanishes: the normal part of closed contacts, all slip of rolling ones,
+    T projects w onto the part that must vanish: the normal part of closed contacts, all slip of rolling ones,
     and slip across e of slipping ones.
     """
     found, blocks = at.found, []
@@ -173,6 +173,8 @@ def contacts_at_start(at: At) -> Begun:
 
 
 def _bearing(at: At, i: int) -> Scalar:
-    """Return `1 - mu G_nt.e/G_nn`, the share of the normal response that is left while contact i slips."""
+    """Return `1 - mu G_nt.e/G_nn`, the share of the normal response that friction leaves while contact i
+    slips.
+    """
     own = at.alone(i, at.found.b)
     return 1 - at.friction[i] * (own.G[0, 1:] @ at.modes.direction[i]) / own.G[0, 0]

@@ -60,10 +60,10 @@ class Resultants(eqx.Module):
 def resultants(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
 ) -> Resultants:
-    """Return the sum of the loads per body and per speed; only loads with (`conservative=True`) or without a
-    potential (`False`), or with the numbers `among`.
+    """Return the sum of the loads per body and per speed, for loads with a potential (`conservative=True`),
+    without one (`False`), or with the indices `among`.
 
-    `loads`: of the scene at this motion, where they are known already.
+    `loads`: those of the scene at this motion, if they are already known.
     """
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
@@ -126,7 +126,9 @@ def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[Unconstraine
 
 
 def equations_of(scene: Scene, instant: Instant, loads: tuple[Load, ...] | None = None) -> UnconstrainedEquations:
-    """M, h and Q of the equations without constraint forces, at a known instant; `loads`: as in `resultants`."""
+    """Return M, h and Q of the equations without constraint forces, at a known instant; `loads`: as in
+    `resultants`.
+    """
     partial = instant.by_speeds.bodies
     force, torque = inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
     h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
@@ -140,7 +142,7 @@ def mass_matrix(
     beta: Float[Entries, "*states bodies 3 speeds"],
     gamma: Float[Entries, "*states bodies 3 speeds"],
 ) -> Float[Entries, "*states speeds speeds"]:
-    """`M = sum m beta' beta + gamma' I gamma`, of arrays of JAX or NumPy; also at many states."""
+    """Return `M = sum m beta' beta + gamma' I gamma` for arrays of JAX or NumPy, also at many states."""
     return _summed(beta, mass[..., None, None] * beta) + _summed(gamma, inertia @ gamma)
 
 
@@ -213,7 +215,9 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
-    """Return the modes of the contacts that switch, with the directions of slip, which are numbers of the state: zero where none slips or creeps."""
+    """Return the modes of the switching contacts and their directions of slip, which belong to the state. A
+    direction is zero where a contact neither slips nor creeps.
+    """
     names = scene.switching.contacts
     number = jnp.stack([motion.modes[name] for name in names])
     e = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
@@ -222,7 +226,7 @@ def contact_modes(scene: Scene, motion: Motion) -> Modes:
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
-    """Return rates of the directions of slip, 1/s; none where a contact does not slip.
+    """Return rates of the directions of slip, 1/s; zero where a contact does not slip.
 
     de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, and `SLOW` where it creeps
     """
@@ -254,8 +258,8 @@ def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Fl
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:
-    """Return the loads of a scene, and the forces of switching contacts, which depend on them; `found`: the
-    contacts' response, if already known.
+    """Return the loads of a scene, including the forces of switching contacts, which depend on the others;
+    `found`: the contacts' response, if already known.
     """
     own = loads_of(scene, motion)
     if not scene.switching.contacts:
@@ -265,8 +269,8 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
-    """Return all impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the
-    scene's own potential; `loads`: as in `resultants`.
+    """Return all impressed forces, torques in body axes, and forces on the speeds, including `-N' dV/dq` of
+    the scene's own potential; `loads`: as in `resultants`.
     """
     total = resultants(scene, motion, loads=loads)
     orientation = of_bodies(motion, "orientation")
@@ -288,8 +292,9 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
     """Return the residual of Jourdain's variational equation (18): `sum (m a - F) . delta_1 v = delta u . (M
     udot + h - Q)`, in W.
 
-    `udot`: the accelerations; `virtual_velocity`: `delta u`, any, shape (speeds,). `inputs`: values of the scene's inputs (default: zero).
-    Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.
+    `udot`: the accelerations; `virtual_velocity`: any `delta u`, shape (speeds,). `inputs`: values of the
+    scene's inputs (default: zero). The residual is zero for every virtual velocity with `A delta u = 0` if
+    and only if `udot` is the constrained acceleration.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
     udot, virtual_velocity = as_speeds(scene, udot, "udot"), as_speeds(scene, virtual_velocity, "virtual_velocity")

@@ -24,16 +24,20 @@ _KNOWN = {*_FUNCTIONS, *_OF_MANY, "Pow", "Piecewise", "ExprCondPair", "sinc", "e
 
 
 def sympy_package() -> Any:
-    """Return the package `sympy`; if it is missing, an ImportError tells how to install it."""
+    """Return the package `sympy`. Raises ImportError with the command that installs it if it is missing."""
     needed("sympy.physics.mechanics", "a scene from SymPy")
     return needed("sympy", "a scene from SymPy")
 
 
 class Formulas:
-    """Several lists of expressions by name, evaluated together: a function of the values of their symbols."""
+    """Several named lists of expressions that are evaluated together, as a function of the values of their
+    symbols.
+    """
 
     def __init__(self, lists: Mapping[Any, Any], leaves: Sequence[Any]):
-        """The `lists` (or matrices) of expressions in what is called `leaves`. ValueError for a function that JAX does not have."""
+        """Prepare the `lists` (or matrices) of expressions in the symbols `leaves`. Raises ValueError for a
+        function that JAX does not have.
+        """
         sympy = sympy_package()
         self._lengths = {name: len(expressions) for name, expressions in lists.items()}
         flat = [sympy.sympify(e) for expressions in lists.values() for e in expressions]
@@ -59,8 +63,8 @@ class Formulas:
 
 
 def check_functions(expression, leaves) -> None:
-    """Raise a ValueError that names a function in the expression, apart from the `leaves`, that JAX does not
-    have, or that is not real.
+    """Raise ValueError with the name of a function in the expression that JAX lacks or that is not real. The
+    `leaves` are not examined.
     """
     if expression.is_Atom and expression.is_number and not expression.is_extended_real:
         raise ValueError(f"`{expression}` is not a real number; check the expressions that contain it")
@@ -69,7 +73,8 @@ def check_functions(expression, leaves) -> None:
     name = type(expression).__name__
     if name not in _KNOWN:
         raise ValueError(
-            f"the function `{name}` in `{shortened(expression)}` has no counterpart in JAX; write it in elementary functions, or make it an input"
+            f"the function `{name}` in `{shortened(expression)}` has no counterpart in JAX; write it in "
+            "elementary functions, or make it an input"
         )
     for argument in expression.args:
         check_functions(argument, leaves)

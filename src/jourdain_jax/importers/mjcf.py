@@ -37,25 +37,28 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
         jj.simulate(Arm(), {"elbow": 0.3}, t1=1.0)
 
     - `path`: of the file, or its text.
-    - `free`: names of bodies whose place in the frame of their parent is a parameter.
-    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such
-      as "armature" or "equality". With
-      "inertia", moments of inertia that no body has are taken as they are.
+    - `free`: names of bodies whose position in the frame of their parent becomes a parameter.
+    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such as
+      "armature" or "equality". With "inertia", impossible moments of inertia are accepted.
 
-    **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
-    the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors of
-    joints and of sites are inputs, held within `ctrlrange` and their force within `forcerange` where these are limits, as MuJoCo holds them. Fields, as far as
-    they are not zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the mass centre),
-    `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from their mass or
-    density. The pose that the file states is the `example`.
+    **Returns** a class. Hinges and slides are coordinates with their names, a ball joint is a quaternion with
+    its name, and a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints
+    without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo.
+    Motors of joints and of sites are inputs; `ctrlrange` limits the input and `forcerange` its force, as in
+    MuJoCo. Values of the file that are not zero are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in
+    the body's frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`,
+    `<joint>_stiffness` and `gravity` (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms
+    come from their mass or density. The pose of the file is the `example`.
 
     `connect`, `weld` and `joint` of `equality` are geometric rows, which hold exactly: loops are closed as they are in the stated pose.
 
-    Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; those of joints become the `domain`.
+    Geoms are drawn, but their contacts are not read: state rolling in `contacts` of a subclass. Limits of
+    joints do not stop a motion; they become the `domain`.
 
-    **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, moments of inertia that no body has, what is said twice, and
-    whatever changes the motion, or is no part of the format, and is not read, such as `tendon`, `armature`, `frictionloss` or a misspelt attribute,
-    unless `ignore` names it. A warning lists what else is omitted.
+    **Raises** ValueError, with the name, for a file that cannot be read, a moving body without mass,
+    impossible moments of inertia, repeated statements, and everything that changes the motion or does not
+    belong to the format and is not read, such as `tendon`, `armature`, `frictionloss` or a misspelt
+    attribute, unless `ignore` names it. A warning lists other omitted elements.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_labels(free))
@@ -71,7 +74,8 @@ class _Reader:
         self.settings = {"angle": "degree", "eulerseq": "xyz", "inertiafromgeom": "auto", "autolimits": "true"} | dict(self.compiler.given)
         self.unit = 1.0 if self.settings["angle"] == "radian" else math.pi / 180
         if len(self.settings["eulerseq"]) != 3 or set(self.settings["eulerseq"].lower()) - set("xyz"):
-            raise self.compiler.fault("`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters out of x, y, z, X, Y, Z")
+            raise self.compiler.fault("`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters "
+                "out of x, y, z, X, Y, Z")
         self.meshes = {mesh.get("name") or Path(mesh.get("file", "")).stem: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
         self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}  # the body that each is on, and its place there
@@ -100,7 +104,8 @@ class _Reader:
             one, other = (element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2))
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
-                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is not a {'hinge or slide' if follows else 'body'}")
+                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is not a "
+                    f"{'hinge or slide' if follows else 'body'}")
             if element.get("active") == "false":
                 continue
             if follows:
@@ -117,8 +122,8 @@ class _Reader:
             self._body(element, parent, given, frame)
 
     def _held(self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE) -> Iterable[tuple[Element, str | None, Place]]:
-        """Yield the elements of a kind in a body, and in frames in it: each with the class around it, and its
-        frame in that of the body.
+        """Yield the elements of a kind in a body and in its nested frames. Each comes with the class that
+        applies to it and its frame relative to the body.
         """
         for child in holder:
             if child.tag == kind:
@@ -135,7 +140,8 @@ class _Reader:
         joints = tuple(self._joint(element, childclass, name, k) for k, element in enumerate(part.children("joint", "freejoint")))
         if any(joint.kind == "free" for joint in joints):
             if parent is not None or len(joints) > 1:
-                raise self.file.fault(f"{what} has a free joint and {'a parent' if parent else 'others'}; expected it alone, in the world")
+                raise self.file.fault(f"{what} has a free joint and {'a parent' if parent else 'others'}; "
+                    "expected a free joint alone, on a body of the world")
             start = (*zip("xyz", position, strict=True), *zip(_ATTITUDE, matrices_to_quaternions(turn[None])[0], strict=True))
             self.start |= {f"{identifier(joints[0].name)}_{part}": float(x) for part, x in start}  # the stated pose
             position, turn = np.zeros(3), np.eye(3)
@@ -198,7 +204,8 @@ class _Reader:
         if number == 0:
             return None
         if kind not in SIZES:
-            self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give body an `inertial`, or the geom mass="0"')
+            self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give body an '
+                '`inertial`, or the geom mass="0"')
             return None
         position, turn, size = self._solid(given, kind, frame)
         mass = number if word == "mass" else number * volume(kind, size)
@@ -215,7 +222,8 @@ class _Reader:
             position, turn = (ends[:3] + ends[3:]) / 2, onto_axis(along)
             size = np.array([size[0], half] if kind in ("capsule", "cylinder") else [size[0], size[0], half])
         if len(size) < SIZES[kind] or np.any(size[: SIZES[kind]] <= 0):
-            raise given.fault("size", f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above zero for the type `{kind}`")
+            raise given.fault("size", f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above "
+                f"zero for the type `{kind}`")
         return *_within(frame, (position, turn)), size[: SIZES[kind]]
 
     def _looks(self, geoms: list[Geom]) -> tuple[Look, ...]:
@@ -238,15 +246,16 @@ class _Reader:
         return None
 
     def _place(self, given: Part) -> Place:
-        """Return position and rotation from attributes. ValueError for several rotations, or numbers that
-        define none.
+        """Return position and rotation from attributes. Raises ValueError for several rotations, and for
+        numbers that define none.
         """
         position = given.numbers("pos", 3, np.zeros(3))
         stated = [word for word in _TURNS if word in given]
         if not stated:
             return position, np.eye(3)
         if len(stated) > 1:
-            raise self.file.fault(f"{given.what} is turned by {' and by '.join(f'`{word}`' for word in stated)}; expected one of them")
+            raise self.file.fault(f"{given.what} is turned by "
+                f"{' and by '.join(f'`{word}`' for word in stated)}; expected one of them")
         (word,) = stated
         with np.errstate(invalid="ignore"):
             turn = self._turn(word, given.numbers(word, _TURNS[word]))
@@ -255,7 +264,7 @@ class _Reader:
         return position, turn
 
     def _turn(self, word: str, x: np.ndarray) -> Matrix:
-        """Return the rotation that an attribute states by these numbers; NaN where they state none."""
+        """Return the rotation that these numbers of an attribute define; NaN if they define none."""
         if word == "quat":
             return by_quaternion(x)
         if word == "axisangle":
@@ -282,19 +291,24 @@ class _Reader:
                 )
                 link, position, turn = self.sites[site]
                 if link not in heavy:
-                    raise self.file.fault(f"{motor.what} pushes the site `{site}` of {f'body `{link}`' if link else 'the world'}, which has no mass that moves")
+                    raise self.file.fault(f"{motor.what} pushes the site `{site}` of "
+                        f"{f'body `{link}`' if link else 'the world'}, which has no mass that moves")
                 force, moment = np.pad(gear, (0, 6 - len(gear))).reshape(2, 3) @ turn.T
                 gear, push = np.ones(1), Push(link, position, force, moment)
             elif joint not in names:
-                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is not a hinge or slide; {nearest(joint, names)}")
+                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is not a hinge or slide; "
+                    f"{nearest(joint, names)}")
             yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
-        """Return the range of a motor's control or force, where it has one: stated, and not switched off."""
+        """Return the range that limits a motor's control or force; None if it has none or its limits are
+        switched off.
+        """
         low, high = motor.numbers(f"{what}range", 2, [0.0, 0.0])
         limited, inferred = motor.given.get(f"{what}limited", "auto"), self.settings["autolimits"] == "true"
         if (limited == "true" and low >= high) or (limited == "auto" and not inferred and (low, high) != (0.0, 0.0)):
-            raise self.file.fault(f'`{what}range` of {motor.what} and `{what}limited` contradict each other; state low < high and `{what}limited="true"`')
+            raise self.file.fault(f'`{what}range` of {motor.what} and `{what}limited` contradict each other; '
+                f'state low < high and `{what}limited="true"`')
         return (float(low), float(high)) if limited == "true" or (limited == "auto" and low < high) else None
 
 

@@ -15,10 +15,12 @@ _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
 # What elements may hold, the attributes of their classes included; all else is refused by name. Idle is what has to do with contacts, limits, drawing, and how
 # the other engine computes.
 TABLE = {
-    "mujoco": Holds("model", many="compiler option default worldbody asset actuator equality include", listed=_IDLE),
+    "mujoco": Holds("model", many="compiler option default worldbody asset actuator equality "
+        "include", listed=_IDLE),
     "compiler": Holds(
         "angle eulerseq inertiafromgeom meshdir assetdir autolimits",
-        idle="texturedir strippath fusestatic discardvisual usethread saveinertial convexhull exactmeshinertia fitaabb conflict lengthrange",
+        idle="texturedir strippath fusestatic discardvisual usethread saveinertial convexhull "
+            "exactmeshinertia fitaabb conflict lengthrange",
         off={
             "coordinate": "local",
             "boundmass": "0",
@@ -33,25 +35,28 @@ TABLE = {
     "option": Holds(
         "gravity",
         one="flag",
-        idle="timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance o_margin o_solref o_solimp o_friction magnetic "
-        "wind integrator cone jacobian solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations sdf_iterations sdf_initpoints "
-        "sleep_tolerance",
+        idle="timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance "
+            "o_margin o_solref o_solimp o_friction magnetic wind integrator cone jacobian solver iterations "
+            "ls_iterations noslip_iterations ccd_iterations mpr_iterations sdf_iterations sdf_initpoints "
+            "sleep_tolerance",
         off={"density": "0", "viscosity": "0", "actuatorgroupdisable": ""},
     ),
     "include": Holds("file"),
     "flag": Holds(
         "gravity",
-        idle="constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase eulerdamp autoreset nativeccd island multiccd "
-        "energy invdiscrete sleep",
+        idle="constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase "
+            "eulerdamp autoreset nativeccd island multiccd energy invdiscrete sleep",
         off=dict.fromkeys(("spring", "damper", "passive", "actuation", "clampctrl"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
         words={"gravity": ("enable", "disable")},
     ),
-    "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material joint geom site camera light pair equality tendon"),
+    "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material "
+        "joint geom site camera light pair equality tendon"),
     "worldbody": Holds(many="geom body site frame", listed=_IDLE),
     "frame": Holds(f"name childclass {_PLACE}", many="geom body site frame", listed=_IDLE),
     "site": Holds(f"name class {_PLACE}", idle="type size fromto material rgba group user"),
     "asset": Holds(many="mesh", idle="texture material hfield skin model"),
-    "mesh": Holds("name class file scale", idle="content_type vertex normal texcoord face refpos refquat smoothnormal maxhullvert inertia builtin params"),
+    "mesh": Holds("name class file scale", idle="content_type vertex normal texcoord face refpos refquat "
+        "smoothnormal maxhullvert inertia builtin params"),
     "body": Holds(
         f"name childclass {_PLACE}",
         one="inertial",
@@ -97,7 +102,8 @@ class Defaults:
         self._classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for section in file.root.findall("default"):
             if section.get("class", "main") != "main":
-                raise file.fault(f"the outermost `default` is of the class `{section.get('class')}`, expected `main`: put a `default` of that class into it")
+                raise file.fault(f"the outermost `default` is of the class `{section.get('class')}`, "
+                    "expected `main`: put a `default` of that class into it")
             self._read(section, "main", {})
 
     def _read(self, section: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
@@ -110,7 +116,8 @@ class Defaults:
                 self._file.check_text(element, f"`{element.tag}` of the class `{name}`")
                 known[element.tag] = known.get(element.tag, {}) | dict(element.attrib)
             if element.tag in _ACTUATORS:
-                shared = {name: value for name, value in element.attrib.items() if name in f"{motor.read} {motor.idle}".split()}
+                shared = {name: value for name, value in element.attrib.items() if name in f"{motor.read} "
+                    f"{motor.idle}".split()}
                 known["motor"] = known.get("motor", {}) | shared
         self._classes[name] = self._classes.get(name, {}) | known
         for element in section.findall("default"):
@@ -118,12 +125,13 @@ class Defaults:
             if not inner:
                 raise self._file.fault(f"a `default` inside the class `{name}` has no `class`; give it one")
             if inner in self._classes:
-                raise self._file.fault(f"two `default` are of the class `{inner}`; give each a class of its own")
+                raise self._file.fault(f"two `default` are of the class `{inner}`; give each a class of its "
+                    "own")
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> Part:
-        """Return the element with its attributes completed by its class, or else by that of the bodies around
-        it; checked.
+        """Return the checked element. Missing attributes come from its class, or else from the class of the
+        bodies around it.
         """
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
@@ -134,5 +142,5 @@ class Defaults:
 
 
 def all_of(file: XmlFile, path: str) -> Part:
-    """Return all sections at a path as one: of an attribute that several state the last counts."""
+    """Merge all sections at a path into one. If several state an attribute, the last one counts."""
     return Part(file, f"`{path.rpartition('/')[2]}`", None, {name: value for section in file.root.findall(path) for name, value in section.attrib.items()})

@@ -16,8 +16,8 @@ def about(axis: Vector, angle: float) -> Matrix:
 
 
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
-    """Return the rotation of MJCF's `euler`: about successive axes (rad), of the turned frame in lower case,
-    fixed ones in upper case.
+    """Return the rotation of MJCF's `euler`, about successive axes (rad). Lower-case letters are axes of the
+    rotated frame, upper-case letters axes of the fixed one.
     """
     turn = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
@@ -32,7 +32,7 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 
 
 def combined(masses: list[Mass]) -> Mass:
-    """Several masses in one frame as one: mass centre, and inertia by the parallel axes,
+    """Combine several masses in one frame: mass centre, and inertia by the parallel-axis theorem,
 
     I = sum I_i + m_i (d_i.d_i - d_i d_i').
     """
@@ -59,7 +59,8 @@ def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
-    """Principal moments about the middle for a mass of 1 kg; the axis of cylinders and capsules is z."""
+    """Return principal moments about the middle for a mass of 1 kg; the axis of cylinders and capsules is z.
+    """
     if kind in ("sphere", "ellipsoid", "box"):
         squares = np.square(np.broadcast_to(size, 3))
         return (np.sum(squares) - squares) / (3 if kind == "box" else 5)

@@ -14,8 +14,8 @@ _TAKEN = ("t", "array", "slots", "keys")  # by the time and by the container of 
 
 
 def identifier(name: str) -> str:
-    """Return the name as a Python identifier: other characters than letters, digits and underscores become
-    underscores, `left-wheel` is `left_wheel`.
+    """Return the name as a Python identifier: characters other than letters, digits and underscores become
+    underscores, so that `left-wheel` becomes `left_wheel`.
     """
     plain = re.sub(r"\W+", "_", name).strip("_") or "unnamed"
     plain = f"_{plain}" if plain[0].isdigit() else plain
@@ -23,8 +23,8 @@ def identifier(name: str) -> str:
 
 
 def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
-    """Return name -> its identifier, with an underscore at its end if it is `taken`; ValueError if two are
-    equal, or become so.
+    """Return name -> its identifier, with a trailing underscore if it is `taken`. Raises ValueError if two
+    are or become equal.
     """
     found: dict[str, str] = {}
     taken = set(taken)
@@ -35,7 +35,8 @@ def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> d
         if twin == name:
             raise ValueError(f"two {kind}s are called `{name}`; give each a name of its own")
         if twin is not None:
-            raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of them")
+            raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of "
+                "them")
         found[name] = new
     return found
 

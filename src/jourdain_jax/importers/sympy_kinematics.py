@@ -53,8 +53,8 @@ def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
 
 
 def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[MechanicalSystem, Pose | None]:
-    """Return the pose of a body, at SymPy's position (zero if it has none); None if it does not move or has
-    no mass.
+    """Return the pose of a body at SymPy's position (zero if it has none); None if the body does not move or
+    has no mass.
     """
     sympy = sympy_package()
     name = str(getattr(body, "name", body))  # a `Particle` of SymPy 1.12 has its name as its text
@@ -99,8 +99,8 @@ def _in_own_frame(body, name: str, angle: tuple | None):
 
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
-    """Return an angle for a frame without orientation: its orientation, the frame that it turns in, and its
-    turn there.
+    """Return an angle for a frame without orientation, together with its orientation, the frame in which it
+    turns, and its rotation there.
     """
     sympy = sympy_package()
     for parent, velocity in frame._ang_vel_dict.items():
@@ -115,13 +115,14 @@ def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tup
             turn = (sympy.rot_ccw_axis1, sympy.rot_ccw_axis2, sympy.rot_ccw_axis3)[along[0]](angle)
             return system.with_coordinates({angle: rates[along[0]]}), (base * turn, parent, turn)
     raise ValueError(
-        f"frame `{frame.name}` has no orientation in `{system.frame.name}`, nor an angular velocity about one axis of a frame that has; "
-        "orient it by coordinates, such as `orient_axis(parent, parent.y, angle)`"
+        f"frame `{frame.name}` has no orientation in `{system.frame.name}`, nor an angular velocity about "
+        "one axis of a frame that has; orient it by coordinates, such as `orient_axis(parent, parent.y, "
+        "angle)`"
     )
 
 
 def _constant(system: MechanicalSystem, matrix, what: str):
-    """Return the matrix without coordinates, if its value does not depend on them. ValueError if it does."""
+    """Return the matrix without coordinates. Raises ValueError if its value depends on them."""
     sympy = sympy_package()
     matrix = system.resolved(matrix)
     if system.is_constant(matrix):
@@ -130,12 +131,13 @@ def _constant(system: MechanicalSystem, matrix, what: str):
     for sample in sampled(system, {what: matrix, f"{what}, at zero": still}):
         moving, zero = (sample.values[name] for name in (what, f"{what}, at zero"))
         if largest(moving - zero) > _SAME * largest(zero):
-            raise ValueError(f"the {what} changes in time, so the body is not rigid; state it in the frame of the body")
+            raise ValueError(f"the {what} changes in time, so the body is not rigid; state it in the frame "
+                "of the body")
     return still
 
 
 def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
-    """Raise a ValueError where the stated angular velocity is not the rate of the orientation."""
+    """Raise ValueError where the stated angular velocity is not the rate of the orientation."""
     if pose.frame is None:
         return
     name, stated = f"orientation of body `{pose.name}`", f"angular velocity of body `{pose.name}`"
@@ -146,7 +148,8 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
         if largest(omega - sample.values[stated]) > _SAME * (1.0 + largest(omega)):
             raise ValueError(
                 f"frame `{pose.frame.name}` has an angular velocity that disagrees with its orientation; "
-                "check the kinematic equations, or let `orient_axis` and similar methods define the angular velocity"
+                "check the kinematic equations, or let `orient_axis` and similar methods define the angular "
+                "velocity"
             )
 
 

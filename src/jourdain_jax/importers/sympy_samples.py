@@ -18,7 +18,7 @@ _STEP = 1e-6  # of differences
 
 @dataclass(frozen=True)
 class Sample:
-    """One state, and the values and rates of expressions there, by the names of their lists."""
+    """One state, with the values and rates of expressions by the names of their lists."""
 
     leaves: dict[Any, float]
     values: dict[str, Float[np.ndarray, "_"]]
@@ -36,10 +36,11 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
 
 
 def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()) -> list[Sample]:
-    """Return the first random states at which all expressions are finite, with the nearest speeds at which
-    the `rows` vanish, which are affine in them.
+    """Return the first random states at which all expressions are finite. Their speeds are the nearest ones
+    at which the `rows`, which are affine in them, vanish.
 
-    Constants have their numbers where these are given. ValueError, which names a list, where there are too few such states.
+    Constants with given numbers have these. Raises ValueError, with the name of a list, if there are too few
+    such states.
     """
     named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()}
     named[""] = [system.rates[q.diff(system.time)] for q in system.coordinates]
@@ -73,13 +74,14 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
         if len(found) == _STATES:
             return found
     raise ValueError(
-        f"the {worst} has no finite value at {_TRIES - _STATES + 1} of {_TRIES} random states; check its expressions and the values of its constants"
+        f"the {worst} has no finite value at {_TRIES - _STATES + 1} of {_TRIES} random states; check its "
+        "expressions and the values of its constants"
     )
 
 
 def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]) -> Float[np.ndarray, "rows columns"]:
-    """Return `[A b]` of rows A u + b from their `values` at given leaves: the values at rest, and the
-    increments by each speed.
+    """Return `[A b]` of rows A u + b from their `values` at given leaves: the values at rest, and their
+    increments for each speed.
     """
     rest = leaves | dict.fromkeys(speeds, 0.0)
     b = values(rest)
@@ -87,7 +89,7 @@ def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speed
 
 
 def _meeting(both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]) -> dict[Any, float]:
-    """Return the nearest speeds at which the rows vanish; NaN where these have no numbers."""
+    """Return the nearest speeds at which the rows vanish; NaN where the rows are not numbers."""
     u = np.array([leaves[speed] for speed in speeds])
     u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if np.isfinite(both).all() else u * np.nan
     return dict(zip(speeds, map(float, u), strict=True))

@@ -25,7 +25,7 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True)
 class _Expressions:
-    """A system's expressions, and which name of the scene stands for which of their symbols."""
+    """The expressions of a system, and the scene's name for each of their symbols."""
 
     time: Any
     q: tuple[Any, ...]
@@ -36,7 +36,7 @@ class _Expressions:
     formulas: dict[str, Formulas]  # bodies, rates, loads, and geometric and velocity rows
 
     def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Scalar]]:
-        """Return the values of a part; `others`: speeds and inputs, where it depends on these."""
+        """Return the values of a part; `others`: speeds and inputs, if it depends on them."""
         leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
             leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
@@ -92,20 +92,24 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81})
         jj.simulate(Pendulum(), {"q": 0.3}, t1=5.0)
 
-    - `system`: a `KanesMethod` that knows its bodies and loads (its equations need not be formed), a `System`, or a `JointsMethod`, all of
-      `sympy.physics.mechanics`.
-    - `origin`: the point of SymPy that positions count from, at rest or moving (default: the `fixed_point` of a `System`; otherwise it must be given).
+    - `system`: a `KanesMethod` that knows its bodies and loads (its equations need not be formed), a
+      `System`, or a `JointsMethod`, all of `sympy.physics.mechanics`.
+    - `origin`: SymPy's point that is the origin of positions, at rest or moving (default: the `fixed_point`
+      of a `System`; otherwise required).
     - `values`: symbol, or its name, -> number, for every constant in the expressions, in its unit.
     - `name`: of the class.
 
-    **Returns** a class. Its coordinates and speeds have SymPy's names, the speeds are the generalized speeds of SymPy. Constants are fields: parameters with
-    the given `values` as defaults. Functions of time that are neither coordinates nor speeds are inputs. The class can be subclassed, say for `events`.
+    **Returns** a class. Coordinates and speeds have SymPy's names; the speeds are SymPy's generalized speeds.
+    Constants are parameters with the given `values` as defaults. Functions of time that are neither
+    coordinates nor speeds are inputs. The class can be subclassed, for instance to add `events`.
 
-    Velocities that SymPy states apart from positions, such as those of a rolling disc whose contact point is given no place, bring coordinates of their
-    own: `C_x`, `C_y` for the path of the `origin` C, `W_angle` for a frame W with an angular velocity and no orientation.
+    SymPy may state velocities without positions, as for a rolling disc whose contact point has no position.
+    These add coordinates: `C_x`, `C_y` for the path of the `origin` C, `W_angle` for a frame W with an
+    angular velocity and no orientation.
 
-    **Raises** ValueError, by name: a constant without a value, a value for what does not occur, a function that JAX does not have, a system without bodies or
-    kinematic equations, a rate that no equation gives. ImportError without `sympy`.
+    **Raises** ValueError, with the name, for a constant without a value, a value without a constant, a
+    function that JAX does not have, a system without bodies or kinematic equations, and a rate without an
+    equation. Raises ImportError without `sympy`.
 
     **Examples**
 
@@ -165,20 +169,21 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
         "coordinates": coordinates(" ".join(identifiers([str(x.func) for x in system.coordinates], "coordinate").values())),
         "speeds": speeds(" ".join(u_names.values())),
         "inputs": inputs(" ".join(identifiers([str(x.func) for x in unknown], "input").values())),
-        "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions count from {system.origin.name}.",
+        "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions count "
+            f"from {system.origin.name}.",
         "_expressions": expressions,
     }
     parameters = {fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
-    return scene_class(SympyScene, name, f"A scene from SymPy: {', '.join(pose.name for pose in poses)}.", parameters, attributes)
+    return scene_class(SympyScene, name, "A scene from SymPy: "
+        f"{', '.join(pose.name for pose in poses)}.", parameters, attributes)
 
 
 def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str, Any], Any]:
     """Return the loads by kind and place, inertial frame: "weight" (constant, so that it has a potential),
     "force" and "torque" of a body, "generalized" of a speed.
 
-    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by the
-    power that they have by SymPy's velocity of that
-    point or frame: Q_k = F . dv/du_k.
+    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by their
+    power: Q_k = F . dv/du_k, with the velocity that SymPy has for that point or frame.
     """
     sympy = sympy_package()
     found: dict[tuple[str, Any], Any] = {}
@@ -199,7 +204,7 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str
 
 
 def velocity_rows(system: MechanicalSystem) -> list[Any]:
-    """The velocity rows that are not the rates of the geometric ones: SymPy wants both."""
+    """Return the velocity rows that are not the rates of geometric ones; SymPy requires both."""
     rows = [system.resolved(row) for row in system.velocity]
     if not rows or not system.configuration:
         return rows
@@ -216,8 +221,8 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
 
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
-    """Raise a ValueError for a function of time that no kinematic equation gives, where it can be no input: a
-    rate, or one that poses depend on.
+    """Raise ValueError for a function of time that can be neither a coordinate nor an input: no kinematic
+    equation contains it, and it is a rate or poses depend on it.
     """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds
@@ -225,12 +230,14 @@ def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
         raise ValueError(f"`{x}` occurs, but no kinematic equation determines it; {advice}")
     if x in of_poses:
         advice = "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a subclass"
-        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, but is neither a coordinate nor a speed; {advice}")
+        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, but is "
+            f"neither a coordinate nor a speed; {advice}")
 
 
 def _check_values(given: Mapping[str, float], names: set[str]) -> None:
     """Raise a ValueError for constants without a value, and values of nothing."""
     if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
-        raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each constant, by symbol or name")
+        raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each "
+            "constant, by symbol or name")
     check_names(given, sorted(names), "`values` names `{}`, which does not occur in the system")

@@ -52,7 +52,7 @@ class MechanicalSystem:
 
 def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalSystem:
     """Return the parts of a `KanesMethod`, a `JointsMethod` with formed equations, or a `System` of SymPy.
-    ValueError for anything else, and for missing parts.
+    Raises ValueError for anything else, and for missing parts.
     """
     mechanics = sympy_package().physics.mechanics
     system = getattr(system, "method", None) or system  # of a JointsMethod
@@ -62,7 +62,8 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
         read, origin = _of_system, system.fixed_point if origin is None else origin
     else:
         raise ValueError(
-            f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
+            f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of "
+            "sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
         )
     check_kind(
         origin, mechanics.Point, "`origin`",
@@ -76,11 +77,13 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
 
 def _of_kane(kane) -> tuple:
     if kane.bodies is None:
-        raise ValueError("the `KanesMethod` does not know its bodies; give it `bodies=` and `forcelist=`, or call its `kanes_equations(bodies, loads)` first")
+        raise ValueError("the `KanesMethod` does not know its bodies; give it `bodies=` and `forcelist=`, or "
+            "call its `kanes_equations(bodies, loads)` first")
     try:
         rates = kane.kindiffdict()
     except AttributeError:
-        raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, the rates of the coordinates in terms of the speeds") from None
+        raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, the rates of the "
+            "coordinates in terms of the speeds") from None
     velocity = kane._k_nh * kane.u + kane._f_nh if kane._f_nh else ()
     return kane._inertial, rates, kane.forcelist or (), kane.q, kane.u, kane.bodies, kane._f_h, velocity, kane._uaux
 
@@ -89,7 +92,8 @@ def _of_system(system) -> tuple:
     sympy = sympy_package()
     q, kinematic = sympy.Matrix(system.q), sympy.Matrix(system.kdes)
     if len(kinematic) != len(q):
-        raise ValueError(f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; add the missing ones by `add_kdes`")
+        raise ValueError(f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; "
+            "add the missing ones by `add_kdes`")
     qdot = q.diff(sympy.physics.mechanics.dynamicsymbols._t)
     # kinematic = A qdot + b = 0
     solved = -kinematic.jacobian(qdot).LUsolve(kinematic.xreplace(dict.fromkeys(qdot, sympy.S.Zero)))

@@ -51,7 +51,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Link:
-    """One link; several joints act one after the other, none leaves it fixed to its parent."""
+    """One link. Several joints act in sequence; without joints it is fixed to its parent."""
 
     name: str
     parent: str | None  # None: the inertial frame
@@ -75,7 +75,9 @@ class Follower:
 
 @dataclass(frozen=True)
 class Closure:
-    """A point of a link that stays where another one has it in the stated pose; with `turn`, the link does not turn against that one either."""
+    """A point of a link that is held at a point of another link, as in the stated pose; with `turn`, the
+    links do not rotate relative to each other either.
+    """
 
     name: str
     link: str | None  # None: the inertial frame
@@ -86,7 +88,7 @@ class Closure:
 
 @dataclass(frozen=True)
 class Push:
-    """A force at a point of a link, and a torque on it, in its frame."""
+    """A force at a point of a link and a torque on the link, both in its frame."""
 
     link: str
     point: Vector  # m
@@ -96,8 +98,8 @@ class Push:
 
 @dataclass(frozen=True)
 class Motor:
-    """An input that drives a hinge or slide with `gear` times its value, limited first as an input, then as a
-    force.
+    """An input that drives a hinge or slide with `gear` times its value. Limits apply first to the input,
+    then to the force.
     """
 
     name: str

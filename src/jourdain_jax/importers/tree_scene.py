@@ -73,7 +73,8 @@ class TreeScene(Scene):
         for one in self._tree.ties:
             if isinstance(one, Follower):
                 expected = sum(c * moved.get(one.leader, 0.0) ** k for k, c in enumerate(one.coefficients) if c)
-                found[f"{one.joint} follows {one.leader}" if one.leader else f"{one.joint} is held"] = moved[one.joint] - expected
+                found[f"{one.joint} follows {one.leader}" if one.leader else f"{one.joint} is "
+                    "held"] = moved[one.joint] - expected
                 continue
             (R, r), (other_R, other_r), (S, s), (other_S, other_s) = now[one.link], now[one.other], stated[one.link], stated[one.other]
             found[one.name] = r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
@@ -133,7 +134,9 @@ def _array(x) -> Float[Array, "*shape"]:
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
-    """Return the coordinates of a joint, as `coordinates` takes them; without a prefix for the base."""
+    """Return the coordinates of a joint, in the form that `coordinates` accepts; those of the base have no
+    prefix.
+    """
     label = f"{name}_" if joint.name else ""
     if joint.kind == "ball":
         return (quaternion(name),)
@@ -191,14 +194,15 @@ def _mesh(path: str) -> Any:
 
 
 def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
-    """Return the class of scenes of a mechanism. ValueError, which names the `source`, if nothing moves, a
-    moving part has no mass, or moments are impossible.
+    """Return the class of scenes of a mechanism. Raises ValueError, with the `source`, if nothing moves, a
+    moving part has no mass, or moments of inertia are impossible.
 
-    `ignore`: with "inertia" in it, such moments are taken as they are.
+    `ignore`: if it contains "inertia", such moments are accepted.
     """
     moving = tree.moving()
     if not moving:
-        raise ValueError(f'{source}: no joint moves a body; expected at least one moving joint, or a moving base, such as base="free"')
+        raise ValueError(f'{source}: no joint moves a body; expected at least one moving joint, or a moving '
+            'base, such as base="free"')
     _check_masses(tree, source, ignore)
     check_names(tree.free, [link.name for link in tree.links], "`free` names `{}`, which is not a link")
     joints = [joint for link in tree.links for joint in link.joints]
@@ -243,20 +247,22 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
         f"{name}_inertia": parameter(np.diag(inertia) if is_diagonal else inertia, unit="kg m^2", about="about its mass centre, along its axes"),
     }
     if np.any(link.mass.centre):
-        found[f"{name}_mass_centre"] = parameter(link.mass.centre, unit="m", about=f"in the frame of {link.name}")
+        found[f"{name}_mass_centre"] = parameter(link.mass.centre, unit="m", about="in the frame of "
+            f"{link.name}")
     return found
 
 
 def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
-    """Raise a ValueError for a joint that carries no mass, and for impossible moments of inertia; of links
-    fixed to each other together.
+    """Raise ValueError for a joint that carries no mass, and for impossible moments of inertia. Links that
+    are fixed to each other count together.
     """
     heavy: set[str] = set()
     fixed: dict[str | None, list[Mass]] = {link.name: [] if link.mass is None else [link.mass] for link in tree.links} | {None: []}
     for link in reversed(tree.links):
         if link.joints or link.parent is None:
             if fixed[link.name] and "inertia" not in ignore:
-                _check_moments(combined(fixed[link.name]), f"{source}: link `{link.name}`{', with what is fixed to it,' if len(fixed[link.name]) > 1 else ''}")
+                _check_moments(combined(fixed[link.name]), f"{source}: link "
+                    f"`{link.name}`{', with what is fixed to it,' if len(fixed[link.name]) > 1 else ''}")
         else:
             fixed[link.parent] += [Mass(m.mass, link.position + link.turn @ m.centre, link.turn @ m.inertia @ link.turn.T) for m in fixed[link.name]]
         if (link.mass is not None or link.name in heavy) and link.parent is not None:
@@ -274,6 +280,7 @@ def _check_moments(mass: Mass, what: str) -> None:
         raise ValueError(
             f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, "
             "impossible for a body; expected none below zero, and the "
-            f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia, or give "
+            f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, "
+            "units and products of inertia, or give "
             'ignore=("inertia",) to accept them'
         )

@@ -23,7 +23,8 @@ _BASES = ("fixed", "planar", "free")
 _SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")}
 # What elements may hold; all else is refused by name. Elements that are read are idle, or listed, where they move nothing.
 _TABLE = {
-    "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor ros2_control mujoco"),
+    "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor "
+        "ros2_control mujoco"),
     "link": Holds(
         "name",
         one="inertial",
@@ -48,7 +49,8 @@ _TABLE = {
     "child": Holds("link"),
     "origin": Holds("xyz rpy"),
     "axis": Holds("xyz"),
-    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk command_effort current gear_velocity"),
+    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk command_effort "
+        "current gear_velocity"),
     "dynamics": Holds("damping friction"),
     "mimic": Holds("joint multiplier offset"),
 }
@@ -71,26 +73,33 @@ def from_urdf(
                 return {side: jj.disc_contact(pose[f"{side}_wheel"], 0.033, axis="z") for side in ("left", "right")}
 
     - `path`: of the file, or its text.
-    - `base`: how the root link moves: "fixed"; "planar", coordinates `x`, `y` (m) and `heading`; "free", `x`, `y`, `z` and the quaternion `attitude`.
-    - `motors`: names of revolute, continuous or prismatic joints that an input pushes, `<joint>_motor` in N m or N.
-    - `free`: names of links whose place in the frame of their parent is a parameter.
-    - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held: `locked={"thumb": 0.0}`.
-    - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
-    - `ignore`: what may be omitted without a word: names of elements and attributes, "friction", or "text"
-      between elements. With
-      "inertia", moments of inertia that no body has are taken as they are.
+    - `base`: the motion of the root link: "fixed"; "planar", with coordinates `x`, `y` (m) and `heading`;
+      "free", with `x`, `y`, `z` and the quaternion `attitude`.
+    - `motors`: names of revolute, continuous or prismatic joints that get an input, `<joint>_motor` in N m or
+      N.
+    - `free`: names of links whose position in the frame of their parent becomes a parameter.
+    - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held:
+      `locked={"thumb": 0.0}`.
+    - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the
+      file).
+    - `ignore`: names of elements and attributes that may be omitted without a warning, "friction", or "text"
+      between elements. With "inertia", impossible moments of inertia are accepted.
 
-    **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
-    one `<joint>_x`, `_y`, `_heading`; a joint that is called as a coordinate of the base is, such as `x`, is `x_`. Fields, as far as they are not zero in the
-    file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the mass centre), `<joint>_damping` and `gravity`
-    (m/s^2); and of links that `free` names `<link>_origin` (m). Limits of joints stop nothing; they become the `domain`. `mimic` is a geometric row, and
-    counts for nothing on joints that are fixed or locked. Shapes of `visual` are drawn; `collision` is not read: rolling is stated in `contacts` of a subclass.
+    **Returns** a class. A joint is a coordinate with its name; a floating one is `<joint>_x`, `_y`, `_z` and
+    the quaternion `<joint>_attitude`, a planar one `<joint>_x`, `_y`, `_heading`. A joint with the name of a
+    coordinate of the base, such as `x`, becomes `x_`. Values of the file that are not zero are fields:
+    `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the
+    mass centre), `<joint>_damping` and `gravity` (m/s^2), and `<link>_origin` (m) of links in `free`. Limits
+    of joints do not stop a motion; they become the `domain`. `mimic` is a geometric row, without effect on
+    fixed or locked joints. Shapes of `visual` are drawn; `collision` is not read: state rolling in `contacts`
+    of a subclass.
 
-    **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
-    loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a
-    joint with friction, what is said twice; and by its name all that an element of a URDF does not hold: a misspelt attribute, `spring` of `dynamics`,
-    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are omitted,
-    such as `gazebo` and `transmission`.
+    **Raises** ValueError, with the name of the link or joint, for a file that cannot be read, an unknown type
+    of joint, a parent or child that does not exist, a loop, a mass without inertia, impossible moments of
+    inertia (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a joint
+    with friction, and repeated statements; and, with its name, for everything that does not belong to a URDF:
+    a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A warning lists
+    elements without effect on the motion that are omitted, such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
@@ -112,7 +121,8 @@ class _Reader:
             raise file.fault("it has no links")
         for name in self.locked:
             if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in ("hinge", "slide"):
-                raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; {nearest(name, self.joints)}")
+                raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; "
+                    f"{nearest(name, self.joints)}")
 
     def tree(self, base: str, motors: Labels, free: Labels) -> Tree:
         """Return the whole mechanism."""
@@ -120,7 +130,8 @@ class _Reader:
         for name, joint in self.joints.items():
             child, parent = (self._end(joint, which) for which in ("child", "parent"))
             if child in above:
-                raise self.file.fault(f"link `{child}` is the child of joints `{above[child][0]}` and `{name}`; a link has one parent")
+                raise self.file.fault(f"link `{child}` is the child of joints `{above[child][0]}` and "
+                    f"`{name}`; a link has one parent")
             above[child] = name, parent
         roots = [name for name in self.links if name not in above]
         if len(roots) != 1:
@@ -132,7 +143,8 @@ class _Reader:
             links += [self._link(name, joint, parent) for name, (joint, parent) in above.items() if parent == link.name]
         if len(links) < len(self.links):
             lost = next(name for name in self.links if name not in {link.name for link in links})
-            raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops by `geometric_constraints` in a subclass")
+            raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops "
+                "by `geometric_constraints` in a subclass")
         joints = [joint for link in links for joint in link.joints]
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
         check_names(motors, names, "`motors` names `{}`, which is not a joint with one coordinate")
@@ -162,7 +174,8 @@ class _Reader:
         dynamics, limit = joint.child("dynamics"), joint.child("limit")
         damping = dynamics.number("damping", 0.0)
         if dynamics.number("friction", 0.0):
-            self.file.refuse("friction", f"the friction of {joint.what}", "state a smooth torque in `loads` of a subclass")
+            self.file.refuse("friction", f"the friction of {joint.what}", "state a smooth torque in `loads` "
+                "of a subclass")
         if damping < 0:
             raise dynamics.fault("damping", f"{damping:g}, expected a number >= 0")
         low, high = (limit.number(which, 0.0) for which in ("lower", "upper"))
@@ -198,7 +211,8 @@ class _Reader:
         geometry, material = visual.child("geometry"), visual.child("material")
         shapes = [] if geometry.element is None else list(geometry.element)
         if len(shapes) != 1:
-            raise self.file.fault(f"{visual.what} has {'several shapes' if shapes else 'no shape'} in its `geometry`, expected one")
+            raise self.file.fault(f"{visual.what} has {'several shapes' if shapes else 'no shape'} in its "
+                "`geometry`, expected one")
         if not material.children("color"):
             material = self.colours.get(material.given.get("name"), material)
         colour, opacity = material.child("color").colour()

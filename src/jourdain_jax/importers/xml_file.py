@@ -39,7 +39,9 @@ class XmlFile:
     """A robot file during reading: its root, its location, and omitted parts."""
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
-        """The file at `path`, or the text itself; `table`: what elements may hold, the root first. ValueError where it cannot be read or holds more."""
+        """Read the file at `path`, or the text itself. `table`: the permitted content of each element, the
+        root first. Raises ValueError for a file that cannot be read or has other content.
+        """
         check_kind(path, str | os.PathLike, "`path`", f"the path of a {format_name} file, or its text")
         self.ignore, self.table = as_labels(ignore), table
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
@@ -59,8 +61,8 @@ class XmlFile:
         self._check(self.root, f"`{root_tag}`", root_tag)
 
     def _include(self, holder: Element, known: set[Path]) -> None:
-        """Replace elements `include` by the contents of other files; ValueError for a file that is included
-        twice, or in itself.
+        """Replace elements `include` by the contents of other files. Raises ValueError for a file that is
+        included twice, or in itself.
         """
         for k, child in reversed(list(enumerate(holder))):
             if child.tag != "include":
@@ -75,8 +77,8 @@ class XmlFile:
             holder[k : k + 1] = list(inner)
 
     def _check(self, element: Element, what: str, kind: str) -> None:
-        """Raise a ValueError for anything in an element outside the table, unless it is to be ignored;
-        `what`: the element, in words.
+        """Raise ValueError for anything in an element outside the table, unless it is to be ignored; `what`:
+        the element, in words.
         """
         holds = self.table[kind]
         self.check_attributes(kind, element.attrib, what)
@@ -102,13 +104,14 @@ class XmlFile:
             self.refuse("text", f"the text `{shortened(text)}` in {what}", "state numbers in attributes")
 
     def check_attributes(self, kind: str, attributes: Mapping[str, str], what: str) -> None:
-        """Raise a ValueError for an attribute that elements of a kind do not have here, unless it is to be
-        ignored, or one with an unknown value.
+        """Raise ValueError for an attribute that elements of a kind do not have (unless it is to be ignored),
+        and for one with an unknown value.
         """
         holds = self.table[kind]
         for name, value in attributes.items():
             if value not in holds.words.get(name, (value,)):
-                raise self.fault(f"`{name}` of {what} is `{shortened(value)}`; {nearest(value, holds.words[name])}")
+                raise self.fault(f"`{name}` of {what} is `{shortened(value)}`; "
+                    f"{nearest(value, holds.words[name])}")
             if name not in f"{holds.read} {holds.idle}".split() and not (name in holds.off and _is_off(value, holds.off[name])):
                 self.refuse(name.rpartition("}")[2], f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}', valid=holds.read)
 
@@ -117,10 +120,13 @@ class XmlFile:
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
-        """A ValueError for something that is not read, unless `ignore` has its `key`; `valid`: names that may be meant."""
+        """Raise ValueError for something that is not read, unless `ignore` contains its `key`; `valid`: names
+        to suggest.
+        """
         if key not in self.ignore:
             meant = "".join(f"did you mean `{name}`? Otherwise " for name in difflib.get_close_matches(key, valid.split(), 1, 0.7))
-            raise ValueError(f'{self.source}: {what} is not supported; {meant}{advice}, and give ignore=("{shortened(key)}",) to read the file without it')
+            raise ValueError(f'{self.source}: {what} is not supported; {meant}{advice}, and give '
+                f'ignore=("{shortened(key)}",) to read the file without it')
 
     def warn(self) -> None:
         """Warn of omitted elements, apart from those that `ignore` names."""
@@ -134,13 +140,11 @@ class XmlFile:
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
-        """Raise the error of this file that describes `what` is wrong, unless the name is among the valid
-        ones.
-        """
+        """Raise ValueError with the text `what`, unless the name is among the valid ones."""
         check_name(name, valid, f"{self.source}: {what}")
 
     def named(self, kind: str) -> "dict[str, Part]":
-        """Return the elements of a kind in the root, by their names; ValueError where one has none, or two
+        """Return the elements of a kind in the root by name. Raises ValueError where one has no name, or two
         have the same.
         """
         found: dict[str, Part] = {}
@@ -161,8 +165,8 @@ def _parsed(content: str | bytes, source: str) -> Element:
 
 
 class Part:
-    """An element during reading: its attributes and children, and its name in messages; None stands for a
-    missing element.
+    """An element during reading: its attributes and children, and its name in messages; None for a missing
+    element.
     """
 
     def __init__(self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None):
@@ -182,8 +186,8 @@ class Part:
         return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
 
     def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
-        """Return the numbers in an attribute, as many as `count` (None: any). `default` without the
-        attribute; ValueError without either.
+        """Return the numbers in an attribute, `count` of them (None: any number); `default` if it is missing.
+        Raises ValueError if there is no default either.
         """
         text, what = self.given.get(word), f"{word} of {self.what}"
         if text is None:
@@ -192,7 +196,8 @@ class Part:
             return np.asarray(default, float)
         found = np.array([number(x, f"{self.file.source}: {what}") for x in re.findall(r"[^ \t\r\n]+", text)], float)
         if len(found) != (count or max(1, len(found))):
-            raise self.file.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
+            raise self.file.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} "
+                f"number{'' if count == 1 else 's'}")
         return found
 
     def number(self, word: str, default: float | None = None) -> float:
@@ -211,8 +216,8 @@ class Part:
         return self.file.fault(f"{word} of {self.what} is {what}")
 
     def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
-        """Return the mass properties of an element; None if it states zeros. ValueError for other masses that
-        are not positive, except zero masses that no joint moves.
+        """Return the mass properties of an element; None if they are zero. Raises ValueError for other masses
+        that are not positive, except zero masses that no joint moves.
         """
         if mass == 0 and not np.any(inertia):
             return None

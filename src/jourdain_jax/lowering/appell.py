@@ -120,10 +120,10 @@ class AppellOnGraph:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
     def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[NodeList, NodeList]:
-        """Coordinates put back onto quaternion norms and geometric rows; speeds put back onto velocity rows, none where these are eliminated.
+        """Return coordinates projected onto quaternion norms and geometric rows, and speeds projected onto
+        velocity rows (none if these are eliminated).
 
-        Contacts that are closed count as rows.
-        """
+        Closed contacts count as rows."""
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
@@ -191,7 +191,7 @@ class AppellOnGraph:
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
     def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[NodeList, NodeList, NodeList]:
-        """Return dependent speeds and rates at the true coordinates: rates independent of held ones are copied, the others recomputed."""
+        """Return dependent speeds and rates at the true coordinates; those of held ones are recomputed."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
@@ -246,7 +246,7 @@ class AppellOnGraph:
 
 
 class _Kinematics:
-    """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates held (after differentiation)."""
+    """Velocities, partial velocities and accelerations at ydot = 0; some coordinates are held."""
 
     def __init__(self, build: AppellOnGraph, forms: NormalForms, held: dict[int, int], explicit: bool, free_z: bool = False):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
@@ -363,7 +363,7 @@ class _Kinematics:
         return pairs
 
     def _along(self, nodes, raw, qdot) -> NodeList:
-        """Rate of `nodes` (at the held coordinates) along the motion; `raw`: the same before any coordinate was held."""
+        """Return the rate of `nodes` along the motion; `raw`: the nodes before any coordinate was held."""
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
         rates = derivatives(g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held})

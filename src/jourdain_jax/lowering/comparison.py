@@ -25,7 +25,7 @@ def rates_of(found: Equations) -> list[int]:
 
 
 def values_at(found: Equations, probes: Probes) -> np.ndarray:
-    """Return rates at all probes, NaN where a pivot is small: there the program is not valid."""
+    """Return rates at all probes; NaN at probes with a small pivot, where the program is not valid."""
     return np.where(pivots_ok(found.pivots, probes), probes(rates_of(found)), np.nan)
 
 
@@ -37,14 +37,16 @@ def agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
-    """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
+    """Return the sizes by which errors of rates (first axis) at probes are judged: the usual size of each
+    rate, in its own unit.
+    """
     usual = largest(rates, 1, keepdims=True)
     # 0.01 of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
     return usual + 0.01 * largest(rates, 0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
-    """Return whether a program is valid at enough of the probed states; of long chains only some are
+    """Return whether a program is valid at enough of the probed states. For long chains only some are
     assembled.
     """
     # at 12 probes programs can be compared, where so many were found
@@ -52,7 +54,9 @@ def enough(usable: np.ndarray) -> bool:
 
 
 def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
-    """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
+    """Compare the scalar program with JAX's own derivatives and a dense solution at the probes. Return the
+    reason, with a name, where they differ.
+    """
     probes, independent = builder.probes, tuple(builder.independent)
     leaves, treedef = jax.tree.flatten(scene)
     columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]

@@ -31,7 +31,8 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
     """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
     states; NaN where accelerations are not determined.
 
-    All arrays have an axis of states first, parameters too. `independent`: speeds in the state; where these are not all, the others follow from the rows.
+    All arrays, including parameters, have a leading axis of states. `independent`: speeds in the state; if
+    these are not all, the others follow from the rows.
     """
     closed, shape = jaxpr_of_scene(scene, structure.potentials_of_inputs)
     numbers: VelocityQuantities = jax.tree.unflatten(jax.tree.structure(shape), range(len(jax.tree.leaves(shape))))[0]
@@ -81,7 +82,8 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
     """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not determined.
 
-    `rank`: of the rows. No more count: at coordinates that were rounded to single precision, rows that depend on each other are independent by some 1e-8.
+    `rank`: that of the rows. Rows beyond it do not count, since coordinates rounded to single precision make
+    dependent rows independent by some 1e-8.
     """
     c = speed_scales(M)
     A = A * c[:, None]

@@ -17,7 +17,9 @@ Rows = list[list[int]]  # of a matrix, entry by entry a node
 
 @dataclass(frozen=True)
 class Eliminated:
-    """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish: along the motion, or for some parameters."""
+    """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish along the motion or for some
+    parameters.
+    """
 
     solution: Rows
     pivots: list[int]
@@ -33,7 +35,7 @@ def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.nda
 
 
 def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
-    """Return the median of each over the probes with finite values; NaN if there are none."""
+    """Return the median of each value over the probes where it is finite; NaN if there are none."""
     known = np.any(~np.isnan(sizes), axis=1)
     found = np.full(len(sizes), np.nan)
     found[known] = np.nanmedian(sizes[known], axis=1)
@@ -41,9 +43,10 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
 
 
 def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:
-    """Solve a system; `right[row]` holds the right-hand sides of that row. With more rows than unknowns they have to agree.
+    """Solve a system; `right[row]` holds the right-hand sides of that row. If there are more rows than
+    unknowns, they must be consistent.
 
-    `far`: probes at full turns of all angles, made where a pivot has to be judged at them.
+    `far`: probes at full turns of all angles. They are made only when a pivot must be judged there.
     """
     system = Pivots(graph, A, right, probes, far)
     count = len(system.columns)
@@ -71,7 +74,9 @@ def quotient(graph: Graph, a: int, b: int) -> int:
 
 
 def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
-    """`M^-1 right` for a symmetric positive definite M, as L D L'; `right` holds columns, and so does the solution. The pivots are D."""
+    """Return `M^-1 right` for a symmetric positive definite M, as L D L'; `right` and the solution consist of
+    columns. The pivots are D.
+    """
     count = len(M)
     S, columns = [list(row) for row in M], [list(column) for column in right]
     left = set(range(count))

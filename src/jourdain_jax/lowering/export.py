@@ -14,19 +14,22 @@ _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
 def summary(lowered) -> str:
-    """Return operations after each step, omitted parts with reasons, the privileged speeds, pivots and
-    guards, parameters with their units.
+    """Return the summary: operations after each step, omitted parts with reasons, privileged speeds, pivots
+    and guards, parameters with units.
     """
     lines = [
-        f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} rates and {len(lowered.ydot)} accelerations",
+        f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} "
+        f"rates and {len(lowered.ydot)} accelerations",
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
         f"  omitted, without influence on the accelerations: {', '.join(lowered.held) or 'nothing'}",
         *(f"  kept as a call of JAX, as it has no scalar form: {reason}" for reason in lowered.calls),
         *([f"  redundant rows omitted: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
-        f"  computed once per motion, from parameters alone: {len(lowered.fixed)} number{'' if len(lowered.fixed) == 1 else 's'}",
-        f"  must not vanish, pivots that are monitored: {_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
+        f"  computed once per motion, from parameters alone: {len(lowered.fixed)} "
+        f"number{'' if len(lowered.fixed) == 1 else 's'}",
+        "  must not vanish, pivots that are monitored: "
+        f"{_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
         f"  must stay positive, signs that are relied on: {_shown(lowered, lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",
     ]
@@ -39,8 +42,8 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """Return the nodes as expressions where these are short (60 characters, of 8 nodes at most), otherwise
-    how many there are.
+    """Return the nodes as expressions if these are short (at most 60 characters and 8 nodes), otherwise their
+    number.
     """
     names = identifiers(lowered)
     written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
@@ -50,7 +53,7 @@ def _shown(lowered, nodes) -> str:
 
 
 def _alone(graph, pivot: int) -> int:
-    """Return the text that describes a pivot as a multiple or sign of another value."""
+    """Return a text that describes a pivot as a multiple of another value, or by that value's sign."""
     args = graph.args[pivot]
     return next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
 
@@ -60,7 +63,8 @@ def _speeds(lowered) -> list[str]:
         return [f"  speeds, all integrated, with rows kept by multipliers: {', '.join(lowered.speeds)}"]
     return [
         f"  privileged speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
-        f"  dependent speeds, eliminated: {', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
+        "  dependent speeds, eliminated: "
+        f"{', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
     ]
 
 
@@ -95,7 +99,7 @@ def results(lowered) -> dict[str, int]:
 
 
 def _prefix(letter: str, names) -> str:
-    """Return a prefix for numbered names of our own that no name of the scene has."""
+    """Return a prefix for generated, numbered names that no name of the scene begins with."""
     return _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
 
 
@@ -112,7 +116,8 @@ def python_source(lowered) -> str:
     state = ", ".join(names[int(n)] for n in given)
     signed = any("sign(" in text for text in (*first, *fixed, *second, *outputs))
     signs = ["", "def sign(x):", "    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0", ""] if signed else []
-    unpack = [f"    {', '.join(f'{k}{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = fixed"] if fixed else []
+    unpack = [f"    {', '.join(f'{k}{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = "
+        "fixed"] if fixed else []
     return "\n".join(
         [
             "import math",
@@ -120,7 +125,8 @@ def python_source(lowered) -> str:
             *signs,
             "",
             f"def fixed({', '.join(parameters)}):",
-            f'    """What depends on the parameters of {lowered.scene_name} alone: {_parameters(lowered) or "none"}."""',
+            f'    """What depends on the parameters of {lowered.scene_name} alone: '
+            f'{_parameters(lowered) or "none"}."""',
             *first,
             f"    return ({', '.join(fixed)}{',' if len(fixed) == 1 else ''})",
             "",
@@ -144,8 +150,8 @@ def _conventions(lowered) -> str:
 
 
 def c_source(lowered, name: str = "rates") -> str:
-    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; needs
-    the mathematical library.
+    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; it
+    needs the mathematical library.
     """
     traced, rates = lowered.traced, results(lowered)
     names = {n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given for n, given in identifiers(lowered).items()}
@@ -166,7 +172,8 @@ def c_source(lowered, name: str = "rates") -> str:
             f"   parameters: {_parameters(lowered) or 'none'}",
             *(f"   {group}: {listed[group]}" for group in ("coordinates", "speeds", "inputs")),
             f"   out, time derivatives: {', '.join(rates)} */",
-            f"void {name}(const double *parameters, double t, const double *coordinates, const double *speeds, const double *inputs, double *out) {{",
+            f"void {name}(const double *parameters, double t, const double *coordinates, const double "
+            "*speeds, const double *inputs, double *out) {",
             *(f"    (void){argument};" for argument in unused),
             *(f"    const double {names[n]} = {group}[{i}];" for group, nodes in groups.items() for i, n in enumerate(nodes) if n in used),
             *lines,
@@ -186,7 +193,7 @@ def expressions(lowered) -> dict:
 def latex(lowered) -> str:
     """Return the equations for an `align` environment, long numbers with six digits; needs SymPy.
 
-    Speeds that are the rate of a coordinate stand as its derivative, which needs no equation.
+    A speed that is the rate of a coordinate appears as its derivative, and needs no equation.
     """
     import sympy
 
@@ -205,7 +212,7 @@ def latex(lowered) -> str:
 
 
 def _symbol(name: str) -> str:
-    """Return a letter, Latin or Greek, with its number as index, in italics; words upright."""
+    """Return a letter, Latin or Greek, in italics with its number as index; other words are upright."""
     import sympy
 
     letter = name.rstrip("0123456789").rstrip("_")

@@ -17,9 +17,9 @@ from jourdain_jax.program.onto_rows import onto_rows
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
     """Return probes with coordinates up to half a turn away from the given ones, projected onto the geometric
-    constraints where Newton's method converges; made on first use.
+    constraints where Newton's method converges. They are made on first use.
 
-    Quaternions are drawn again.
+    Quaternions are drawn anew.
     """
     return cache(lambda: _at_full_turns(probes, traced))
 

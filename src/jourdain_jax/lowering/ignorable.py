@@ -16,9 +16,9 @@ FEW = 6  # probes that show most coordinates to count
 
 
 def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
-    """Return coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe, even
-    below the round-off of values, such as the heading of the last of many trailers. Considers only operations
-    that the identity test evaluates exactly.
+    """Return coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe. The
+    derivative may be below the round-off of the values, as for the heading of the last of many trailers. Only
+    operations that the identity test evaluates exactly are considered.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
@@ -36,7 +36,7 @@ def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int]
 
 
 def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
-    """Return coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on
+    """Return coordinates (quaternions as a whole) whose value has no effect on the privileged accelerations
     anywhere.
     """
     probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
@@ -51,8 +51,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def surely_changed(groups) -> np.ndarray:
-        """Return groups that influence results at a few probes, evaluated all together: in a long chain
-        nearly all do.
+        """Return groups that certainly influence the results, as a few probes show for all groups at once. In
+        a long chain these are nearly all.
         """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):

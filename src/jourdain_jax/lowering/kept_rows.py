@@ -15,8 +15,8 @@ from jourdain_jax.program.polynomial import NormalForms
 
 
 class KeptRows:
-    """The way in which constraints are kept. `massless`: M may be singular; pivots of privileged speeds are
-    judged at `probes` and, if necessary, `far`.
+    """The treatment of constraints. `massless`: whether M may be singular; `probes`, and if necessary `far`:
+    states at which pivots of privileged speeds are judged.
     """
 
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):

@@ -23,7 +23,9 @@ def loads_have_relations(scene: Scene) -> bool:
 
 
 def loads_may_jump(scene: Scene) -> bool:
-    """Return whether loads or masses jump at a state or parameter; a jump at a fixed time leaves derivatives right."""
+    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times are excepted, since
+    derivatives remain correct there.
+    """
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
     graph, loads = traced.graph, list(_loads(scene, traced))
@@ -33,7 +35,9 @@ def loads_may_jump(scene: Scene) -> bool:
 
 
 def bent_load(scene: Scene, t, q, u, inputs) -> str:
-    """Return in words which load or mass has no derivative with respect to the state at a state; empty where none is seen."""
+    """Describe the load or mass that has no derivative with respect to the state at some state; empty if none
+    is found.
+    """
     try:
         traced = looked_at(scene).traced
     except Unsupported:

@@ -42,10 +42,11 @@ MOST_TERMS = 200  # of one normal form
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
-    """Return the lowered equations of the scene's class, or the reason why there are none. Built once per
-    class, shapes and privileged speeds.
+    """Return the lowered equations of the scene's class, or the reason why there are none. They are built
+    once per class, shapes and privileged speeds.
 
-    `every_speed`: all speeds stay in the state, rows are kept by multipliers; default: where no privileged speeds serve everywhere.
+    `every_speed`: whether all speeds stay in the state, with multipliers for the rows; by default only if no
+    privileged speeds are valid everywhere.
     """
     structure = structure_of(scene)
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
@@ -64,8 +65,8 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     print(jj.lower(disc))                     operations after each step, what was dropped and why
     print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
 
-    `every_speed`: whether all speeds stay in the state and the rows are kept by multipliers (True), or dependent speeds are eliminated (False);
-    default: the latter where privileged speeds serve everywhere in the scene's domain.
+    `every_speed`: True keeps all speeds in the state and the rows by multipliers; False eliminates dependent
+    speeds. The default is False if some privileged speeds are valid everywhere in the scene's domain.
     """
     scene = as_scene(scene)
     found = lowered(scene, every_speed)
@@ -76,7 +77,7 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
 
 @once_per_class
 def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
-    """Return the program, which depends on the structure's `kept` part, not on the values of parameters."""
+    """Return the program. It depends on the structure's `kept` part, but not on the values of parameters."""
     begin = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is not a number at a probe does not count there
@@ -91,7 +92,8 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         raise NotLowered("its constraints are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise NotLowered(f"rows {named} are redundant at all probed states, but this could not be proved for others")
+        raise NotLowered(f"rows {named} are redundant at all probed states, but this could not be proved for "
+            "all states")
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
     try:
@@ -115,9 +117,9 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
-    """Return configurations on the geometric constraints, random and symmetric ones, with any speeds, and
-    parameters off their values, so that accidental zeros and equalities do not count: larger by up to a
-    tenth; smaller, or by less, where the scene would be undefined, or moments of inertia impossible.
+    """Return configurations on the geometric constraints, random and symmetric ones, with random speeds.
+    Parameters are up to a tenth larger than their values, so that coincidences do not count. Where the scene
+    would then be undefined or moments of inertia impossible, they are smaller or closer to their values.
     """
     generator = np.random.default_rng(1)
     # 56 probes at most
@@ -244,15 +246,15 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
             speeds = scene.speed_names.entries
             free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in (builder.independent, builder.dependent))
             raise ValueError(
-                f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity constraints, "
-                f"by which {tied} follow from {free}; give values for all of them "
-                "that satisfy the constraints, or state the independent ones as `privileged`"
+                f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity "
+                f"constraints, by which {tied} follow from {free}; give values for all of them that satisfy "
+                "the constraints, or state the independent ones as `privileged`"
             )
 
 
 def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
-    """Return divisors in the rates of coordinates, as in w/sin q; a choice by `where` keeps away from zero
-    itself.
+    """Return divisors in the rates of coordinates, as in w/sin q, except those that a `where` keeps away from
+    zero.
     """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
@@ -261,9 +263,9 @@ def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
 
 
 def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:
-    """Yield strategies worth trying; `plainly`: operations without normal forms.
+    """Yield strategies worth trying; `plainly`: without normal forms of operations.
 
-    Over all models, with all speeds and without, nothing else took fewer operations (twelve were tried).
+    For all models, with all speeds and without, no other of twelve strategies took fewer operations.
     """
     if builder.multiplied:
         yield Strategy(True, MOST_TERMS, MOST_TERMS if small else 0, held=held)
@@ -278,8 +280,8 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
 
 
 def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
-    """Return pivots relative to their values, for the same parameters, at a probed state; signs of those that
-    never vary.
+    """Return pivots relative to their values at a probed state with the same parameters. For pivots that
+    never vary, return their signs.
     """
     return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
 
@@ -309,11 +311,11 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeLi
 
 
 def may_be_massless(scene: Scene, structure: Structure) -> bool:
-    """Return whether M is singular at the parameters of `scene`, or with zero for those traced ones that need
-    not be positive.
+    """Return whether M is singular at the parameters of `scene`. Traced parameters that may be zero are set
+    to zero.
 
-    These are parameters declared `non_negative` and those whose default is zero; where privileged speeds serve, so that it costs nothing, all that are not
-    declared `positive`.
+    These are parameters declared `non_negative` and those with a default of zero. If privileged speeds are
+    used anyway, all parameters that are not declared `positive` are included, since that costs nothing.
     """
     if structure.massless:
         return True

@@ -43,7 +43,8 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
-    """Rates of the minimal state (q, y), or of the full one (y = u), of one class of scenes as a scalar program; parameters are inputs of it.
+    """Rates of the minimal state (q, y), or of the full one (y = u), of one class of scenes, as a scalar
+    program whose inputs include the parameters.
 
     Compared by identity, so that it can be a static argument of compiled functions.
     """
@@ -111,14 +112,14 @@ class Lowered:
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """Return the program as one C function `name`, in SI units and radians; its comment says which number
-        is which.
+        """Return the program as one C function `name`, in SI units and radians, with a comment on the meaning
+        of its numbers.
         """
         return export.c_source(self, name)
 
     def expressions(self) -> dict:
-        """Return name -> SymPy expression of every rate; needs SymPy. For small scenes: large ones give
-        pages.
+        """Return name -> SymPy expression of every rate; needs SymPy. Use it for small scenes: the
+        expressions of large ones fill pages.
         """
         return export.expressions(self)
 
@@ -129,7 +130,8 @@ class Lowered:
         return export.latex(self)
 
     def _repr_latex_(self) -> str | None:
-        """Return the equations in a notebook, if they are short; otherwise, and without SymPy, the summary.
+        """Return the equations in a notebook if they are short; otherwise, and without SymPy, return the
+        summary.
         """
         # 100 operations of a program whose equations a notebook shows
         if self.operations > 100 or importlib.util.find_spec("sympy") is None:
@@ -137,8 +139,8 @@ class Lowered:
         return "$$\\begin{aligned}\n" + self.latex() + "\n\\end{aligned}$$"
 
     def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
-        """Return the values that depend on parameters only, for the parameters of `scene`; computed once per
-        motion.
+        """Return the values that depend on parameters only, for the parameters of `scene`. They are computed
+        once per motion.
         """
         place = {int(n): (k, i) for k, nodes in enumerate(self.traced.parameters) for i, n in enumerate(np.ravel(nodes))}
         leaves = [jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(scene)]
@@ -163,9 +165,9 @@ class Lowered:
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return `rates`; the pivots, which must keep their signs; directions; and the smallest sine between a row that is
-        kept by multipliers and those before it, None if there are none. The last three are numbers to
-        differentiation.
+        """Return `rates`; the pivots, which must keep their signs; directions of rows; and the smallest sine
+        between a row kept by multipliers and the rows before it (None if there are no such rows). All but the
+        rates have no derivative.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
@@ -204,8 +206,8 @@ class Lowered:
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
-        """Project coordinates and integrated speeds onto the constraints; `affine`: they are affine, so that
-        one step is exact for the speeds.
+        """Project coordinates and integrated speeds onto the constraints; `affine`: constraints are affine in
+        the speeds, so that one step is exact for these.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
@@ -221,8 +223,8 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers whose signs are monitored over every step, in the rates and, if it `has_events`,
-        in the events.
+        """Return the numbers whose signs are monitored during every step, in the rates and, if it
+        `has_events`, in the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
 
@@ -241,8 +243,8 @@ class Lowered:
 
     @property
     def calls(self) -> Labels:
-        """Reasons for each call of JAX in the rates and stop events: a part of a load or event without a
-        scalar form.
+        """Return the reason for each call of JAX in the rates and stop events: a part of a load or event
+        without a scalar form.
         """
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
 
@@ -255,6 +257,6 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
 
 
 def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane:
-    """Return the smallest magnitude of any, 1 at most; its sign is the product of theirs."""
+    """Return the smallest magnitude of several numbers, at most 1, with the sign of their product."""
     pivots = jax.lax.stop_gradient(pivots)
     return jnp.prod(jnp.sign(pivots), axis=0) * jnp.min(jnp.abs(pivots), axis=0, initial=1.0)

@@ -68,7 +68,9 @@ def accelerations_by_multipliers(
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
-    """`M + A' W A`, positive definite where M is for the velocities that the rows admit; the inertia that is added is of the size of M's own."""
+    """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The added
+    inertia has the size of M.
+    """
     made, speeds = [list(row) for row in M], range(len(M))
     heavy = np.nanmedian(largest(probes([row[i] for i, row in enumerate(M)]), 0))
     for row in A:

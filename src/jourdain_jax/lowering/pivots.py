@@ -46,7 +46,9 @@ class _Entry:
 
 
 class Pivots:
-    """The system `A x = right` while it is eliminated, and the choice of the next pivot. `probes`: of the domain; `far`: at full turns of all angles."""
+    """The system `A x = right` during elimination, and the choice of the next pivot. `probes`: of the domain;
+    `far`: at full turns of all angles.
+    """
 
     def __init__(self, graph: Graph, A: Sequence[Sequence[int]], right: Sequence[Sequence[int]], probes: Probes, far: Callable[[], Probes] | None):
         # terms of a determinant in normal form
@@ -142,8 +144,8 @@ class Pivots:
     # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Return whether an entry stays away from zero also outside of the domain, wherever the system is
-        regular.
+        """Return whether an entry stays away from zero wherever the system is regular, also outside of the
+        domain.
         """
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
@@ -161,7 +163,9 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """The probes at which the given system is regular: its rows and columns scaled, at the probes of the domain and the far ones."""
+        """Return the probes, in the domain and far from it, at which the system with scaled rows and columns
+        is regular.
+        """
         if self._kept_regular is None:
             count = len(self._given[0])
             A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
@@ -188,8 +192,8 @@ class Pivots:
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
-        """Return reference sizes of entries besides their row, at the first probes; None if a vanishing row
-        makes the system singular anyway.
+        """Return reference sizes of entries and of their rows, at the first probes; None if a vanishing row
+        makes the system singular.
         """
         if not self._tall:
             return None
@@ -224,7 +228,7 @@ class Pivots:
         return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
 
     def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
-        """a b - c d, where it depends on parameters alone and is not small; None otherwise."""
+        """Return a b - c d if it depends on parameters only and is not small; otherwise None."""
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
@@ -234,8 +238,8 @@ class Pivots:
     # rows combined
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """Return one column combined from all rows that contain it; the entry at the place `single` if that
-        is no better.
+        """Combine all rows that contain a column into one for that column. Return the `single` entry at that
+        place instead if it is as good.
         """
         graph, A, regular = self.graph, self.A, self._regular
         found = []
@@ -267,7 +271,7 @@ class Pivots:
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 
     def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Return two rows turned into one with the pivot and one without: `a r + w b s` and `b r - a s`; the
+        """Rotate two rows into one with the pivot and one without: `a r + w b s` and `b r - a s`; the
         determinant keeps its sign.
         """
         graph, A, (r, s) = self.graph, self.A, users
@@ -287,8 +291,8 @@ class Pivots:
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Return all rows of a column combined into a new one, and made orthogonal to the column (Gram and
-        Schmidt).
+        """Combine all rows of a column into one new row, and make the other rows orthogonal to the column
+        (Gram and Schmidt).
         """
         graph, A = self.graph, self.A
         new = len(A)
@@ -312,7 +316,9 @@ class Pivots:
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
-    """Return entries beside the largest of their row, which come one after another, and beside `sizes`."""
+    """Return the ratios of entries to the largest entry of their row, and to `sizes`. Entries of a row are
+    contiguous.
+    """
     values = np.abs(values)
     starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
     largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)

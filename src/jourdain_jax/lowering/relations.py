@@ -24,7 +24,9 @@ WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
-    """Number whose sign decides -> the relations that it decides, each with 1, or -1 where it is the negative of their own number."""
+    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if its own
+    number is the negative of the key.
+    """
     found: dict[int, list[tuple[int, int]]] = {}
     for n in graph.reachable(list(nodes)):
         if graph.varies[n] and (own := _own(graph, n)) is not None and graph.varies[own]:
@@ -57,7 +59,7 @@ def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
 
 
 def _branch(graph: Graph, node: int, above: bool) -> int:
-    """Return the value of a relation where its own number is positive (`above`), or negative."""
+    """Return the value of a relation where its own number is positive (`above`) or negative."""
     op, args = graph.op[node], graph.args[node]
     if op in COMPARED:
         return graph.const(COMPARED[op][0 if above else 1])
@@ -69,8 +71,8 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
 
 
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
-    """Return the outputs with these relations (of `switches`) as for a positive number, and as for a negative
-    one.
+    """Return the outputs for a positive number, and for a negative number, of these relations (of
+    `switches`).
     """
     outputs = list(outputs)
     above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
@@ -78,9 +80,9 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
 
 
 def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the numbers whose signs are watched: of the rates, and of stop events only.
+    """Return the numbers whose signs are monitored: those of the rates, and those of stop events only.
 
-    Numbers that depend on `modes` are omitted: modes have events of their own.
+    Numbers that depend on `modes` are omitted, since modes have their own events.
     """
     found: list[NodeList] = []
     for outputs, counts in ((rates, _differ), (events, _may_dip)):
@@ -92,7 +94,7 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
 
 def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
-    """Return whether the branches of relations differ on either side of a zero of their number."""
+    """Return whether the branches of relations differ near a zero of their number."""
     if (beside := _beside(number, probes)) is None:
         return True
     above, below = branches(graph, nodes, outputs)
@@ -105,13 +107,15 @@ def _differ(values, above, below, least) -> bool:
 
 
 def _may_dip(values, above, below, least) -> bool:
-    """Return whether a value may dip: it is not the lower one of its two branches on either side."""
+    """Return whether a value may fall and rise again at a relation: on one side of it, the value is not the
+    smaller of its two branches.
+    """
     return not np.all(values <= np.minimum(above, below) + least)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
-    """Return the numbers whose branches continue beyond their zeros: both are finite wherever the outputs
-    are.
+    """Return the numbers whose branches continue beyond their zeros: both branches are finite where the
+    outputs are.
     """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
@@ -136,8 +140,8 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(number: int, probes: Probes) -> Callable[[float], tuple[Probes, Probes]] | None:
-    """Return a function of a distance: states on either side of zeros of a number; None if it has none
-    between probes.
+    """Return a function of a distance that returns states on either side of zeros of a number; None if the
+    number has no zero between probes.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)

@@ -25,7 +25,7 @@ from jourdain_jax.program.graph import Graph
 
 @lru_cache(maxsize=64)
 def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lowered:
-    """Return the program with a mode and an event for each relation, after those of the scene.
+    """Return the program with an additional mode and event for each relation, after those of the scene.
 
     `modes`: which of its inputs are modes.
     """
@@ -60,8 +60,8 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
-        """Add a reset: the state and the modes `after` an event, sides by the numbers then, and the rise of
-        energy.
+        """Add a reset: the state and the modes `after` an event, sides by the numbers at the new state, and
+        the gain in energy.
         """
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # each after those that it is made of
             (moved,) = graph.substituted([x[k]], after)
@@ -93,7 +93,9 @@ def _where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
 
 
 def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -> int:
-    """Return what a relation is where its own number has this `sign`, and of whole numbers on this `side`."""
+    """Return the value of a relation for this `sign` of its own number; if the relation is a whole number,
+    for this `side`.
+    """
     if op in COMPARED:
         return graph.call(op, sign, graph.zero)
     if op == "sign":
@@ -109,9 +111,10 @@ def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -
 
 
 def _whole(graph: Graph, op: str, args: Sequence[int], side: int) -> int:
-    """Return floor(a), ceil(a), round(a) or rem(a, b) where the whole number below a, a/b or a + 1/2 is even.
+    """Return floor(a), ceil(a), round(a) or rem(a, b) on a given side, where the whole number below a, a/b or
+    a + 1/2 is even or odd.
 
-    `side`: 1, or -1 where that number is odd.
+    `side`: 1 for an even number, -1 for an odd one.
     """
     a = graph.div(*args) if op == "rem" else args[0]
     odd = _where(graph, graph.call("lt", side, graph.zero), graph.one, graph.zero)

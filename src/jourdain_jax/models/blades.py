@@ -69,7 +69,8 @@ class ChaplyginSleigh(Scene):
 
     mass: Parameter = parameter(1.3, unit="kg", positive=True)
     inertia: Parameter = parameter(0.4, unit="kg m^2", positive=True, about="I, about the mass centre")
-    offset: Parameter = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative behind it")
+    offset: Parameter = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative "
+        "behind it")
 
     coordinates = coordinates("x y heading")
     conventions = "z up; heading from x towards y; the blade is along body x; x, y of the mass centre."
@@ -106,7 +107,7 @@ def _level(mass, inertia, x, y, orientation) -> RigidBody:
 
 
 def _edge(body, point=None) -> Scalar:
-    """Return the row of a blade along body x, at a point of the body (default: its mass centre)."""
+    """Return the row of a blade along body x at a point of the body (default: its mass centre)."""
     return knife_edge(body, body.position if point is None else body.place(point), body.orientation[:, 1])
 
 
@@ -131,8 +132,10 @@ class Snakeboard(Scene):
     """
 
     mass: Parameter = parameter(6.0, unit="kg", positive=True, about="of everything")
-    half_length: Parameter = parameter(0.2, unit="m", positive=True, about="l, from the middle to a wheel pair")
-    board_inertia: Parameter = parameter(0.1, unit="kg m^2", positive=True, about="J, with the masses of rotor and wheels")
+    half_length: Parameter = parameter(0.2, unit="m", positive=True, about="l, from the middle to a wheel "
+        "pair")
+    board_inertia: Parameter = parameter(0.1, unit="kg m^2", positive=True, about="J, with the masses of "
+        "rotor and wheels")
     rotor_inertia: Parameter = parameter(0.05, unit="kg m^2", positive=True, about="Jr")
     wheel_inertia: Parameter = parameter(0.002, unit="kg m^2", positive=True, about="Jw, of one wheel pair")
 

@@ -70,9 +70,10 @@ class _ThinDisc(Heavy):
 class TiltingDisc(_ThinDisc):
     """A thin disc rolling without slip on a level plane, in angles: the classic of Appell and Korteweg.
 
-    Contact and height are built into the coordinates (x, y: contact point). Two no-slip rows, three degrees of freedom.
-    Singular where the disc lies flat (lean = +-pi/2); `TiltingDiscQuaternion` is the scene for that neighbourhood.
-    Source: Wang and Pao (2003), section V; J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972).
+    Contact and height are built into the coordinates (x, y: contact point). Two no-slip rows, three degrees
+    of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
+    `TiltingDiscQuaternion` near that position. Source: Wang and Pao (2003), section V; J. I. Neimark and N.
+    A. Fufaev, Dynamics of Nonholonomic Systems (1972).
 
     Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point.
     """
@@ -100,9 +101,10 @@ _TILTED = TiltingDisc.example
 class TiltingDiscQuaternion(_ThinDisc):
     """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the contact as rows.
 
-    One height row and two no-slip rows on six speeds: three degrees of freedom, the motion of `TiltingDisc`. The coordinates fail
-    nowhere, so that the scene holds down to the neighbourhood of the flat disc, where the contact point itself is undefined.
-    Source: Wang and Pao (2003), section V; R. Cushman and J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
+    One height row and two no-slip rows on six speeds leave three degrees of freedom, with the motion of
+    `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc lies
+    flat, where the contact point itself is undefined. Source: Wang and Pao (2003), section V; R. Cushman and
+    J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
 
     Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y.
     """

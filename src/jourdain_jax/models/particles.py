@@ -26,7 +26,7 @@ class _OnSheets(Scene):
         return {"particle": Particle(self.mass, jnp.stack([q.x, q.y, q.z]))}
 
     def _with_plane(self, normal) -> dict:
-        """Return the particle, and the plane of the velocities that the row allows, drawn from its normal."""
+        """Return the particle and the plane of the velocities that the row allows, drawn by its normal."""
         normal = normal / jnp.sqrt(normal @ normal)
         turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
         return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}

@@ -63,7 +63,8 @@ class DoublePendulumRods(_DoublePendulum):
 
         |r1|^2 = l1^2,   |r2 - r1|^2 = l2^2
 
-    The same system as `DoublePendulumAngles`, which knows no rods. Multipliers are the thrusts in the rods, N (negative: tension).
+    The same system as `DoublePendulumAngles`, which has no rods as constraints. Multipliers are the thrusts
+    in the rods, N (negative: tension).
 
     Cartesian coordinates of both particles; pivot at the origin.
     """
@@ -91,9 +92,9 @@ def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Partic
 class SpringAndRod(Scene):
     """Two particles in a vertical plane: a spring holds the first to the origin, a rod holds the second to the first.
 
-    The spring is an impressed force, known from the positions; the rod is a constraint, its force known only by what it enforces,
-    `|r2 - r1| = l`. The rod's multiplier is its thrust (negative: tension), in N.
-    Source: Wang and Pao (2003), section I.
+    The spring is an impressed force, known from the positions. The rod is a constraint, whose force follows
+    from its condition `|r2 - r1| = l`. The rod's multiplier is its thrust (negative: tension), in N. Source:
+    Wang and Pao (2003), section I.
 
     Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second.
     """

@@ -39,8 +39,8 @@ MODELS = _Models()
 
 
 def model(name: str, **parameters) -> Scene:
-    """Return a model by name, with parameters changed by name; a ValueError that lists the valid names
-    otherwise.
+    """Return a model by name, with changed parameters by name. Raises ValueError with the valid names for an
+    unknown one.
     """
     kind = known_model(name)
     valid = [field.name for field in fields(kind) if field.init]
@@ -50,12 +50,13 @@ def model(name: str, **parameters) -> Scene:
 
 
 def known_model(name: str) -> type[Scene]:
-    """Return the class of a model; a ValueError with the nearest name if there is none."""
+    """Return the class of a model. Raises ValueError with the nearest name if there is none."""
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"unknown model `{name}`; {nearest(name, MODELS)}")
     return MODELS[name]
 
 
 def counts_of(kind: type[Scene]) -> Labels:
-    """Return names of the whole numbers that decide the structure of a scene, such as a number of links."""
+    """Return names of the whole numbers that determine the structure of a scene, such as a number of links.
+    """
     return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))

@@ -32,7 +32,8 @@ class BallOnTurntable(Heavy):
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
     radius: Parameter = parameter(0.05, unit="m", positive=True)
     inertia_ratio: Parameter = parameter(0.4, positive=True, about="kappa = I/(m r^2): 2/5 solid, 2/3 hollow")
-    turn_rate: Parameter = parameter(2.0, unit="rad/s", about="Om, of the table about its normal through the origin")
+    turn_rate: Parameter = parameter(2.0, unit="rad/s", about="Om, of the table about its normal through the "
+        "origin")
     tilt: Parameter = parameter(0.0, unit="rad", about="of the table, down along x")
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
@@ -110,8 +111,9 @@ class Rattleback(Heavy):
     privileged = ("w1", "w2", "w3")
     domain = {"alpha": (-1.0, 1.0), "beta": (-1.0, 1.0)} | dict.fromkeys(("w1", "w2", "w3"), (-5.0, 5.0))
     conventions = (
-        "x, y, z inertial with z up, of the mass centre; angles and w1, w2, w3 refer to axes with n3 = -z down: R = rot3(gamma) "
-        "rot1(alpha) rot2(beta), body axis 3 down at zero angles, so that w3 > 0 turns clockwise seen from above."
+        "x, y, z inertial with z up, of the mass centre; angles and w1, w2, w3 refer to axes with n3 = -z "
+        "down: R = rot3(gamma) rot1(alpha) rot2(beta), body axis 3 down at zero angles, so that w3 > 0 turns "
+        "clockwise seen from above."
     )
     example = {"alpha": math.radians(0.5), "beta": math.radians(0.5), "w1": 0.0, "w2": 0.0, "w3": -5.0}
     example_span = 20.0
@@ -138,7 +140,9 @@ class Rattleback(Heavy):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
 
     def contact_arm(self, down: Vector3) -> Vector3:
-        """rho (m), body axes: from the mass centre to the ellipsoid's lowest point when `down` is the downward vertical."""
+        """Return rho (m), body axes: from the mass centre to the ellipsoid's lowest point if `down` is the
+        downward vertical.
+        """
         weighted = self._semi_axes() ** 2 * down
         return weighted / jnp.sqrt(down @ weighted) - self._below_centre()
 

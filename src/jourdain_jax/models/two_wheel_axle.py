@@ -28,18 +28,21 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class _TwoWheelAxle(Scene):
-    """Shared parts of the four scenes: the parameters, a wheel, the weight, the known integrals."""
+    """The common parts of the four scenes: parameters, a wheel, the weight, the known integrals."""
 
     radius: Parameter = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
     length: Parameter = parameter(0.8, unit="m", positive=True, about="l, of the axle")
-    mass: Parameter = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
-    rim_mass: Parameter = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
+    mass: Parameter = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its "
+        "centre")
+    rim_mass: Parameter = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 "
+        "and m'a^2/2")
     slope: Parameter = parameter(0.2, unit="rad", about="alpha, of the incline")
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     conventions = (
-        "x down the slope, y across it, z along its normal; heading phi from x towards y, theta about the heading, psi about the "
-        "axle, positive forwards: angular velocity phidot k + thetadot i' + psidot j''; wheel 2 is on the left of wheel 1."
+        "x down the slope, y across it, z along its normal; heading phi from x towards y, theta about the "
+        "heading, psi about the axle, positive forwards: angular velocity phidot k + thetadot i' + psidot "
+        "j''; wheel 2 is on the left of wheel 1."
     )
     example_span = 10.0
 
@@ -61,7 +64,8 @@ class _TwoWheelAxle(Scene):
         )
 
     def _rolling(self, pose, height: str):
-        """Return both wheels roll; each carries itself, the axle bends no load from one to the other."""
+        """Return the rolling contacts of both wheels. Each wheel carries itself: the axle transmits no load.
+        """
         return {wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,)) for wheel in ("wheel1", "wheel2")}
 
     def _axle_row(self, psi1_rate, psi2_rate, phi_rate):
@@ -80,7 +84,7 @@ class _TwoWheelAxle(Scene):
 
 
 class _FreeWheels(_TwoWheelAxle):
-    """Two wheels as free bodies, upright, of one heading and rolling; the axle's own row is still missing."""
+    """Two wheels as free bodies, upright, with one heading and rolling; the axle's own row is missing."""
 
     coordinates = coordinates("x1 y1 z1 phi1 theta1 psi1 x2 y2 z2 phi2 theta2 psi2")
     privileged = ("psi1_rate", "phi1_rate")
@@ -113,7 +117,7 @@ class TwoWheelAxleFree(_FreeWheels):
 class TwoWheelAxleRedundant(_FreeWheels):
     """Two wheels on an axle down an incline, Method I with both rows (60a) and (60b).
 
-    Either alone loses the axle where its factor, cos phi or sin phi, passes zero.
+    Either row alone loses the axle where its factor, cos phi or sin phi, passes zero.
     """
 
     def velocity_constraints(self, motion):
@@ -156,7 +160,7 @@ class TwoWheelAxleCoordinates(_UprightWheels):
 class TwoWheelAxleQuasi(_UprightWheels):
     """Two wheels on an axle down an incline, Method III: quasi-velocities (67).
 
-    Of the seven the five rows are set to zero; rolling of wheel 1 and turning remain.
+    Five of the seven are zero by the rows; the rolling of wheel 1 and the turning remain.
     """
 
     speeds = speeds("rolling turning")

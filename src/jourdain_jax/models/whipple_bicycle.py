@@ -44,34 +44,45 @@ class WhippleBicycle(Scene):
     g: Parameter = parameter(9.81, unit="m/s^2", about="gravity")
     rR: Parameter = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
     mR: Parameter = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
-    IRxx: Parameter = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia")
-    IRyy: Parameter = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia")
+    IRxx: Parameter = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment "
+        "of inertia")
+    IRyy: Parameter = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of "
+        "inertia")
     xB: Parameter = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
     zB: Parameter = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
     mB: Parameter = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
-    IBxx: Parameter = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x")
-    IByy: Parameter = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y")
-    IBzz: Parameter = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z")
+    IBxx: Parameter = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
+        "about x")
+    IByy: Parameter = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
+        "about y")
+    IBzz: Parameter = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
+        "about z")
     IBxz: Parameter = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
     xH: Parameter = parameter(0.9, unit="m", about="fork centre of mass, forward")
     zH: Parameter = parameter(-0.7, unit="m", about="fork centre of mass, down")
     mH: Parameter = parameter(4.0, unit="kg", positive=True, about="fork mass")
-    IHxx: Parameter = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x")
-    IHyy: Parameter = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y")
-    IHzz: Parameter = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z")
+    IHxx: Parameter = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia "
+        "about x")
+    IHyy: Parameter = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about "
+        "y")
+    IHzz: Parameter = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia "
+        "about z")
     IHxz: Parameter = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
     rF: Parameter = parameter(0.35, unit="m", positive=True, about="front wheel radius")
     mF: Parameter = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
-    IFxx: Parameter = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia")
-    IFyy: Parameter = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia")
+    IFxx: Parameter = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral "
+        "moment of inertia")
+    IFyy: Parameter = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of "
+        "inertia")
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")
     privileged = ("lean_rate", "steer_rate", "front_spin_rate")  # regular at any steer; the rear wheel stands still at a right angle
     domain = {"lean": (-0.8, 0.8), "pitch": (-0.1, 0.1), "steer": (-1.0, 1.0)}
     conventions = (
-        "z up, x forward, y to the left at yaw = 0; parameters in the z-down frame of Meijaard et al. (2007). Turns in the order "
-        "yaw, lean, pitch. Positive: yaw left, lean right, pitch nose down, steer right, spins rolling forward."
+        "z up, x forward, y to the left at yaw = 0; parameters in the z-down frame of Meijaard et al. "
+        "(2007). Turns in the order yaw, lean, pitch. Positive: yaw left, lean right, pitch nose down, steer "
+        "right, spins rolling forward."
     )
     example = {"rear_spin_rate": 15.0, "lean_rate": 0.2, "steer_rate": 0.0}
 
@@ -79,14 +90,15 @@ class WhippleBicycle(Scene):
     def from_values(cls, values: Mapping[str, float | Array]) -> "WhippleBicycle":
         """Return the bicycle with these 26 parameters by name, as read from a parameter file.
 
-        Raises a ValueError that names parameters which are missing or unknown.
+        Raises ValueError with the names of parameters that are missing or unknown.
         """
         names = [name for name, _, _ in parameters_of(cls())]
         for name in values:
             check_name(name, names, f"unknown bicycle parameter `{name}`")
         missing = [name for name in names if name not in values]
         if missing:
-            raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; give all {len(names)}")
+            raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; "
+                f"give all {len(names)}")
         return cls(**values)
 
     def upright(self, speed) -> dict[str, Scalar]:
@@ -115,7 +127,9 @@ class WhippleBicycle(Scene):
         }
 
     def visuals(self, pose):
-        """Frame and fork as bars from the hubs to the steer axis; of the rider only the mass centre, as a ball."""
+        """Return shapes: bars from the hubs to the steer axis for frame and fork; the rider's mass centre as
+        a ball.
+        """
         on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)  # noqa: E731, points of the plane of symmetry in the source's axes
         head, top, hub, saddle = on_axis(-2.1 * self.rF), on_axis(-2.6 * self.rF), (0.0, -self.rR), (0.26 * self.w, -2.5 * self.rR)
         crank = (0.42 * self.w, -0.85 * self.rR)
@@ -138,9 +152,9 @@ class WhippleBicycle(Scene):
         }
 
     def mode_names(self, eigenvalues: np.ndarray) -> Labels:
-        """Return names of the four modes: weave is the complex pair, or where all are real the two of one
-        sign that meet at a higher speed, which grow when riding forward; of the others castering is the
-        faster one, capsize the slower. None of another number of modes.
+        """Return names of the four modes. Weave is the complex pair; if all eigenvalues are real, it is the
+        two of one sign that meet at a higher speed (when riding forward, those that grow). Of the others
+        castering is the faster one, capsize the slower. Another number of modes has no names.
         """
         if len(eigenvalues) != 4:
             return ()
@@ -154,13 +168,14 @@ class WhippleBicycle(Scene):
 
 
 def _vector(x, z) -> Vector3:
-    """Components (x, 0, -z) in the engine's axes of a vector in the plane of symmetry, with z down."""
+    """Return components (x, 0, -z), in the engine's axes, of a vector in the plane of symmetry with z down.
+    """
     x, z = jnp.asarray(x), jnp.asarray(z)
     return jnp.stack([x, jnp.zeros_like(x), -z])
 
 
 def _inertia(xx, yy, zz, xz) -> Matrix3:
-    """Inertia in the engine's axes: the product changes sign under half a turn about x."""
+    """Return inertia in the engine's axes: the product changes its sign by the half turn about x."""
     zero = jnp.zeros_like(xx)
     return jnp.stack([xx, zero, -xz, zero, yy, zero, -xz, zero, zz]).reshape(3, 3)
 

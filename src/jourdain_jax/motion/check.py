@@ -20,7 +20,7 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes, none if all is plausible. Printed as a
+    """Findings of `check`: subject -> sentences on likely mistakes, none if all is plausible. `print` shows a
     table.
     """
 
@@ -34,7 +34,8 @@ class Checked(Printed):
 
     def _text(self) -> str:
         rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
-        return "\n".join([f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
+        return "\n".join([f"Check of {self.scene}: "
+            f"{'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
 
 
 @shown_from_users_lines
@@ -45,10 +46,11 @@ def check(scene: Scene | BuiltFor) -> Checked:
 
         print(jj.check(scene))
 
-    Looks at some states of the domain; a narrow feature between them is not seen. `verify` prints the table, and the first `build` of a class warns with it
-    where something looks wrong. When the scene is built or moves, the first finding is raised as an error, except a program that differs (dense matrices
-    serve) and a moment of inertia above the sum of the others.
-    ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
+    It examines some states of the domain; a narrow feature between them is not found. `verify` prints the
+    table, and the first `build` of a class warns with it. When the scene is built or moves, the first finding
+    is raised as an error, except a program that differs (dense matrices replace it) and a moment of inertia
+    above the sum of the others. Raises ValueError where no admissible state is found, or a free motion has no
+    inertia.
     """
     return _checked(as_scene(scene), None)
 

@@ -48,8 +48,9 @@ class _Rates(eqx.Module):
 def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
     """Return the rates of a scene for `diffrax.diffeqsolve`: of the state (q, u), coordinates and all speeds.
 
-    For what `simulate` does not do: step-size control, saving, adjoints and events of diffrax. Nothing keeps the state on the rows but their accelerations;
-    `jj.consistent` puts states back onto them. `inputs`: as of `simulate`. Differentiable in the scene and its inputs.
+    Use it for features of diffrax that `simulate` lacks: step-size control, saving, adjoints and events. Only
+    accelerations keep the state on the rows; `jj.consistent` projects states back onto them. `inputs`: as of
+    `simulate`. Differentiable in the scene and its inputs.
 
     **Examples**
 
@@ -151,7 +152,9 @@ class Diffrax(eqx.Module, Integrator):
 
 
 def check(setup: Setup) -> None:
-    """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
+    """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it
+    has relations, which they do not monitor.
+    """
     name, solver = type(setup.scene).__name__, setup.integrator.name
     if not all(setup.field.stops):
         raise ValueError(f"solver=diffrax.{solver}() cannot continue after events of `{name}`; omit `solver`")
@@ -173,6 +176,8 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):
-    """Return the lowest value of all stop events: of several in one step, diffrax would take the first in their order, not in time."""
+    """Return the lowest value of all stop events. If several happened in one step, diffrax would take the
+    first in their list, not in time.
+    """
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     return jnp.min(integrands.events(t * direction, y, args))

@@ -45,7 +45,7 @@ _TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # finite d
 
 
 class TimeProgram:
-    """The operations of a function of time, without its plain numbers; equal to any other that does the same."""
+    """The operations of a function of time, without its numbers; equal if the operations are."""
 
     def __init__(self, closed: ClosedJaxpr, real):
         taken: list[tuple[Var, Literal]] = []
@@ -68,11 +68,11 @@ class TimeProgram:
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Return the shapes of the arguments before the time: the plain numbers, and the captured values."""
+        """Return the shapes of the arguments before the time: the plain numbers and the captured values."""
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
-        """Return the value at time t; `numbers`: the plain ones; `held`: what the function closes over."""
+        """Return the value at time t; `numbers`: the plain numbers; `held`: the captured values."""
         given = zip((*numbers, *held, t), self.closed.in_avals, strict=True)
         return jaxpr_as_fun(self.closed)(*(jnp.asarray(x, like.dtype) for x, like in given))[0]
 
@@ -83,7 +83,7 @@ class TimeProgram:
         return self is other or (isinstance(other, TimeProgram) and self._key == other._key)
 
     def does_the_same_as(self, other: "TimeProgram") -> bool:
-        """Whether both are traces of one function, which is known: rules of differentiation are new in every trace, and are not compared."""
+        """Return whether both are traces of one known function; rules of differentiation do not count."""
         return self._key == other._key or _without_rules(self._key) == _without_rules(other._key)
 
 
@@ -99,7 +99,7 @@ def _without_rules(described):
 
 
 class FunctionOfTime(eqx.Module):
-    """An input as a given function of time: its operations, the plain numbers in them, and the arrays that it closes over."""
+    """An input as a function of time: its operations, their plain numbers, and captured arrays."""
 
     program: TimeProgram = eqx.field(static=True)
     numbers: Float[Array, "*lanes numbers"]
@@ -111,10 +111,10 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of one time at its present values, and the shape of its result; None unless it is a number.
+    """Return a function of time at its present captured values (None unless it is a number), and its shape.
 
-    It is traced again where it is another function, or what it reads (`scene/identity.py`) has changed or has state.
-    """
+    It is traced again if the function is a new one, or if values that it reads (`scene/identity.py`) have
+    changed."""
     try:
         kept = _trace(function)
     except TypeError:  # it cannot be hashed
@@ -151,17 +151,17 @@ def _trace(function: Callable) -> _Trace:
 
 
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
-    """Return `f` compiled for a set of input programs; the least recently used is dropped."""
+    """Compile `f` for a set of input programs; the least recently used is dropped."""
     return lru_cache(maxsize=16)(lambda programs: compiled(f, options))
 
 
 class Sampled(eqx.Module):
     """An input with `values` at given times `ts` (s, increasing), linear between, constant beyond.
 
-    Steps end at its knots, so that no feature is passed over, however short: a blow of 1 ms in a motion of 10 s is felt at any tolerance. Knots at which the
-    values are on a straight line, to within a tenth of `rtol` (at most 1e-5) of their range, do not count. Samples of something rough cost a step each.
-    Functions of time are seen at the times of steps only, also those that interpolate themselves.
-    """
+    Steps end at its knots, so that no feature is missed, however short: a blow of 1 ms in a motion of 10 s
+    has its effect at any tolerance. Knots on a straight line between others, to within a tenth of `rtol` (at
+    most 1e-5) of the range of the values, do not count. Samples of a rough signal cost a step each. Functions
+    of time, by contrast, are evaluated at the times of steps only, even if they interpolate."""
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
     values: Float[Array, "samples"] = eqx.field(converter=as_real)
@@ -220,7 +220,7 @@ class Inputs(eqx.Module):
         return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
-        """Return values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
+        """Return values and rates at time t. Raises ValueError for functions without derivatives."""
         t = jnp.asarray(t, real_type())
         try:
             values, rates = jax.jvp(self, (t,), (jnp.ones_like(t),))
@@ -235,7 +235,7 @@ class Inputs(eqx.Module):
 def in_phases(
     inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
 ) -> Inputs:
-    """Return inputs whose modes change after each transition, at infinity if it did not happen."""
+    """Return inputs whose modes change after each transition; one that did not happen is at infinity."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
@@ -245,7 +245,7 @@ def in_phases(
 
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
-    """The vector of inputs at time t; on NumPy or compiled where all is known, instead of one operation after another."""
+    """Return the vector of inputs at time t, on NumPy or compiled if all is known."""
     if inputs.channels and is_traced(inputs, t):
         return inputs(t)
     if inputs.constant:
@@ -261,7 +261,7 @@ _ZERO = Constant(np.zeros(()))  # made once: a module takes some 20 us
 
 
 def _as_channel(f: Callable, where: str) -> Callable:
-    """A function of time as a channel, or a ValueError unless `f` of one time is one number; nothing is computed."""
+    """Return a function of time as a channel. Raises ValueError unless `f` of one time is one number."""
     advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
         channel, found = traced(f, real_type())
@@ -279,7 +279,7 @@ def _as_channel(f: Callable, where: str) -> Callable:
 
 
 def as_inputs(scene: Scene, given) -> Inputs:
-    """Return inputs from a dictionary of name -> number, function of time or `Sampled`; default zero."""
+    """Return inputs from name -> number, function of time or `Sampled`; omitted ones are zero."""
     if isinstance(given, Inputs):
         if len(given.channels) != len(scene.inputs):
             raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has {len(scene.inputs)} inputs; give them by name")
@@ -308,7 +308,7 @@ def as_inputs(scene: Scene, given) -> Inputs:
 
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
-    """Raise a ValueError for an input of velocity constraints that jumps between t0 and t1."""
+    """Raise ValueError for an input of velocity constraints that jumps between t0 and t1."""
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
@@ -327,9 +327,8 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders` at which steps must end, but for the saved times `ts`.
-
-    Then infinite times, with the sign of the motion, at least one. None where there are no samples.
+    """Return times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders`
+    at which steps must end, without the saved times `ts`; then at least one infinite time. None: no samples.
     """
     samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
     if not samples:
@@ -351,7 +350,8 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """The knots at which steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
+    """Return the knots at which steps must end. Between these, straight lines approximate the samples to
+    `share` of the range of values."""
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
@@ -373,7 +373,7 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
 
 
 class SeenFromWithin(eqx.Module):
-    """An input by samples, at times of a step: at a knot it is on the line that belongs to the step."""
+    """An input by samples, as seen within a step: at a knot it continues the step's own line."""
 
     sampled: Sampled
     middle: PerLane  # s, of the step; infinite if there is none
@@ -391,7 +391,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples as seen inside a step with this middle (s); infinite: no step yet."""
+    """Return `inputs` with samples as seen from within the step around this time (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

@@ -70,13 +70,13 @@ def _numbers(setup: Setup) -> dict:
 
 
 def _prepared(setup: Setup) -> Setup:
-    """Return the setup with all numbers in the default precision (derivatives keep their own type)."""
+    """Return the setup with all numbers in the default precision; their derivatives keep their own type."""
     return setup._replace(**in_default_precision(_numbers(setup)))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup, with machine code also for quantities beside the steps where machine code integrates
-    it, if possible.
+    """Return the setup. If machine code integrates it, quantities other than the steps use machine code as
+    well, if possible.
     """
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
@@ -85,10 +85,10 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
-    """Return the motions of all lanes: `own_steps.width` at a time by a scalar program, else under `vmap`.
+    """Return the motions of all lanes: by a scalar program `own_steps.width` at a time, otherwise under
+    `vmap`.
 
-    `lane`: the setup of what varies. On a GPU numbers that do not vary have no lanes: kernels are given them
-    once.
+    `lane`: the varying part of the setup. On a GPU constant numbers have no lanes: kernels receive them once.
     """
     setups = eqx.filter_vmap(lane)(*varied)
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
@@ -101,8 +101,9 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
 
 
 def _entered(setup: Setup) -> tuple[Setup, Scalar]:
-    """Return the setup, with derivatives that are zero if nothing of its motion is used, and NaN after a
-    failure; and the zero by which `_finish` tells (`calculus/markers.py`).
+    """Return the setup, and a zero by which `_finish` recognises whether a motion failed
+    (`calculus/markers.py`). Derivatives of the setup are zero if nothing of its motion is used, and NaN after
+    a failure.
     """
     numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
@@ -111,7 +112,7 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
 
 
 def _plain(setup: Setup) -> Plain:
-    """Return the numbers of a setup before it is `_entered`: those that all motions share have no lanes."""
+    """Return the numbers of a setup before it is `_entered`; those that all motions share have no lanes."""
     setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
     own = setup.fitting()
     times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
@@ -126,8 +127,8 @@ def _plain(setup: Setup) -> Plain:
 
 
 def _in_contact(setup: Setup) -> Setup:
-    """Return the setup with contacts that switch in the modes of the start, which is on the ground where they
-    touch it.
+    """Return the setup with switching contacts in the modes of the start. Bodies that touch the ground there
+    are projected onto it.
     """
     scene, t0, start = setup.scene, setup.t0, setup.start
     if not scene.switching.contacts:
@@ -226,7 +227,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         inputs=in_phases(given.inputs, transitions, solved.passed.modes, direction),
         phases=_phases(given.inputs, passed, solved.passed, integrator.event_names, given.scene.modes),
         state_form=field.name,
-        reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
+        reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to "
+            "machine code",
         solver=integrator.name,
         projected=field.projects,
         unwatched=unwatched,
@@ -250,7 +252,7 @@ def _phases(inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, nam
 
 
 def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
-    """Return how far a projection moved a state from `free` to `y`, in tolerances of a step."""
+    """Return the distance by which a projection moved a state from `free` to `y`, in tolerances of a step."""
     rtol, atol = setup.tolerances
     parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
     return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
@@ -294,15 +296,18 @@ MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
 
 
 def conserves(setup: Setup) -> bool:
-    """Return whether T + V is constant along a motion whose steps are taken by tolerances.
+    """Return whether T + V is constant along a motion whose steps are controlled by tolerances.
 
-    Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
+    Integrated work is excluded. It may be a small difference of large powers, whose errors step-size control
+    does not bound.
     """
     return setup.field.conserves and all(setup.field.stops) and not isinstance(setup.integrator.solver, FixedStepMethod)
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
-    """T and V (J) at states, and both where each number is larger by the error that a step may leave in it."""
+    """Return T and V (J) at states, and both again with each coordinate and speed increased by the possible
+    error of a step.
+    """
     field, scene, inputs, fixed, _ = args
     rtol, atol = setup.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)

@@ -44,8 +44,9 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 class Model(BuiltFor, Printed):
     """A scene with the choices for its integration, made by `build`. Printed as a table.
 
-    It is a tree whose leaves are the parameters of `scene`. `model.replace(radius=r)` has other parameters and keeps the state, the backend, and, where `r`
-    is traced by JAX, all choices that numbers decided. It is pickled as its scene, and built again where it is loaded.
+    It is a tree whose leaves are the parameters of `scene`. `model.replace(radius=r)` has other parameters
+    and keeps the state and the backend; where JAX traces `r`, it also keeps all choices that depend on
+    numbers. It is pickled as its scene, and built again when loaded.
     """
 
     scene: Scene
@@ -75,15 +76,13 @@ class Model(BuiltFor, Printed):
         return structure_of(self.scene if self.decided is None else self.decided.scene)
 
     def field(self, constant: bool = True, work: bool = True) -> VectorField:
-        """Return the integrated vector field, with `constant` inputs or others, and with the `work` of loads
-        without a potential.
-        """
+        """Return the integrated vector field, with `constant` or other inputs, and with the `work` of loads
+        without a potential."""
         return self.once((constant, work), lambda: _vector_field(self, constant, work))
 
     def usual(self, determined: bool) -> Usual:
         """Return the typical sizes for projecting states; `determined`: constraints determine the free
-        speeds.
-        """
+        speeds."""
 
         def sizes() -> Usual:
             found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))  # what it traces must not be computed at once
@@ -158,9 +157,8 @@ class Model(BuiltFor, Printed):
 
     @property
     def way(self) -> str:
-        """The integrator of motions with constant inputs (machine code, XLA or dense matrices), and why no
-        faster one applies.
-        """
+        """Return the integrator of motions with constant inputs (machine code, XLA or dense matrices), and
+        the reason why no faster one applies."""
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as asked'}"
@@ -185,9 +183,10 @@ class Model(BuiltFor, Printed):
         return tuple(said)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the findings of `build` for the numbers of the scene to the file `path`, for `jj.load_model`.
+        """Write the results of `build` for the numbers of the scene to the file `path`, for `jj.load_model`.
 
-        ValueError for a model with a reduction or a stabilisation of its own, and where the scene has parts that are kept as calls of JAX.
+        Raises ValueError for a model with its own reduction or stabilisation, and where parts of the scene
+        are kept as calls of JAX.
         """
         scene, formulation = self.reference.scene, self.formulation
         if formulation.reduction is not None or formulation.baumgarte is not None:
@@ -253,7 +252,7 @@ jax.tree_util.register_pytree_node(Model, _flattened, _unflattened)
 
 @shown_from_users_lines
 def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto", memory: int | float | str | None = None) -> Model:
-    """Settle once how motions of a scene are integrated: rank, redundant constraints, privileged speeds, time
+    """Decide once how motions of a scene are integrated: rank, redundant constraints, privileged speeds, time
     dependence, conserved quantities, the state, the scalar program, the backend.
 
         model = jj.build(disc)
@@ -261,13 +260,13 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
         motion = jj.simulate(model, {"lean": 0.3}, t1=5.0)
         slope = jax.grad(lambda r: jj.simulate(model.replace(radius=r), {"lean": 0.3}, t1=5.0).q_end[0])(0.5)
 
-    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB", that chunks of a `rollout` and what reverse mode keeps of
-    motions may take (default: 4 GiB), and, where it is stated, the processes of a `Study`. All functions of a scene build on first use and keep what they
-    found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the model in
-    place of `scene`; all others take its `.scene`.
-    The first call for a class warns with the table of `check` if it has findings.
-    ValueError as of `structure_of` (no admissible state, no inertia along a free motion, impossible bodies), and where the formulation or
-    the backend does not apply to the scene.
+    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB": the bound for chunks
+    of a `rollout` and for records of reverse mode (default: 4 GiB), and, if stated, for the processes of a
+    `Study`. All functions of a scene build on first use and keep the result. `start`, `simulate`, `rollout`,
+    `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the model in
+    place of `scene`; all others take its `.scene`. The first call for a class warns with the table of `check`
+    if it has findings. Raises ValueError as `structure_of` does (no admissible state, no inertia along a free
+    motion, impossible bodies), and where the formulation or the backend does not apply to the scene.
     """
     scene = as_scene(scene)
     structure_of(scene)  # says what is wrong
@@ -288,8 +287,8 @@ def load_model(path: str | os.PathLike, scene: Scene) -> Model:
         model = jj.load_model("bicycle.model", bicycle)
 
     `path`: of the file; `scene`: of the same class, methods and values. Nothing in a file is executed, but it
-    decides the integrated equations: take files of your own.
-    ValueError where the file is damaged, or is that of another scene, version or precision.
+    determines the integrated equations: load only files of your own. Raises ValueError where the file is
+    damaged, or belongs to another scene, version or precision.
     """
     found, how = model_file.read(path, as_scene(scene))
     formulation = Formulation(how["state"], stabilisation="projection" if how["projects"] else None)
@@ -298,9 +297,8 @@ def load_model(path: str | os.PathLike, scene: Scene) -> Model:
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return a scene, or a model, with this formulation and backend (by default the model's), and with the
-    choices kept for its values.
-    """
+    """Return a scene, or a model, with this formulation and backend (by default the model's), and the choices
+    stored for its values."""
     decided = memory = None
     if isinstance(scene, Model):
         if formulation is None:
@@ -360,7 +358,8 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
 
 
 def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
-    """The scalar program that is integrated; None: dense matrices are. ValueError where a backend asks for a program and there is none."""
+    """Return the scalar program to integrate; None for dense matrices. Raises ValueError where a backend
+    requires a program and there is none."""
     reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
         reason = "a reduction or a stabilisation of its own needs dense matrices"
@@ -390,8 +389,8 @@ def _cutoff(structure: Structure) -> float | None:
 
 
 def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
-    """Return the default reduction: privileged velocities for the minimal state; for the full one that of a
-    lowered program, otherwise the null space by QR.
+    """Return the default reduction. For the minimal state these are the privileged velocities; for the full
+    state that of a lowered program, or else the null space by QR.
     """
     if independent is not None:
         return Privileged(independent)

@@ -29,8 +29,8 @@ KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram,
 
 
 def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
-    """Write the findings about a scene, by the functions that find them and the first part of their case, and
-    `how` to build it.
+    """Write the findings about a scene and `how` to build it. Findings are keyed by the functions that find
+    them and the first part of their key.
     """
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
@@ -41,14 +41,15 @@ def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hasha
 
 
 def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
-    """Return the findings about a scene, and how it is built; a ValueError if the file is damaged or does not
-    match.
+    """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file is
+    damaged or does not match.
     """
     head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
     if stated != expected:
         other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)
-        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in {other}; build and save it again")
+        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in {other}; "
+            "build and save it again")
     how, found = _decoded(json.loads(content))
     return found, how
 

@@ -30,20 +30,18 @@ class Options:
     """Options of integration.
 
     - `rtol`, `atol`: tolerances of a step, relative and absolute.
-    - `solver`: a solver of diffrax, which runs `diffrax.diffeqsolve` (but Tsit5, Dopri5 and Dopri8 are our own), or one of `jj.Taylor`, `jj.RadauIIA`,
-      `jj.ImplicitMidpoint`, `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their `step` between saved
-      times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
-    - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
-      is not missed where nothing else keeps steps short; inf: no bound.
+    - `solver`: a solver of diffrax, which runs `diffrax.diffeqsolve` (except Tsit5, Dopri5 and Dopri8, for
+      which this package has its own loop), or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`,
+      `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their
+      `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
+    - `max_steps`: the largest number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so
+      that a load that acts briefly, or a dip of an event, is not missed; inf: no bound.
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
-      motion; those at which it continues stay.
-      `work`: integrate the work of loads without a potential.
+      motion, but not those at which it continues. `work`: integrate the work of loads without a potential.
     - `max_transitions`: the largest number of events at which a motion continues (`jj.Event`).
-    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that
-      is stiff (by an implicit solver, unless
-      `solver` is given); `trajectory.fallback` and its summary report it. Inside your own `jit` or `vmap`,
-      and without it, the result code
-      stays.
+    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that is
+      stiff (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report
+      it. Inside your own `jit` or `vmap`, and without it, the result code stays.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
@@ -127,21 +125,25 @@ _register(AllOptions)
 _DEFAULT = AllOptions()
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
 GONE = {  # options that there were once -> what serves now
-    "adjoint": f"all motions have derivatives in forward and in reverse mode; for an adjoint of diffrax {_BY_DIFFRAX}",
-    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in solver=jj.ImplicitMidpoint(step=0.01)",
+    "adjoint": "all motions have derivatives in forward and in reverse mode; for an adjoint of diffrax "
+        f"{_BY_DIFFRAX}",
+    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in "
+        "solver=jj.ImplicitMidpoint(step=0.01)",
     "memory": "a model has its own; give it to `jj.build`",
     "saveat": f"give times to save at as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
-    "stepsize_controller": f"give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); for another control {_BY_DIFFRAX}",
+    "stepsize_controller": "give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); "
+        f"for another control {_BY_DIFFRAX}",
 }
 
 
 def as_options(
     options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None, scene=None
 ) -> AllOptions:
-    """Return the options of a call of `function`: the fields of the object, replaced by options by name.
+    """Return the options of a call of `function`: the fields of the object, overridden by options by name.
 
-    `refused`: names that have no meaning for this function, and why; `scene`: a model brings its formulation, backend and memory. Raises TypeError for these
-    and for unknown names, ValueError for wrong values.
+    `refused`: names that have no meaning for this function, with the reason; `scene`: a model supplies its
+    formulation, backend and memory. Raises TypeError for these and for unknown names, ValueError for wrong
+    values.
     """
     of_model = {name: getattr(scene, name) for name in ("formulation", "backend", "memory")} if isinstance(scene, BuiltFor) else {}
     if not (by_name or of_model) and (options is None or type(options) is AllOptions):
@@ -156,7 +158,8 @@ def as_options(
             raise TypeError(f"`{name}` is no longer an option: {GONE[name]}")
         if name not in OPTION_NAMES:
             known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refusals]
-            raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
+            raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; "
+                f"{nearest(name, known)}")
     found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
@@ -164,11 +167,12 @@ def as_options(
 
 def bytes_of(memory: Any) -> int:
     """Return the bytes for `memory`: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB"
-    (2^20); ValueError otherwise.
+    (2^20). Raises ValueError for anything else.
     """
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
     if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
-        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'")
+        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as "
+            "'2GB' or '500MB'")
     return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
@@ -206,12 +210,15 @@ def _check(options: AllOptions) -> None:
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    checked_whole(options.max_steps, "`max_steps`", 1, expected="of at least 1; give the number of steps after which to stop")
-    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; give the number of events after which to stop")
+    checked_whole(options.max_steps, "`max_steps`", 1, expected="of at least 1; give the number of steps "
+        "after which to stop")
+    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; give the number "
+        "of events after which to stop")
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):
-        raise ValueError(f"`solver` is {described(solver)}, expected an object of diffrax; write `{_meant(solver) or 'diffrax.Dopri8()'}`")
+        raise ValueError(f"`solver` is {described(solver)}, expected an object of diffrax; write "
+            f"`{_meant(solver) or 'diffrax.Dopri8()'}`")
 
 
 def _meant(value) -> str:

@@ -63,7 +63,7 @@ class OwnSteps(Integrator):
 
     def reason_against_machine_code(self, setup: Setup) -> str:
         if not self.native:
-            return "another backend was asked for"
+            return "another backend was requested"
         if not isinstance(self.solver, Method):
             return "the solver is implicit"
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
@@ -132,7 +132,9 @@ class OwnSteps(Integrator):
 
 
 def _by_start(perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]) -> tuple:
-    """Return cotangents of a setup and a beginning from those of the state and of the arguments of rates."""
+    """Return cotangents of a setup and of the initial state from those of the state and of the arguments of
+    rates.
+    """
     by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments)
     return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None)
 
@@ -148,11 +150,11 @@ def own_steps(solver, **static) -> OwnSteps | None:
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
-    """Return the motion that `run` finds from a number to others, its start and states moved to the times of
-    the setup.
+    """Return the motion of `run`, which works on plain numbers, with start and saved states moved to the
+    times of the setup so that these have derivatives.
 
-    A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
-    otherwise.
+    A reached time is its goal. The time of a stop event comes from the loop itself. A time that was not
+    reached has a constant distance from the start.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
     goals, later = setup.goals(setup.ts), start - numbers(start)
@@ -206,8 +208,8 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Return why no step watches the relations that the loads of a scene, or its stop events, have; empty
-    where one does, or they have none.
+    """Return why no step monitors the relations in a scene's loads or stop events; empty if a step does, or
+    there are none.
     """
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
@@ -230,9 +232,9 @@ def reason_against_watching(setup: Setup) -> str:
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
-    """Return whether rates may jump, in a way that derivatives leave out, at a time that depends on the
-    state, on numbers of inputs, or, where the
-    `scene_varies`, on parameters; `watched`: steps watch relations.
+    """Return whether rates may jump without derivatives accounting for it: at a time that depends on the
+    state, on numbers of inputs or, if the `scene_varies`, on parameters. `watched`: whether steps end at
+    relations.
     """
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
@@ -251,20 +253,20 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
-    """Return the program with the functions of time among the inputs, where it takes these, and the relations
-    in it.
-    """
+    """Return the program, with functions of time among its inputs where it has any, and its relations."""
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
 
 
 def width(program: Lowered) -> int:
-    """Return how many lanes of a lowered scene run in lockstep.
+    """Return the number of lanes of a lowered scene that run in lockstep.
 
-    A step of a batch lasts until its slowest lane has ended, and what a step touches should stay in a core's fastest cache: so few lanes at a time are best,
-    if a step of few lanes costs little beside its arithmetic. On a CPU it does where XLA compiles the whole loop over steps into one function, which it does
-    for loops that touch little memory (see `jourdain_jax`); otherwise every operation is started on its own, and many lanes must share that cost.
+    A step of a batch lasts until its slowest lane has ended, and its data should stay in a core's fastest
+    cache. So few lanes at a time are best, if a step of few lanes costs little beside its arithmetic. On a
+    CPU this holds if XLA compiles the whole loop over steps into one function, as it does for loops that use
+    little memory (see `jourdain_jax`). Otherwise every operation is started separately, and many lanes must
+    share that cost.
     """
     # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
     return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

@@ -100,7 +100,9 @@ class Usual(eqx.Module):
 
 
 def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
-    """Return the sizes for the parameters of a scene; `determined`: as of `Usual`; `native`: whether machine code may put states onto the rows."""
+    """Return the sizes for the parameters of a scene; `determined`: as of `Usual`; `native`: whether machine
+    code may project states onto the rows.
+    """
     low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
     width = np.where(high > low, high - low, 1.0).astype(real_type())
     program = row_program(scene) if native and not ffi.reason_against() else None
@@ -117,8 +119,8 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
 
 
 def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
-    """Return the coordinates on the geometric constraints nearest to q, and the residual; both have
-    derivatives in the `known` values.
+    """Return the coordinates on the geometric constraints nearest to q, and the residual. Both have
+    derivatives with respect to the `known` values.
     """
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
@@ -152,9 +154,7 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
-    """Return how rows are evaluated where XLA puts something onto them, or a derivative or a search needs
-    them.
-    """
+    """Return the evaluation of rows for projections by XLA, for derivatives, and for searches."""
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
@@ -206,10 +206,10 @@ def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
 
 
 def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Flag]:
-    """Return the start on the constraints, and whether its coordinates arrived, where they may be found; no
-    search where `guesses` is None.
+    """Project the start onto the constraints; also return whether the position solve converged within the
+    domain. Without `guesses` there is no search.
 
-    The residual is infinite where a number is not finite, or a coordinate was found where it may not be.
+    The residual is infinite where a number is not finite, or a coordinate lies outside its permitted range.
     """
     given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
     q = given_q
@@ -237,7 +237,7 @@ def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordin
     """Return coordinates of the states `elsewhere`, on the geometric rows; NaN where none are found in the
     domain.
 
-    `native`: whether machine code may put them there.
+    `native`: whether machine code may project them.
     """
     t, q, u = jax.tree.map(lambda x: jnp.asarray(x, real_type()), elsewhere(scene))
     if not names_of_position_rows(scene):
@@ -255,7 +255,7 @@ def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordin
 
 @eval_numpy
 def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return fault -> whether a scene of known numbers has it at this state, or elsewhere."""
+    """Return fault -> whether a scene of known numbers has it, at this state or elsewhere."""
     return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
@@ -268,7 +268,9 @@ def left_of(g: Float[Array, "closures"]) -> Scalar:
 
 
 def _arrived(q, near_q, g, start: Guess) -> Flag:
-    """Return whether the rows are met, where coordinates may be found and without running far away."""
+    """Return whether the rows are satisfied, with coordinates within their permitted range and without a far
+    excursion.
+    """
     # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
     close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
     return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
@@ -285,7 +287,7 @@ class _Put(NamedTuple):
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
-    """Return coordinates from the first guess that leads to the rows, q itself counting as the first."""
+    """Return coordinates from the first guess that leads to the rows; q itself counts as the first guess."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
@@ -305,19 +307,19 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
 
 
 def contradiction(dtype) -> float:
-    """Return the residual (m, rad) from which on given values contradict each other: that of numbers typed
-    with a few digits, or of round-off.
+    """Return the residual (m, rad) above which given values count as contradictory. It allows for numbers
+    typed with a few digits, and for round-off.
     """
     return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: of numbers typed with a few digits
 
 
 def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
-    """Return whether values that are held, where entries are not free, may contradict each other; `known`: of
-    the scene.
+    """Return whether held values (entries that are not free) may contradict each other; `known`: those of the
+    scene.
 
     rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: their columns of what is free
 
-    Then they cannot, but for single configurations.
+    Under this condition there is no contradiction, except at isolated configurations.
     """
     of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))  # otherwise rows determine the dependent ones
     of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)

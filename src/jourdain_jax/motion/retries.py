@@ -36,7 +36,8 @@ RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  
 
 
 def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
-    """Return the motion, repeated until a way succeeds or none is left; unchanged if its result is traced."""
+    """Return the motion, repeated until a retry succeeds or none is left; unchanged if its result is traced.
+    """
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -46,9 +47,11 @@ def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup,
 def lanes_retried(
     run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
 ):
-    """Run failed lanes again as single motions are; return all lanes, and for each way of retrying the `RERUN_FIELDS` of its lanes.
+    """Run failed lanes again as single motions are. Return all lanes, and for each kind of retry the
+    `RERUN_FIELDS` of its lanes.
 
-    `run`: the motions of lanes with these numbers, with these options; `form`: what is integrated of them; `begun`: their start times; `chunk`: of `rollout`.
+    `run`: the motions of lanes with these indices and options; `form`: their integrated state; `begun`: their
+    start times; `chunk`: that of `rollout`.
     """
     reruns: dict[int, tuple] = {}
     while (again := _next_retries(form, lanes, begun, options)).any():
@@ -63,7 +66,7 @@ def lanes_retried(
 
 
 def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
-    """Return the next retry of each sample, with all earlier changes of its run; AS_ASKED: none."""
+    """Return the next retry of each sample, including all earlier changes of its run; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
     found, codes, fallback = np.full(lanes.result.shape, results.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
     for tried in np.unique(fallback).tolist():
@@ -88,7 +91,7 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:
     """Return the retries of a `motion` from `t0`: those already made and one more; AS_ASKED if none is left.
 
-    `field`: how it was integrated; `options`: those that were given.
+    `field`: the integrated field; `options`: the given ones.
     """
     if np.all(known_numbers(motion.result) <= results.EVENT):
         return results.AS_ASKED
@@ -115,8 +118,8 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
 
 
 def _marked(motion: Trajectory, retries: int) -> Trajectory:
-    """Return a motion, or several, marked as repeated by these retries; out of steps once more, it counts as
-    stiff.
+    """Return one or several motions, marked as repeated by these retries. One that runs out of steps again
+    counts as stiff.
     """
     code = motion.result
     if retries & results.IMPLICIT:
@@ -132,8 +135,8 @@ def lost_codes(field: VectorField) -> tuple[int, ...]:
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
-    """Return whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where
-    its numbers are not known.
+    """Return whether a `motion` from `t0` ran out of steps because stability kept the steps short; False if
+    its numbers are unknown.
     """
     known = numbers_where_known((field, motion, t0))
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or known is None:
@@ -147,7 +150,7 @@ def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
 
 @eqx.filter_jit
 def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state state"]:
-    """Return derivative of the rates at the end state, with respect to the state without the work."""
+    """Return the derivative of the rates at the end state with respect to the state without the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
     y = field.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))

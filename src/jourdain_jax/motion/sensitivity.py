@@ -45,14 +45,17 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
     error = steps * amplification * rtol
     if error > 0.05:
         text = (
-            f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with rtol = {rtol:g} in each of {steps} steps its "
-            f"relative error may be {error:.0e}; tighten `rtol` and `atol` (in float64), or shorten the span"
+            f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with "
+            f"rtol = {rtol:g} in each of {steps} steps its relative error may be {error:.0e}; tighten `rtol` "
+            "and `atol` (in float64), or shorten the span"
         )
         warnings.warn(text, SensitivityWarning, stacklevel=3)
 
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
-    """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
+    """Return `integrate(setup)`. Its derivative, taken outside of `jit`, warns where the motion amplifies
+    errors too much.
+    """
     varies = tuple(name for name, part in setup._asdict().items() if is_traced(part))
     if not varies:
         return integrate(setup)
@@ -106,8 +109,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """Warn if one of the differentiated `motions` crossed relations at which rates jump; unknown crossings do
-    not warn.
+    """Warn if one of the differentiated `motions` crossed relations at which rates jump; unknown crossings
+    cause no warning.
     """
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
@@ -116,14 +119,16 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
     if moving_jumps(field, names, motions.inputs, scene_varies, bool(np.all(crossings >= 0))):
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
-            f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "
-            "its derivatives omit the shift of the time of the jump. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
-            "there by an event and start another; the motion itself is right"
+            f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, "
+            "`where`, `sign`, `floor`, ...) at which loads jump: its derivatives omit the shift of the time "
+            "of the jump. Let loads change within a short time or length, as by `jnp.tanh`, or end the "
+            "motion there by an event and start another; the motion itself is right"
         )
         warn(text, SensitivityWarning)
 
 
 def numbers_where_known(values):
-    """Return the values with numbers if they are differentiated outside `jit`; None if they have none."""
+    """Return the values with numbers if they are differentiated outside `jit`; None if they have no numbers.
+    """
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
     return None if is_traced(bare) else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)

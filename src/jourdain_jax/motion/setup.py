@@ -38,9 +38,10 @@ class Passed(eqx.Module):
     def times(
         self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
     ) -> Float[Array, "transitions"]:
-        """Return when they happened, on the same side of each of the saved times `ts` as it has since the start, `goals`.
+        """Return the times of transitions, rounded consistently: a transition before a goal, measured from
+        the start, is also before the corresponding saved time in `ts`.
 
-        Sums with the `origin` would not tell where the two are a rounding apart.
+        Adding the `origin` to a time since the start may round it onto the wrong side.
         """
         if not len(self.ts):
             return jnp.asarray(self.ts)
@@ -75,7 +76,8 @@ class Solved(eqx.Module):
 
 
 class Integrator(abc.ABC):
-    """How a motion is integrated: by our own steps (`motion/own_steps.py`) or by diffrax (`motion/diffrax_steps.py`).
+    """The integrator of a motion: our own steps (`motion/own_steps.py`) or diffrax
+    (`motion/diffrax_steps.py`).
 
     Numbers that change with every call are in the `Setup`.
     """
@@ -92,7 +94,9 @@ class Integrator(abc.ABC):
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
-        """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+        """Return in words why XLA compiles the loop over steps, in place of our machine code; empty if
+        machine code runs it.
+        """
 
     @abc.abstractmethod
     def solved(self, setup: "Setup", begun: "Begun") -> Solved:
@@ -125,8 +129,8 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":
-        """Return the setup with times for any loop: none beyond an end by round-off, and those of a short
-        span if they are inconsistent.
+        """Return the setup with times that any loop accepts: no time lies beyond the end by round-off, and
+        inconsistent times are replaced by those of a short span.
         """
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
@@ -137,7 +141,9 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
 
     @property
     def reason_against_machine_code(self) -> str:
-        """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+        """Return in words why XLA compiles the loop over steps, in place of our machine code; empty if
+        machine code runs it.
+        """
         return self.integrator.reason_against_machine_code(self)
 
     def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
@@ -160,7 +166,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as they were given: without derivatives, and what a batch shares has no lanes."""
+    """Numbers of a motion as given: without derivatives, and without lanes where a batch shares them."""
 
     times: dict  # as of a `Setup`
     known: tuple  # `native_motion.known_of`
@@ -178,8 +184,8 @@ class Begun(eqx.Module):
 
 
 def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
-    """Return whether the span is finite and not empty, and the times to save at lie in it, one after another;
-    also of traced times.
+    """Return whether the span is finite and not empty, and the saved times lie in it in order; also for
+    traced times.
     """
     xp = array_module((ts, t0, t1))
     direction = xp.sign(t1 - t0)

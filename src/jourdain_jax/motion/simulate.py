@@ -61,11 +61,12 @@ def simulate(
     - `inputs`: name -> number, function of time, or `Sampled`.
     - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as `rtol=1e-10`, which take precedence.
 
-    By name alone:
-    - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
-    - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
-      default one; "xla", that program compiled by XLA: also for third derivatives, derivatives with respect to samples, `jax.export` and other devices, which
-      machine code refuses; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
+    By name alone: - `formulation`: the equations to integrate, a `jj.Formulation(state, reduction,
+    stabilisation)` (default: chosen for the scene). - `backend`: "native", the scene's scalar program
+    (`jj.lower`) as machine code, where llvmlite is installed and the solver is a default one; "xla", that
+    program compiled by XLA, which also has what machine code lacks: third derivatives, derivatives with
+    respect to samples, `jax.export`, other devices; "dense", the dense matrices; "auto" (default), the first
+    of these that applies. The first two take the same steps.
 
     All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in
     all combinations
@@ -103,8 +104,8 @@ def simulate(
 
 
 def _integrated(setup: Setup) -> Trajectory:
-    """Return the motion; under `jax_debug_nans`, NaN after an event is a mark, and a motion that failed is
-    integrated again for JAX to find the NaN.
+    """Integrate the motion. Under `jax_debug_nans` the NaN after an event is only a marker; a motion that
+    failed is integrated again, so that JAX finds the operation that made the NaN.
     """
     if not jax.config.jax_debug_nans:
         return integrate(setup)
@@ -123,14 +124,16 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     scene, max_step, (solver, order) = model.scene, options.max_step, solver_of(options)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
-            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`, whose steps are at most its `step`: give jj.{solver.name}(step=...)")
+            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`, whose steps are at most "
+                f"its `step`: give jj.{solver.name}(step=...)")
         max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
     constant = inputs.constant
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
-        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, and time runs from t0 = {t0} back to t1 = {t1} s; give t1 > t0")
+        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, and time runs from t0 = {t0} "
+            f"back to t1 = {t1} s; give t1 > t0")
     start, usual = _start(model, start, t0, inputs)
     field, dtype = model.field(constant, bool(options.work)), start.q.dtype
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
@@ -149,7 +152,8 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
-        asked, advice = ("backend='native'", "use backend='auto', which chooses the fastest possible") if order is None else _BY_SERIES
+        asked, advice = ("backend='native'", "use backend='auto', which chooses the fastest "
+            "possible") if order is None else _BY_SERIES
         raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
 
@@ -169,9 +173,10 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
 
 
 def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMethod | Method", int | None]:
-    """Return the solver, by default the one for the tolerance, and of Taylor series the order. A ValueError where the tolerance is traced and has to decide.
+    """Return the solver (by default the one for the tolerance) and, for Taylor series, the order. Raises
+    ValueError if a traced tolerance would have to decide.
 
-    Warns where the precision does not hold the tolerance.
+    Warns where the precision cannot satisfy the tolerance.
     """
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
@@ -179,7 +184,8 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
     if isinstance(solver, Taylor):
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):
-        raise ValueError("`rtol` is traced, but the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
+        raise ValueError("`rtol` is traced, but the default solver is chosen by its value; give a `solver` "
+            "too, such as diffrax.Dopri8()")
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
@@ -191,24 +197,27 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
     """Return a state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`),
     or None for the scene's example.
 
-    `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
+    `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); velocity rows may
+    depend on them.
     """
     if isinstance(given, State):
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(
-            f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
-            f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
+            f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a "
+            "dictionary of named values, or None for the scene's "
+            f"example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
     model = modelled(model)
     return named_start(model, model.scene.example if given is None else given, one_time(0.0) if t0 is None else t0, inputs)
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):
-    """Return t0, the times to save at, t1; a ValueError if known values are inconsistent."""
+    """Return t0, the saved times, and t1. Raises ValueError if known values are inconsistent."""
     from_state = isinstance(start, State)
     if from_state and start.q.ndim != 1:
-        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
+        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or "
+            "`jax.vmap` for many starts")
     ts = None if ts is None else saved_times(ts)
     t0, t1 = one_time(t0, "t0"), one_time(t1, "t1")
     if t0 is None:
@@ -217,21 +226,23 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         t1 = as_array(t0 + scene.example_span if ts is None else ts[-1], t0.dtype)
     ends = known_numbers((t0, t1)).tolist()
     if ends and not 0 < abs(ends[1] - ends[0]) < np.inf:
-        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
+        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` "
+            "different from `t0`")
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # of known ends: nothing to compile
     elif not known_numbers(times_fit(ts, t0, t1)).all():
-        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = {t1} s "
-            "or in the opposite direction; give `t0` and `t1` that enclose it")
+        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
+            f"{t1} s or in the opposite direction; give `t0` and `t1` that enclose it")
     return t0, ts, t1
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
-    """Return times to save at, on NumPy if known; a ValueError unless they are a monotonic vector of finite
-    numbers.
+    """Return the saved times, on NumPy if known. Raises ValueError unless they are a monotonic vector of
+    finite numbers.
     """
     ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))
     if not ((steps > 0).all() or (steps < 0).all()) or not np.isfinite(known_numbers(ts)).all():
-        raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")
+        raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); "
+            "sort it and drop repeated times")
     return ts

@@ -37,23 +37,24 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
 
-    Differentiable in any mode. The remaining violation is in `residual`, infinite where numbers are not
-    finite (no error: this also runs
-    inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
+    Differentiable in any mode. The remaining violation is in `residual`; it is infinite where numbers are not
+    finite, without an error, since this also runs inside jit and vmap. The quaternion (0, 0, 0, 0) has no
+    direction and stays unchanged, with a residual of 1/2. Raises ValueError for wrong shapes.
     """
     model, scene = modelled(scene), as_scene(scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
     t, q, u = one_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
         if name not in coordinates + speeds:
-            raise ValueError(f"`held` names `{name}`, which is not a coordinate or speed; {nearest(name, coordinates + speeds)}")
+            raise ValueError(f"`held` names `{name}`, which is not a coordinate or speed; "
+                f"{nearest(name, coordinates + speeds)}")
     free_q, free_u = (free_entries(names, tuple(held)) for names in (coordinates, speeds))
     guess = Guess(q, u, free_q, free_u, ~free_entries(coordinates, ()), model.usual(False))
     return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype))
 
 
 def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None = None) -> State:
-    """Return the nearest state; if Newton's method fails, the result of a damped search from q, and then from
+    """Return the nearest state; if Newton's method fails, the result of a damped search from q, then from
     other configurations, `guesses()`.
     """
     given = scene, t, start, inputs
@@ -82,20 +83,20 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
     """Return a consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`,
     or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
-    `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s); values that contradict each other by
-    no more than a few typed digits do, 1.5e-5, move onto the constraints.
-    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
-    where that fails, or leads out of
-    the scene's `domain`, they begin at those of states of the domain, nearest first, as `guess` of the state
-    tells. `near`: coordinates by name, with
-    values from which they begin but at which they are not held; those may be found outside of the domain, as may coordinates of which the rows leave no choice.
-    Of a quaternion that is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the other parts are zero.
-    Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
-    where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
-    `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
-    In a program that is exported, pass `jj.build(scene, backend="xla")` in place of the scene.
-    ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
-    domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
+    `values`, by keyword or in a dictionary `given` (a keyword takes precedence), are kept, at time `t0` (s).
+    Values that contradict each other by at most 1.5e-5, as numbers typed with a few digits may, move onto the
+    constraints. Omitted coordinates begin at zero (a quaternion at the identity) and follow from the rows;
+    where that fails or leaves the scene's `domain`, they begin at states of the domain, nearest first, as
+    `guess` of the state reports. `near`: coordinates by name with starting values at which they are not held;
+    these may end outside of the domain, as may coordinates that the rows determine uniquely. If a quaternion
+    is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other parts are zero. Omitted
+    privileged speeds stay zero, and the dependent speeds follow from the rows; if dependent speeds are given,
+    all others are solved for: the smallest change that satisfies the constraints, in the metric of the mass
+    matrix. `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; velocity rows may
+    depend on their values at `t0`. In a program to export, pass `jj.build(scene, backend="xla")` in place of
+    the scene. Raises ValueError, where values are known, for an unknown name, a value that is not finite, and
+    given values that contradict the constraints or lie in no state of the domain. For unknown values
+    `residual` is infinite instead, and a motion from there ends with a code.
     """
     model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
@@ -107,7 +108,9 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
 
 
 def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NOTHING) -> State:
-    """Return the start that `start` describes; `inputs` at time `t`, which is an array: a vector, or by name (None: zero)."""
+    """Return the start that `start` describes; `inputs` at time `t` (an array): a vector, or by name (None:
+    zero).
+    """
     scene = model.scene
     q, u, given = vectors_named(scene, {**near, **values})
     about = given if near else ()
@@ -115,12 +118,14 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
         given = vectors_named(scene, values)[2]
         for name in near:
             if name not in scene.coordinate_names:
-                raise ValueError(f"`near` names `{name}`, which is not a coordinate; {nearest(name, scene.coordinate_names.entries)}")
+                raise ValueError(f"`near` names `{name}`, which is not a coordinate; "
+                    f"{nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
         for name, value in {**near, **values, "t0": t}.items():
             if not np.all(np.isfinite(known_numbers(value))):
-                raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
+                raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it "
+                    "was computed")
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
     guess = Guess(q, u, *held)
 
@@ -134,11 +139,11 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
-    """Return marks of coordinates and speeds left to the constraints, for given values and guesses as in
-    `Guess`; and whether given values may contradict each other.
+    """Return marks of the coordinates and speeds that constraints determine, for given values and guesses as
+    in `Guess`, and whether given values may contradict each other.
 
-    Privileged speeds that are not given stay at zero, unless a dependent speed is given. Rows may not find coordinates outside of the domain that are neither
-    given nor guessed; but where the rows, affine in them, leave one place.
+    Omitted privileged speeds stay zero, unless a dependent speed is given. Coordinates that are neither given
+    nor guessed must lie in the domain, unless the rows are affine and determine them uniquely.
     """
     scene, known = model.scene, structure_of(model.scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
@@ -156,10 +161,10 @@ def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
-    """Move the start as a whole if its residual is too small to be a contradiction.
+    """Move the start as a whole if its residual is too small for a contradiction.
 
-    Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
-    these parameters contradict each other at others.
+    If the residual is only round-off, the numbers stay. Traced values nevertheless get the derivatives of a
+    moved start, since values that agree at these parameters may contradict each other at others.
     """
     near = start.residual < contradiction(start.q.dtype)
     if not known_numbers(near & (start.residual > OFF * eps_of(start.q))).all():  # more than round-off is left
@@ -179,8 +184,10 @@ def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: Lab
     for k in outside[:1] if float(left_of(jnp.asarray(g))) == 0 else ():
         name, found = scene.coordinate_names.entries[k], float(state.q[k])
         raise ValueError(
-            f"no start of `{who}` was found with `{name}` in its `domain`, {scene.domain[name]}, with the given values held ({held}): the nearest one has "
-            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, to search near it, also outside the domain'
+            f"no start of `{who}` was found with `{name}` in its `domain`, "
+            f"{scene.domain[name]}, with the given values held ({held}): the nearest one has "
+            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, to search '
+            'near it, also outside the domain'
         )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
@@ -189,6 +196,8 @@ def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: Lab
     within = any(bounded and name in scene.domain for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True))
     elsewhere = ", give some as guesses by `near=`, which are looked for outside of the `domain` as well" if within else ""
     raise ValueError(
-        f"the start of `{who}` violates constraint `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} remains with the given values "
-        f"held ({held}); give fewer values and let the constraints decide the rest{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
+        f"the start of `{who}` violates constraint `{names[worst]}`: residual "
+        f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}); give fewer "
+        f"values and let the constraints decide the rest{elsewhere}, or use `jj.consistent(scene, t, q, u)` "
+        "to move all of them"
     )

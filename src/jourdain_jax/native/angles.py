@@ -26,8 +26,8 @@ Triple = tuple[Value, Value, Value]
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """Return a polynomial by Horner's rule, highest power first; of a long one, even and odd powers side by
-    side.
+    """Return the value of a polynomial by Horner's rule, highest power first. For a long one, even and odd
+    powers are evaluated separately.
     """
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
@@ -51,7 +51,7 @@ def two_product(w: Writer, a: Value, b: Value) -> DoubleDouble:
 
 
 def product_less(w: Writer, a: Value, b: Value, c: Value) -> Value:
-    """a b - c, for a c that is close to the product: without round-off."""
+    """Return a b - c without round-off, for a c close to the product."""
     if w.fused:
         return w.fma(a, b, -c)
     (a_high, a_low), (b_high, b_low) = _halves(w, a), _halves(w, b)
@@ -65,7 +65,9 @@ def _halves(w: Writer, a: Value) -> DoubleDouble:
 
 
 def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """q and d of the quotient q - d of two numbers, each with its rest; of a zero it keeps the sign."""
+    """Return q and d of the quotient q - d of two numbers, each of which is in two parts. A zero quotient
+    keeps its sign.
+    """
     inverse = 1.0 / b[0]
     q = a[0] * inverse
     return q, (product_less(w, q, b[0], a[0]) + (q * b[1] - a[1])) * inverse
@@ -119,8 +121,8 @@ def tangent(w: Writer, x: Value) -> Value:
 
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
-    """Return the quick values, with others in lanes with large angles; these are separate functions, so that
-    the usual path skips them.
+    """Return the quick values, replaced in lanes with large angles. Values for large angles come from
+    separate functions, which most calls skip.
     """
     far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
@@ -161,7 +163,9 @@ def _reduced(w: Writer, x: Value) -> Triple:
 
 
 def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDouble, DoubleDouble, Value]:
-    """(r, s), (m, c) and k: the angle that k quarter turns leave has the sine r - s, in which zeros keep their signs, and the cosine m + c."""
+    """Return (r, s), (m, c) and k. After k quarter turns are removed, the angle has the sine r - s and the
+    cosine m + c. A zero sine keeps its sign.
+    """
     square = r * r
     half = 0.5 * square
     most = 1.0 - half
@@ -171,9 +175,10 @@ def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDou
 
 
 def _reduced_far(w: Writer, x: Value) -> Triple:
-    """As `_reduced`, of large angles; NaN for others.
+    """Return the results of `_reduced` for large angles, and NaN for small ones.
 
-    x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
+    x = m 2^e with a whole number m of 53 bits. Only 192 bits of 2/pi are needed: other bits give whole turns,
+    or less than about 2^-126, when multiplied by m.
     """
     bits = (  # the first 1,216 of 2/pi, 64 in each
         0xA2F9836E4E441529,
@@ -249,7 +254,7 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
 
 
 def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
-    """x, with the other sign in the third and fourth quadrant, which have the numbers 2 and 3."""
+    """Return x with the opposite sign in the third and fourth quadrant, which have the numbers 2 and 3."""
     sign = w.binary("shl", quadrant & 2, 62)
     return w.converted("bitcast", w.binary("xor", w.converted("bitcast", x, w.whole), sign), w.real)
 
@@ -280,8 +285,7 @@ def _tiny(a: Value) -> Value:
 
 
 def _direction(w: Writer, across: Value, x: Value) -> Value:
-    """Return the angle from 0 to pi of a point with the coordinates x, `across`; the second is not negative.
-    """
+    """Return the angle from 0 to pi of a point with the coordinates x and `across`, which is not negative."""
     along = w.magnitude(x)
     steep = across > along
     a, b = w.where(steep, along, across), w.where(steep, across, along)
@@ -325,8 +329,8 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> Triple:
-    """Return whether |x| is above 1/2, and the arc whose sine is |x|, or there sqrt((1 - |x|)/2), in two
-    parts.
+    """Return whether |x| is above 1/2, and a number in two parts: the arc whose sine is |x| or, above 1/2,
+    sqrt((1 - |x|)/2).
     """
     a = w.magnitude(x)
     large = a > 0.5

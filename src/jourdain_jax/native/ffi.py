@@ -50,15 +50,15 @@ def version() -> tuple[int, int] | None:
     found = _stated_version()
     if found is None:
         warnings.warn(
-            "this jaxlib has an unknown foreign function interface: motions are integrated by XLA, more slowly; "
-            "install a supported version of jaxlib",
+            "this jaxlib has an unknown foreign function interface: motions are integrated by XLA, more "
+            "slowly; install a supported version of jaxlib",
             stacklevel=2,
         )
     return found
 
 
 def reason_against() -> str:
-    """Return why no machine code of our own can be called here; empty where it can."""
+    """Return why none of our machine code can be called here; empty if it can."""
     if (backend := jax.default_backend()) not in ("cpu", "gpu"):
         return f"it is made for CPUs and NVIDIA GPUs, not for JAX's backend {backend}"
     if reason := host.reason_against() if backend == "cpu" else nvidia.reason_against():
@@ -69,7 +69,7 @@ def reason_against() -> str:
 
 
 def devices() -> str:
-    """Return the note on devices of machine code, if there are others than the CPU."""
+    """Return the note on devices of machine code, if there are any besides the CPU."""
     return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
 
 
@@ -79,7 +79,8 @@ def _stated_version() -> tuple[int, int] | None:
     except OSError:
         return None
     numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]
-    same = all(_members(header, struct) == f"struct_size extension_start {rest}" for struct, rest in _LAYOUTS.items())
+    same = all(_members(header, struct) == "struct_size extension_start "
+        f"{rest}" for struct, rest in _LAYOUTS.items())
     functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[:5:4]
     if not same or functions != _FUNCTIONS or None in numbers:
         return None
@@ -107,8 +108,7 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes but the last ones, 1 or 3 of them on a GPU, where the host
-    has found it.
+    """Return the product of the sizes of all axes except the last 1 or 3, as the host computed it for a GPU.
     """
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
@@ -122,7 +122,9 @@ def product(w: Writer, x: Given, but: int) -> Value:
 def write_handler(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write a handler that calls `body` with all arguments and results; on a GPU the kernel that does so."""
+    """Write a handler that calls `body` with all arguments and results; on a GPU it calls the kernel that
+    does so.
+    """
     if w.device:
         return _write_kernel(w, arguments, results, body)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
@@ -152,7 +154,9 @@ def answer_metadata(w: Writer, frame: Value) -> None:
 def _write_kernel(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """`kernel(words)`, which every thread of a GPU runs; the last result is memory of the call's own."""
+    """Write `kernel(words)`, which every thread of a GPU runs. The last result is memory that belongs to this
+    call.
+    """
     with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
         words = Value(w, "ptr", "%words")
         each = [Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
@@ -168,8 +172,8 @@ def given(w: Writer, buffer: Value) -> Given:
 
 
 def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:
-    """Return the results of a `call` of machine code in a program of JAX, arrays in single precision
-    converted; `more`: avals of results besides, which go.
+    """Return the results of a `call` of machine code in a program of JAX, with arrays in single precision
+    converted; `more`: avals of further results, which are dropped.
     """
 
     def converted(x, old, new):
@@ -213,7 +217,9 @@ NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the nex
 
 
 def start_counting(w: Writer, job: Value, word: int) -> None:
-    """Reset the count of samples taken: a word of a job, or on a GPU its target."""
+    """Reset the count of samples taken. The count is a word of the job; on a GPU, the word to which it
+    points.
+    """
     w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
 
 
@@ -228,7 +234,7 @@ def lanes_taken(w: Writer, job: Value, word: int) -> Value:
 
 
 def share(w: Writer, job: Value, count: Value) -> None:
-    """Call the module's `loop(job)` in as many threads as the writer allows, in fewer for small batches."""
+    """Call the module's `loop(job)` in as many threads as the writer allows; in fewer for small batches."""
     threads = w.threads
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room(threads, "i64"), w.room(type="i64")
     w.store(w.literal(0, "i64"), started)
@@ -250,8 +256,8 @@ def share(w: Writer, job: Value, count: Value) -> None:
 
 
 class OfLane(NamedTuple):
-    """The numbers of one lane in an array of a batch: where the first one is, and how far the next is from
-    it.
+    """The numbers of one lane in an array of a batch: the position of the first one, and the distance to the
+    next.
     """
 
     first: Value
@@ -267,9 +273,10 @@ class OfLane(NamedTuple):
 
 
 def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
-    """Return the numbers of one of `count` lanes in an array, which follow one another on a CPU.
+    """Return the numbers of one of `count` lanes in an array; on a CPU they are contiguous.
 
-    On a GPU lanes come last: neighbouring threads, which begin and save together, touch neighbouring words.
+    On a GPU lanes come last: neighbouring threads, which begin and save together, then access neighbouring
+    words.
     """
     return (
         OfLane(w.at(array, lane, "double"), count)
@@ -291,9 +298,10 @@ def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane)
 
 
 def write_rows(w: Writer, given: int, returned: int) -> None:
-    """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
+    """Write a handler from rows of `given` numbers to rows of `returned` ones, with lanes side by side, by
+    the module's `row(given, returned)`.
 
-    Places for which no row is left compute the last one once more.
+    Lanes beyond the last row compute that row again.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")

@@ -115,7 +115,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
     with _loading:
         if number not in _kernels:
             if len(_kernels) == MOST_KERNELS:
-                raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most that it can keep; start a new one")
+                raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most "
+                    "that it can keep; start a new one")
             ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
             _kernels[number] = found = nvidia.loaded(ptx, ffi.KERNEL)
             place = _WORDS * (len(_kernels) - 1)
@@ -125,8 +126,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the axes of an array, that of neighbours in memory first: of `lanes`, its first ones, before all
-    others.
+    """Return the order of an array's axes in memory, the fastest first. The axes of `lanes`, which are its
+    first ones, come before all others.
     """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 
@@ -134,9 +135,7 @@ def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
 def lowered(
     ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel, batch: tuple[int, ...], samples: int
 ) -> list:
-    """Return the call of a kernel for a batch, whose lanes come last but in samples, the first of the
-    arguments.
-    """
+    """Return the call of a kernel for a batch. Its lanes come last, except in samples, the first argument."""
     lanes = math.prod(batch)
     slot, allowed = kernel.scratch
     # of all threads, and no more than an eighth of the device: so many slots

@@ -77,7 +77,7 @@ def reason_against() -> str:
 @functools.cache
 def features() -> dict[str, bool]:
     """Return the features of the processor. LLVM reports none for Apple's; every 64-bit ARM processor has
-    vector registers, and fuses products and sums.
+    vector registers and fused multiply-add.
     """
     found = dict(llvm.get_host_cpu_features())
     return found | {"neon": True} if llvm.get_process_triple().startswith(("aarch64", "arm64")) else found
@@ -89,7 +89,7 @@ def lanes() -> int:
 
 
 def registers() -> int:
-    """Return the number of values that may be kept in vector registers; four are reserved for instructions.
+    """Return the number of values that fit in vector registers; four registers are reserved for instructions.
     """
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
@@ -120,7 +120,7 @@ def description() -> str:
 
 
 def object_code(text: str, effort: int) -> bytes:
-    """Machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as of `EFFORT`."""
+    """Return the machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as of `EFFORT`."""
     effort = min(effort, EFFORT)
     with _lock:
         machine, few_passes = _machine(effort), effort < 2
@@ -153,7 +153,7 @@ _DIGEST = 32  # bytes
 
 
 def folder() -> Path | None:
-    """Return the cache folder; None if `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
+    """Return the cache folder; None if `JOURDAIN_JAX_CACHE` is 0 or there is no place for it."""
     stated = os.environ.get("JOURDAIN_JAX_CACHE", "")
     if stated == "0":
         return None
@@ -168,10 +168,10 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """Return the result of `make`, from the file of this name if it is whole, otherwise made and stored; a
+    """Return the result of `make`: from the file of this name if it is intact, otherwise made and stored. A
     failing disk is no error.
 
-    `made_by`: what else must be the same, versions of what makes it, as text.
+    `made_by`: further conditions for equality, namely versions of the tools, as text.
     """
     place = folder()
     if place is None or not _is_ours(place):
@@ -192,7 +192,7 @@ def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
 
 
 def _is_ours(place: Path) -> bool:
-    """Return whether the folder, made if missing, can be used; otherwise warn with the reason."""
+    """Return whether the folder, created if missing, can be used; otherwise warn with the reason."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         against = _against(os.stat(place))
@@ -216,8 +216,8 @@ def _against(found: os.stat_result) -> str:
 
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"the folder `{place}` is not used as cache of machine code, which is therefore compiled in each process: "
-        f"{against}; name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
+        f"the folder `{place}` is not used as cache of machine code, which is therefore compiled in each "
+        f"process: {against}; name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
         stacklevel=2,
     )
 

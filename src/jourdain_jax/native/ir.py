@@ -85,11 +85,10 @@ class Value:
 
 
 class Writer:
-    """A module of functions on vectors of `lanes` doubles; `fused`: products and sums are rounded once where `fma` asks for it.
+    """Writes a module of functions on vectors of `lanes` doubles; `fused`: whether `fma` rounds once.
 
-    `threads`: among which many lanes are shared on a CPU; `device`: whether the module is for a GPU. There `scratch` says how many doubles a slot of a
-    thread's memory outside it takes (0: it needs none), and how many bytes those of all threads may.
-    """
+    `threads`: the number of threads that share the lanes on a CPU. `device`: whether it is for a GPU; then
+    `scratch` states the doubles of external memory per slot (0: none) and the bytes for all threads."""
 
     eps = 2.0**-52
 
@@ -120,7 +119,7 @@ class Writer:
 
     @contextmanager
     def procedure(self, name: str, arguments: str) -> Iterator[list[Value]]:
-        """A function that returns nothing; `arguments`: names of pointers, and `name:type` of others, `real` for one number per lane."""
+        """Write a function without result; `arguments`: pointers, and others as `name:type`."""
         known, pairs = {"": "ptr", "real": self.real, "noalias": "ptr noalias"}, (argument.partition(":") for argument in arguments.split())
         types = {n: known.get(type, type) for n, _, type in pairs}
         with self.function(name, "void", types, attributes="noinline") as given:
@@ -208,7 +207,7 @@ class Writer:
         return self.literal(value, self.real)
 
     def binary(self, op: str, a: Value, b) -> Value:
-        """A sum, difference, product or quotient; an operation on truth values or whole numbers, bit by bit."""
+        """Return a sum, difference, product or quotient, or a bitwise operation."""
         b, prefix = self.literal(b, a.type), "f" if "double" in a.type else ""
         return self.instruction(a.type, f"{prefix}{op} {a.type} {a.name}, {b.name}")
 
@@ -250,7 +249,7 @@ class Writer:
         self._declared[name] = text
 
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
-        """The result of a function of vectors that stands in the module once, so that each use takes one call to compile; `body(w, *arguments)` writes it."""
+        """Return the result of a function that the module has once; `body(w, *arguments)` writes it."""
         function = f"shared_{name}"
         self.once(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, lambda w, *given: w.give(body(w, *given)))
         return self.call(function, self.real, *arguments)
@@ -307,7 +306,7 @@ class Writer:
         return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
 
     def together(self, a: Value) -> Value:
-        """Whether a truth value holds in any thread of a warp, which come together here; on a CPU, the value."""
+        """Return whether a value is true in any thread of a warp, which waits here; on a CPU, the value."""
         return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
 
     def thread(self) -> tuple[Value, Value]:
@@ -330,7 +329,7 @@ class Writer:
         return Value(self, "ptr", f"@{name}")
 
     def room(self, count: int = 1, type: str = "") -> Value:
-        """Memory for some values (one number per lane, unless of another type), one piece per call of the function."""
+        """Return memory for some values (by default one per lane), one piece per call of the function."""
         self._count += 1
         type = type or self.real
         self._lines.insert(self._entry, f"  %v{self._count} = alloca {type}, i64 {count}, align 64")
@@ -348,13 +347,13 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, even where LLVM would keep it in a register; others, and on a GPU all, unchanged."""
+        """Return a value reloaded from memory, so that it needs no register; on a GPU, the value."""
         if self.device:
             return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Pointers to some rows of memory, each in a register of its own, unknown to LLVM as related: rows nearby are reached by short offsets."""
+        """Return pointers to rows of memory, in own registers; LLVM reaches rows near them by offsets."""
         assert not self.device
         found, place = [], self.room(type="ptr")
         for row in rows:
@@ -363,11 +362,11 @@ class Writer:
         return found
 
     def counted_up(self, pointer: Value, index) -> Value:
-        """Return a whole number in memory, which becomes one more, also where several threads ask."""
+        """Increment a whole number in memory and return it; several threads may do so at once."""
         return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
 
     def store(self, value, pointer: Value, index=0) -> Value:
-        """Puts a value, or a number in all lanes, into memory; the value, as one that is there."""
+        """Store a value, or one number for all lanes, in memory, and return it."""
         value = self.literal(value, self.real)
         place = self.at(pointer, index, value.type).name
         self._lines.append(f"  store {value.type} {value.name}, ptr {place}")
@@ -375,7 +374,7 @@ class Writer:
 
 
 def _inlined(text: str) -> str:
-    """Return a module with functions inlined that are called once, or small; the others are marked `noinline`."""
+    """Return a module with small functions and those called once inlined; others are `noinline`."""
     parts = {found[1]: found[0] for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)}
     calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
     sizes: dict[str, int] = {}

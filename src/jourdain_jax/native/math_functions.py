@@ -70,7 +70,9 @@ def _within(w: Writer, x: Value, low: float, high: float) -> Value:
 
 
 def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Value, Value]:
-    """k and two parts of p, where e^(x + more) = 2^k (1 + p); |x| < 2000, and `more` is small beside it."""
+    """Return k and p, the latter in two parts, for e^(x + more) = 2^k (1 + p); |x| < 2000, and `more` is
+    small relative to it.
+    """
     shifted = w.fma(x, 1 / math.log(2.0), WHOLE)
     turns, k = shifted - WHOLE, w.converted("bitcast", shifted, w.whole) - _bits(WHOLE)
     near = w.fma(-turns, _LN2[0], x)  # exact
@@ -93,7 +95,7 @@ def exponential(w: Writer, x: Value) -> Value:
 
 
 def _mantissa(w: Writer, x: Value) -> DoubleDouble:
-    """k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for an x that is positive and finite."""
+    """Return k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for an x that is positive and finite."""
     small = x < 2.0**-1022
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
     biased = w.binary("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
@@ -140,7 +142,9 @@ def logarithm(w: Writer, x: Value) -> Value:
 
 
 def _logarithm_of_more(w: Writer, x: Value, more: Value | float = 0.0, plus: Value | float = 0.0) -> Value:
-    """log(1 + x + more) + plus, where `more` is small beside x, and `plus` is no larger than the logarithm."""
+    """Return log(1 + x + more) + plus, where `more` is small relative to x, and `plus` is at most as large as
+    the logarithm.
+    """
     near = 1.0 + x
     head, less = _logarithm(w, near)
     found = head + ((less + (w.where(x < 1.0, (1.0 - near) + x, (x - near) + 1.0) + more) / near) + plus)
@@ -170,7 +174,7 @@ def _logarithm_with(w: Writer, a: Value, x: Value, more: Value) -> Value:
 
 
 def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
-    """asinh x = log(1 + a + a^2/(1 + sqrt(1 + a^2))), where a = |x|"""
+    """Return asinh x = log(1 + a + a^2/(1 + sqrt(1 + a^2))), where a = |x|."""
     a = w.magnitude(x)
     square, less = two_product(w, a, a)
     total, rest = _sum(w, square, 1.0)
@@ -180,7 +184,7 @@ def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_arccosine(w: Writer, x: Value) -> Value:
-    """acosh x = log(1 + t + sqrt(t^2 + 2t)), where t = x - 1"""
+    """Return acosh x = log(1 + t + sqrt(t^2 + 2t)), where t = x - 1."""
     t = x - 1.0
     square, less = two_product(w, t, t)
     total, rest = _sum(w, square, t + t)
@@ -202,7 +206,9 @@ def cube_root(w: Writer, x: Value) -> Value:
 
 
 def remainder(w: Writer, x: Value, y: Value) -> Value:
-    """x less as many whole y as take it towards zero, without round-off: 50 bits of how many at a time."""
+    """Return the remainder of x after whole multiples of y towards zero, without round-off: 50 bits of the
+    quotient at a time.
+    """
     a, b = w.room(), w.magnitude(y)
     w.store(w.magnitude(x), a)
     right = (b > 0.0) & (w.load(a) < math.inf)
@@ -270,7 +276,7 @@ def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
 
 
 def _plus(a: float, head: Value, rest: Value) -> DoubleDouble:
-    """a + (head + rest), for an a no smaller than the head or a sum that is by far larger than a."""
+    """Return a + (head + rest). Either |a| is at least |head|, or the sum is far larger than a."""
     total, less = two_sum(a, head)
     return total, less + rest
 

@@ -47,7 +47,7 @@ def driver() -> ctypes.CDLL:
 
 @functools.cache
 def reason_against() -> str:
-    """Return the reason why no machine code is made here for GPUs; empty if it is."""
+    """Return the reason why no machine code for GPUs is made here; empty if it is."""
     if reason := host.reason_against() or reason_against_text():
         return reason
     try:
@@ -85,7 +85,7 @@ def _checked(code: int) -> None:
 
 
 def _said(function: str, *what, found=ctypes.c_int) -> int:
-    """Return the number that the driver puts where the first argument of a function points."""
+    """Return the number that the driver stores where the first argument of a function points."""
     number = found()
     _checked(getattr(driver(), function)(ctypes.byref(number), *what))
     return number.value
@@ -101,7 +101,9 @@ def _of_device(attribute: int) -> int:
 
 
 def _capabilities() -> list[int]:
-    """Ten times the compute capabilities for which there is text that all devices take: a GPU takes that of older ones."""
+    """Return ten times the compute capability for which to compile. All present devices accept it, since a
+    GPU runs the code of older ones.
+    """
     major, minor = 75, 76  # attributes of a device
     own = [10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device) for device in _devices()]
     return [known for known in (75, 80, 86, 89, 90, 100, 120) if known <= min(own)]
@@ -133,7 +135,7 @@ def text_for(module: str, architecture: str) -> str:
 
 @contextmanager
 def _in_context() -> Iterator[None]:
-    """Run the code inside in the first device's context of this process, which JAX shares."""
+    """Run the code inside in this process's context of the first device, which JAX shares."""
     context = ctypes.c_void_p()
     _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
     _checked(driver().cuCtxPushCurrent_v2(context))
@@ -154,8 +156,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for so many samples: as many as registers allow, with local memory in the
-    first cache, unless these are too few.
+    """Return the number of warps for these `lanes`: as many as registers allow with local memory in the first
+    cache, unless that is too few.
     """
     # attributes of a device: 82 its registers, 81 what of its cache can be shared memory, 16 its multiprocessors
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))

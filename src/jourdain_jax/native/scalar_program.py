@@ -22,18 +22,18 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 @dataclass
 class Turn:
-    """Values loaded before a value is computed, and stored after it, each with its place."""
+    """The values to load before a value is computed, and the values to store after it, each with its place.
+    """
 
     loaded: list[int]
     stored: list[tuple[int, int]] = field(default_factory=list)
 
 
 def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int) -> tuple[list[Turn], int]:
-    """Return a turn for each computed value, and the number of places in memory.
+    """Return the loads and stores (a `Turn`) for each computed value, and the number of places in memory.
 
-    `uses`: the values in order, each with those that it is made of; `there`: those that are in memory
-    already. A place is reused once its value
-    is no longer needed.
+    `uses`: the values in order, each with its operands; `there`: values that are already in memory. A place
+    is reused once its value is no longer needed.
     """
     made_of = [tuple(dict.fromkeys(values)) for _, values in uses]
     coming: dict[int, list[int]] = {}
@@ -89,8 +89,8 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
 
 
 def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
-    """Return values of the outputs, given inputs and nodes computed before; `by_llvm`: LLVM allocates the
-    registers.
+    """Return values of the outputs, from inputs and from nodes computed before; `by_llvm`: whether LLVM
+    allocates the registers.
     """
     return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]
 
@@ -98,8 +98,8 @@ def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int,
 def written_in_turn(
     w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
 ) -> Iterator[tuple[int, Value]]:
-    """Yield the number and the value of each output as soon as it is computed, so that its use is written
-    next. Known values stay in memory.
+    """Yield index and value of each output as soon as it is computed, so that its use is written next. Known
+    values stay in memory.
     """
     numbers: dict[int, list[int]] = {}
     for number, node in enumerate(outputs):
@@ -127,7 +127,9 @@ def written_in_turn(
 
 
 class _AtHand:
-    """Puts values of a long function that wait for their next use into memory, and takes them from there, as `turns` has it."""
+    """Keeps values of a long function in memory until their next use, and loads them from there, as `turns`
+    decides.
+    """
 
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
         self.w, self.values, self.places = w, values, dict(values)
@@ -192,7 +194,9 @@ def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[in
 
 
 def _fused(w: Writer, graph: Graph, op: str, args: tuple[int, ...], fusible: set[int], values: Mapping[int, Value]) -> Value:
-    """x y + b, b - x y or x y - b, where only the first product of two is fused."""
+    """Return x y + b, b - x y or x y - b as a fused multiply-add. If both terms are products, the first one
+    is fused.
+    """
     which = 0 if args[0] in fusible else 1
     x, y = (as_real(w, values[a]) for a in graph.args[args[which]])
     other = args[1 - which]

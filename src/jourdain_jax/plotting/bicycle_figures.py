@@ -15,7 +15,9 @@ _CEILING = 12.0  # 1/s; castering goes far below what matters
 
 
 def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
-    """Real and imaginary parts against forward speed; bands are the 2.5 and 97.5 % quantiles of the samples, of the speeds too; the stable range is green."""
+    """Draw real and imaginary parts against forward speed. Bands are the 2.5 and 97.5 % quantiles of the
+    samples, also of the speeds; the stable range is green.
+    """
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")
     nominal, samples = study.eigenvalues[0], study.eigenvalues[1:][study.physical]
@@ -26,9 +28,11 @@ def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
     _mark_range(study, (real, imaginary))
     real.axhline(0.0, color="0.3", lw=0.8)
     real.set(ylim=(-_CEILING, _CEILING), ylabel="real part in 1/s")
-    imaginary.set(ylabel="imaginary part in rad/s", xlabel="forward speed in m/s", xlim=(study.grid[0], study.grid[-1]))
+    imaginary.set(ylabel="imaginary part in rad/s", xlabel="forward speed in "
+        "m/s", xlim=(study.grid[0], study.grid[-1]))
     imaginary.set_ylim(bottom=0.0)
-    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands, grey for the speeds, hold 95 % of {len(samples)} samples", fontsize=10)
+    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands, grey for the speeds, hold "
+        f"95 % of {len(samples)} samples", fontsize=10)
     real.legend(loc="lower right", fontsize=9)
     for axis in (real, imaginary):
         axis.grid(alpha=0.3)
@@ -88,4 +92,5 @@ def animate_ride(study: Study, path: str | os.PathLike) -> None:
     """The first ride (below the stable range) in space, the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)
-    animate(lane, path, follow=True, paths=[], title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}")
+    animate(lane, path, follow=True, paths=[], title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, "
+        f"{rides.labels[0]}")

@@ -17,7 +17,7 @@ _CELLS = 48  # of a mesh, along each of its two parameters
 
 
 def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.ndarray) -> list[dict]:
-    """Return planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from
+    """Return planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} in and near the box from
     `low` to `high`, m, at the first time.
     """
     found: dict[bytes, dict] = {}
@@ -59,7 +59,9 @@ def _plane(origin, axes, low, high) -> dict:
 
 
 def floor_under(low, high) -> float:
-    """Height (m) of a floor under the box from `low` to `high`: z = 0 where bodies stand on it, else below them."""
+    """Return the height (m) of a floor under the box from `low` to `high`: z = 0 if bodies stand on it,
+    otherwise below them.
+    """
     side = float(max(high - low))
     return 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
 

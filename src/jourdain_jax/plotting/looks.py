@@ -29,7 +29,7 @@ PLAIN = "#8a8a86"  # of what belongs to no body
 
 @dataclass(frozen=True)
 class DrawnBody:
-    """A body at all times; the inertial frame is one of the name `""`, at rest."""
+    """A body at all times. The inertial frame is a body at rest with the name `""`."""
 
     name: str
     colour: str
@@ -56,7 +56,7 @@ class Drawn:
 
     @property
     def size(self) -> float:
-        """The longest side of the box that holds all bodies at the first time, m."""
+        """Return the longest side (m) of the box that holds all bodies at the first time."""
         return float(max(np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(), 1e-3))
 
     @property
@@ -66,12 +66,13 @@ class Drawn:
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
-    """Return the drawing of a motion, at most so many of its saved times, evenly chosen; ValueError if it
+    """Return the drawing of a motion at `most` saved times at most, evenly spaced. Raises ValueError if it
     reached none of them.
     """
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
-        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; give earlier `ts`")
+        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; give "
+            "earlier `ts`")
     if most is not None and most < reached.size:
         reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
     return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))
@@ -119,7 +120,7 @@ def _seen(scene, t, q, u, inputs):
 
 
 class Curved(eqx.Module):
-    """A placeholder for a ground given by a function of one instant: the scene is evaluated again where the
+    """A placeholder for a ground that is a function of one instant: the scene is evaluated again where the
     ground is drawn.
     """
 
@@ -129,8 +130,8 @@ def _at(tree, index):
 
 
 def _corners_of(visual: Visual) -> np.ndarray:
-    """Return points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of
-    a line its own, with a leading axis of times.
+    """Return points (points, 3) in the frame of the body, m, whose box holds the shape at the first time. For
+    a line they are its own, with a leading axis of times.
     """
     if visual.kind == "line":
         return np.asarray(visual.size)
@@ -146,7 +147,7 @@ def _corners_of(visual: Visual) -> np.ndarray:
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
-    """Return looks of a `body` at one time, which rolls by `shapes`; `dot` (m): radius of a body without
+    """Return the shapes of a `body` at one time, which rolls on `shapes`; `dot` (m): radius of a body without
     size.
     """
     if isinstance(body, Particle):
@@ -183,7 +184,7 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
     """Return the uniform box of this mass and inertia: `a^2 = 6 (B + C - A)/m` from its principal moments A,
-    B, C; none where one of its sides is not positive.
+    B, C; none if one of its sides is not positive.
     """
     moments, axes = np.linalg.eigh(np.asarray(body.inertia))
     mass = float(body.mass)

@@ -30,7 +30,7 @@ class Display:
 
 @dataclass
 class Numbers:
-    """A run of 32-bit floats, and where in it arrays are: pairs of first and count."""
+    """A list of 32-bit floats, and the location of arrays in it: pairs of first index and count."""
 
     parts: list[np.ndarray] = field(default_factory=list)
     count: int = 0
@@ -130,7 +130,9 @@ def _ground(numbers: Numbers, ground: dict) -> dict:
 
 
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
-    """Quaternions (times, 4), x y z w, of rotation matrices (times, 3, 3), each as near to the one before as its sign lets it."""
+    """Return quaternions (times, 4), x y z w, of rotation matrices (times, 3, 3). Each has the sign that
+    brings it nearest to the one before.
+    """
     found = matrices_to_quaternions(rotations)[:, [1, 2, 3, 0]]
     signs = np.sign(np.sum(found[1:] * found[:-1], axis=1))
     found[1:] *= np.cumprod(np.where(signs == 0, 1, signs))[:, None]
@@ -138,7 +140,9 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """Return whole turns of a body between saved times, besides the shortest rotation, for fast wheels."""
+    """Return the whole turns of a body between saved times, which fast wheels make in addition to the
+    shortest rotation.
+    """
     if len(ts) < 2:
         return np.zeros(1)
     a, b = quaternions[:-1], quaternions[1:]
@@ -167,8 +171,8 @@ def _moves(body: DrawnBody) -> bool:
 
 
 def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
-    """Return points (points, 3), m, whose box holds the bodies at any one time, from their middle at that
-    time.
+    """Return points (points, 3), m, relative to the middle of the bodies at each time, whose box holds the
+    bodies at that time.
     """
     points = []
     for one in drawn:
@@ -179,11 +183,11 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
-    """Return name, point and scaled force of every contact at all times, of all motions; and the force of the
-    longest arrow.
+    """Return name, point and scaled force of every contact at all times, of all motions, and the force that
+    the longest arrow represents.
 
-    Where a few forces are far larger than the others (a fall, a configuration that is nearly singular), the longest arrow stands for these and for less,
-    so that the others are seen.
+    If a few forces are far larger than the others (a fall, a nearly singular configuration), all of them have
+    the longest arrow, so that the others remain visible.
     """
     found = []
     for motion, one in zip(motions, drawn, strict=True):

@@ -40,9 +40,11 @@ def animate(
 ) -> None:
     """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
 
-    - `frames`: at most so many, evenly chosen from the saved times; the playing time is the motion's own, 2 to 12 s.
+    - `frames`: their largest number; frames are evenly spaced saved times. The playing time is the motion's
+      own, between 2 and 12 s.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
-    - `follow`: keep the view on the bodies as they move, instead of showing the whole path. `view`: elevation and azimuth in degrees.
+    - `follow`: move the view with the bodies instead of showing the whole path. `view`: elevation and azimuth
+      in degrees.
     - `title`: a line above the drawing (default: none).
 
     ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
@@ -88,7 +90,8 @@ def draw_still(
 ) -> None:
     """Draw a motion as one picture: its bodies, solid, at a few times, earlier ones paler, and the paths of points.
 
-    - `at`: times in s (the nearest saved ones are drawn), or how many, evenly spaced from the start to the end.
+    - `at`: times in s (the nearest saved ones are drawn), or their number, evenly spaced from the start to
+      the end.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
     - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
 
@@ -96,7 +99,8 @@ def draw_still(
     """
     _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
     if isinstance(view, str) and view not in VIEWS:
-        raise ValueError(f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, or elevation and azimuth in degrees")
+        raise ValueError(f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
+            "or elevation and azimuth in degrees")
     plt, drawn = pyplot(), looks_of(trajectory)
     wanted = np.asarray(at, float) if not isinstance(at, int) else np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
     chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
@@ -113,10 +117,10 @@ def draw_still(
 
 def scene_picture(scene) -> str:
     """Return HTML of a scene's bodies at its `example`, in space, on a floor with their shadows; empty if
-    there are none.
+    there are no bodies.
 
-    A scene that cannot be started has no picture: a notebook displays unfinished scenes, and `jj.start`
-    reports their faults.
+    A scene that cannot be started has no picture, since a notebook also displays unfinished scenes;
+    `jj.start` reports their faults.
     """
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
@@ -127,7 +131,8 @@ def scene_picture(scene) -> str:
 
 def _check_one(trajectory, where: str, example: str) -> None:
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
-        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a rollout give one lane: {example}")
+        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a rollout "
+            f"give one lane: {example}")
 
 
 def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:

@@ -33,7 +33,8 @@ def check_format(path: str | os.PathLike) -> None:
     check_place(path)
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
-        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
+        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows "
+            f"no `{suffix or 'file without suffix'}`")
 
 
 @of_known_numbers
@@ -49,13 +50,17 @@ def plot(
 ) -> tuple[Any, Any]:
     """Plot named quantities of a `motion` against time, one panel each.
 
-    - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour; `labels`: what the legend calls each of them.
-    - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"`, `"energy"`, their sum (default: all coordinates of the first motion). Of a
-      rollout, coordinates and speeds: the median of all lanes that are still under way, and a band for each number in `bands`, the part of them that it holds.
-    - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians). Coordinates: m, km, cm, mm, rad, mrad, deg,
-      turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s, rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
-    - A family (`jj.family`) is drawn against its own values: `jj.plot(turns, "x_rate", "lean")`, stable parts in full, special points marked.
-    - `title`: default: of a rollout, how its lanes ended. `path`: where to write it (.png, .svg, .pdf); `axes`: existing axes, one per name.
+    - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour;
+      `labels`: their names in the legend.
+    - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"`, `"energy"`, their sum (default:
+      all coordinates of the first motion). For a rollout, coordinates and speeds only: the median of all
+      lanes that are still under way, and a band for each fraction of the lanes in `bands`.
+    - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians).
+      Coordinates: m, km, cm, mm, rad, mrad, deg, turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s,
+      rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h. - A family (`jj.family`) is drawn against its own
+      values: `jj.plot(turns, "x_rate", "lean")`, stable parts as full lines, special points marked.
+    - `title`: default: for a rollout, the results of its lanes. `path`: of a file to write (.png, .svg,
+      .pdf); `axes`: existing axes, one per name.
 
     Returns the matplotlib figure and an array of its axes, shape (names,). KeyError for an unknown name, with the nearest valid one; ValueError for an
     unknown unit, bands outside 0 to 1, or anything that is not a motion; ImportError without matplotlib.
@@ -104,11 +109,12 @@ def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands:
 
 
 def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
-    """Return every further name against the first one: stable parts in full, others dashed, special points
-    marked.
+    """Draw every further name against the first one: stable parts as full lines, others dashed, special
+    points marked.
     """
     if len(names) < 2:
-        raise ValueError(f"`plot` of a family takes the name on the horizontal axis and at least one name on the vertical axis, but {len(names)} were given")
+        raise ValueError("`plot` of a family takes the name on the horizontal axis and at least one name on "
+            f"the vertical axis, but {len(names)} were given")
     scene = family.equations.scene
     sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
     label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
@@ -136,15 +142,16 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
         axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
     axes = np.atleast_1d(axes)
     if len(axes) != len(names):
-        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names, expected one for each of {', '.join(names)}")
+        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names, expected one for each of "
+            f"{', '.join(names)}")
     for axis in axes:
         axis.grid(alpha=0.3)
     return axes
 
 
 def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
-    """Return name -> unit and its size in SI; KeyError for an unknown name, ValueError for an unknown unit,
-    or one of something else.
+    """Return name -> unit and its size in SI. Raises KeyError for an unknown name, ValueError for an unknown
+    unit or one of another quantity.
     """
     check_kind(units, Mapping | None, "`units`", 'a dictionary from names to units, such as {"lean": "deg"}')
     kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
@@ -164,7 +171,8 @@ def _checked_motions(given) -> list[Trajectory | Rollout]:
     for k, one in enumerate(motions):
         if not isinstance(one, Rollout | Trajectory):
             where = f" in place {k}" if several else ""
-            raise ValueError(f"`plot` was given {described(one)}{where}, expected a motion from `jj.simulate` or a rollout")
+            raise ValueError(f"`plot` was given {described(one)}{where}, expected a motion from "
+                "`jj.simulate` or a rollout")
     if not motions:
         raise ValueError("`plot` was given an empty list, expected motions from `jj.simulate` or rollouts")
     return motions
@@ -174,7 +182,8 @@ def _checked_labels(labels, count: int) -> list[str]:
     if labels is None:
         return [""] if count == 1 else [f"motion {k}" for k in range(count)]
     if isinstance(labels, str) or len(labels) != count:
-        raise ValueError(f"`labels` is {labels!r}, expected a list with one label for each of {count} motions")
+        raise ValueError(f"`labels` is {labels!r}, expected a list with one label for each of {count} "
+            "motions")
     return [str(label) for label in labels]
 
 
@@ -184,7 +193,8 @@ def _checked_bands(bands) -> list[float]:
     except (TypeError, ValueError):
         parts = [np.nan]
     if not all(0 < part < 1 for part in parts):
-        raise ValueError(f"`bands` is {bands!r}, expected fractions of the lanes between 0 and 1, such as (0.5, 0.95)")
+        raise ValueError(f"`bands` is {bands!r}, expected fractions of the lanes between 0 and 1, such as "
+            "(0.5, 0.95)")
     return parts
 
 
@@ -193,7 +203,9 @@ def _scene(motion: Trajectory | Rollout):
 
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """A line; of a rollout the bands, widest and palest first, and the median, `y` as `_values` gives them."""
+    """Draw a line; for a rollout the bands, widest and palest first, and the median, with `y` as returned by
+    `_values`.
+    """
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
     if many:
@@ -206,8 +218,8 @@ def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], co
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:
-    """Return values at all times; of a rollout the lower and the upper end of each band in turn, and the
-    median last.
+    """Return values at all times; for a rollout the lower and upper end of each band in turn, then the
+    median.
     """
     many, scene = isinstance(motion, Rollout), _scene(motion)
     valid = (*scene.coordinate_names, *scene.speed_names, *(() if many else ENERGIES))

@@ -27,7 +27,9 @@ class View:
         self.html, self.title, self.height = page, title, height
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the page to `path` (.html), one file that needs no other and no network; ValueError for another suffix."""
+        """Write the page to `path` (.html), one file that needs neither other files nor a network. Raises
+        ValueError for another suffix.
+        """
         _check_suffix(path)
         with open(path, "w", encoding="utf-8") as file:
             file.write(self.html)
@@ -44,14 +46,18 @@ class View:
 def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.PathLike[str] | None = None, **how: Any) -> View:
     """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
-    - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly chosen), drawn one over the other, all but the first
-      translucent.
-    - `path`: a file (.html) to write as well: it holds all it needs. `ride.html#t=2.5` opens at 2.5 s.
-    - `how`, by name: `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels (480).
+    - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly
+      spaced), drawn one over the other, all but the first translucent.
+    - `path`: a file (.html) to write as well, which needs no other file. `ride.html#t=2.5` opens at 2.5 s.
+    - `how`, by name: `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels
+      (480).
     - `play`: whether it plays when it opens.
-    - `follow`: the view moves with the bodies (default: where they go far). `view`: elevation and azimuth it starts from, in degrees (default: (22, -60)).
-    - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres where there is no contact).
-    - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body -> "#rrggbb".
+    - `follow`: the view moves with the bodies (default: if they go far). `view`: initial elevation and
+      azimuth, in degrees (default: (22, -60)).
+    - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres if there
+      is no contact).
+    - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body ->
+      "#rrggbb".
 
     Looks of bodies come from the scene's `visuals`, see `jj.Visual`; otherwise they are guessed. Returns a
     `View`. ValueError for other arguments.
@@ -68,7 +74,8 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.P
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
     check_names(display.colours, names, "`colours` names `{}`, which is not a body")
     if np.shape(display.view) != (2,):
-        raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
+        raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as "
+            "(22, -60)")
     description, numbers = page_data(motions, display)
     shown = View(_page(display.title, description, numbers.bytes()), display.title, display.height)
     if path is not None:
@@ -86,7 +93,8 @@ def _motions(given) -> list[Trajectory]:
         return [given]
     if isinstance(given, list | tuple) and given:
         return [one for several in given for one in _motions(several)]
-    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a rollout, or a list of these")
+    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a rollout, "
+        "or a list of these")
 
 
 def _page(title: str, description: dict, numbers: bytes) -> str:
@@ -113,5 +121,6 @@ def _file(name: str) -> str:
 
 def _check_suffix(path: str | os.PathLike) -> None:
     if not str(path).lower().endswith((".html", ".htm")):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use `jj.animate`, for figures `jj.plot`")
+        raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use "
+            "`jj.animate`, for figures `jj.plot`")
     check_place(path)

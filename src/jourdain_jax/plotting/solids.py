@@ -12,10 +12,10 @@ Quads = Float[np.ndarray, "faces 4 3"]  # m; corners anticlockwise, seen from ou
 
 
 def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
-    """Return faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and
-    their shades, 0 to 1.
+    """Return faces of a shape at the time with index `k`, and their shades, 0 to 1. Faces are in the shape's
+    own axes, those of a line in the body's.
 
-    `thin`: radius of a line that has none, m.
+    `thin`: radius (m) of a line that has none.
     """
     size, dark = np.asarray(visual.size)[0], np.zeros(())
     if visual.kind == "line":
@@ -87,8 +87,8 @@ def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
 
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:
-    """Return faces split into parts with edges of at most about `longest`, so that nearer objects hide
-    farther ones correctly; and the face of each part.
+    """Return faces divided into parts with edges of at most about `longest`, so that nearer objects hide
+    farther ones correctly, and the face to which each part belongs.
     """
     edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)  # from the last corner to the first, from there to the second, ...
     rows, columns = np.clip(np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20).astype(int)

@@ -46,7 +46,7 @@ def rgb(colour: str) -> Float[np.ndarray, "3"]:
 
 def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
     """Return the lowest and the highest corner of the box that holds all points, m, and the floor below them,
-    with some room at its sides.
+    with a margin at the sides.
     """
     points = np.concatenate([x.reshape(-1, 3) for x in faces])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -55,9 +55,10 @@ def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
 
 
 def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, float, float] | None = None):
-    """Axes of a matplotlib figure, seen from this elevation and azimuth (degrees), without the one along which one looks.
+    """Return axes of a matplotlib figure, seen from this elevation and azimuth (degrees). The axis along the
+    line of sight is hidden.
 
-    No `place`: a floor without numbers.
+    Without `place`, the floor has no numbers.
     """
     axes = figure.add_subplot(projection="3d", proj_type="ortho", computed_zorder=False)
     axes.view_init(*view)
@@ -108,7 +109,9 @@ def towards(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
 
 
 def legend(figure, drawn: Drawn, paths: int = 0) -> None:
-    """Names of the bodies in a row above the picture: of many the first, the second and the last."""
+    """Draw names of the bodies in a row above the picture; if there are many, only the first, the second and
+    the last.
+    """
     plt, colours = pyplot(), {name: body.colour for name, body in drawn.bodies.items() if name}
     names = list(colours) if len(colours) <= 4 else [*list(colours)[:2], list(colours)[-1]]
     handles = [plt.Rectangle((0, 0), 1, 1, color=colours[name], label=name) for name in names]

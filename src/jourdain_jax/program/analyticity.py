@@ -13,12 +13,14 @@ CALLS = frozenset({"opaque"})
 
 
 def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list[bool]:
-    """For each output, whether some part of it that depends on time, state or inputs is an operation of these kinds."""
+    """Return, for each output, whether an operation of these kinds occurs in a part that depends on time,
+    state or inputs.
+    """
     return _with(graph, outputs, lambda n: graph.op[n] in kinds and graph.varies[n])
 
 
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
-    """Return whether an operation of these kinds on the way to the outputs depends on one of the variables.
+    """Return whether an operation of these kinds that influences the outputs depends on one of the variables.
     """
     outputs, variables = list(outputs), set(variables)
     decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]

@@ -21,7 +21,9 @@ from jourdain_jax.program.graph import Unsupported
 
 
 class Call:
-    """A closed jaxpr, and why it is one; calls are equal where they compute the same in the same way."""
+    """A closed jaxpr, and the reason why it is kept as a call. Two calls are equal if they do the same
+    operations.
+    """
 
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
@@ -47,10 +49,10 @@ class Call:
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Return the derivatives of each result with respect to the moving entries of the operands, with a
-        leading axis of these.
+        """Return the derivatives of each result with respect to the moving entries of the operands. These
+        entries are the leading axis.
 
-        `Unsupported` where JAX has no forward derivative.
+        Raises `Unsupported` where JAX has no forward derivative.
         """
         function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
         places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]
@@ -86,7 +88,8 @@ class Call:
         except NotImplementedError as error:
             if not lanes or "vmap" not in str(error):
                 raise
-            raise NotImplementedError(f"a callback in a load or stop event does not say how it takes a batch: {str(error).splitlines()[0]}") from None
+            raise NotImplementedError("a callback in a load or stop event does not define what it does with "
+                f"a batch: {str(error).splitlines()[0]}") from None
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
 
@@ -121,8 +124,8 @@ _SEVERAL = tuple, list  # a union of types is made again wherever it stands
 
 
 def description(x) -> Hashable:
-    """Return a key of a jaxpr, or of a parameter of an operation; two traces of one function have equal keys,
-    unless they hold new functions.
+    """Return a key of a jaxpr, or of a parameter of an operation. Two traces of one function have equal keys,
+    unless the function creates others.
     """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))

@@ -33,8 +33,8 @@ def _of_all(graph: Graph, op: str, entries: list[int]) -> int:
 
 
 def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
-    """Return the extreme of more than two as the mean of those that reach it: where they meet, its derivative
-    is the mean of theirs, as in JAX.
+    """Return the extreme of more than two numbers as the mean of those that attain it. If several do, its
+    derivative is the mean of theirs, as in JAX.
     """
     reached = [graph.call("eq", entry, extreme) for entry in entries]
     total = graph.total(graph.call("select", reaches, graph.zero, entry) for reaches, entry in zip(reached, entries, strict=True))
@@ -51,7 +51,9 @@ def product(graph: Graph, equation, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
-    """`Unsupported` for a product with more multiplications, not by 0, 1 and -1, than the graph is meant for."""
+    """Raise `Unsupported` for a product with more multiplications (other than by 0, 1 and -1) than a graph
+    should have.
+    """
     if left.size * right.shape[1] <= graph.most_multiplications:
         return
     trivial = {graph.zero, graph.one, graph.const(-1.0)}

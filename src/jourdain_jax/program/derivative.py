@@ -23,13 +23,15 @@ from jourdain_jax.program.graph import ARRAYS, Graph, NodeList, Unsupported
 
 
 def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> NodeList:
-    """d output/ds for each output, where `direction[n]` is dn/ds; a node in `direction` is not looked into."""
+    """Return d output/ds for each output, where `direction[n]` is dn/ds. Nodes in `direction` count as
+    independent.
+    """
     return [rates.get(0, graph.zero) for rates in directional_derivative(graph, outputs, {0: direction})]
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
-    """Return the derivatives of each output with respect to the variables (nodes that are not looked into) on
-    which it depends.
+    """Return the derivatives of each output with respect to the variables on which it depends. Variables
+    count as independent nodes.
     """
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
@@ -38,7 +40,7 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
     """Return the derivatives of each output along the named directions in which it changes, in one sweep;
     `directions[k][n]` is dn/ds in direction k.
 
-    Nodes in any direction are not looked into in any other.
+    A node in any direction counts as independent in all others.
     """
     outputs = list(outputs)
     tangents: dict[int, dict[int, int]] = {}
@@ -57,10 +59,10 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
 
 
 def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> NodeList:
-    """sum_i w_i d output_i/d variable for each variable (nodes that are not looked into), in one sweep from the outputs back.
+    """Return sum_i w_i d output_i/d variable for each variable (an independent node), in one sweep from the
+    outputs backward.
 
-    The derivative of a branch that is not taken is zero, whatever its value: there a weight of zero counts,
-    also times what is not a number.
+    An untaken branch contributes zero, even if its derivative is NaN.
     """
     variables = list(variables)
     total: dict[int, int] = {}
@@ -116,8 +118,8 @@ def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> li
 
 
 def _derivative(graph: Graph, node: int, dots: list):
-    """Return the rate of a node, given those of its arguments: for an array a tuple, entry by entry; for a
-    call a tuple of these.
+    """Return the rate of a node from the rates of its arguments. For an array and for a call it is a tuple of
+    rates.
     """
     op, args = graph.op[node], graph.args[node]
     if all(d == graph.zero for d in dots):
@@ -157,8 +159,8 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
 
 
 def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
-    """Return a function of the values of `variables` (all that the outputs depend on) that returns those of
-    `outputs`, as arrays of one shape, in the precision of the variable with number `like`; then the values of
+    """Return a function of the values of `variables` (all on which the outputs depend) that returns those of
+    `outputs`, as arrays of one shape in the precision of the variable with index `like`, and then those of
     the nodes `monitored`, without derivatives.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
@@ -198,8 +200,8 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
 
 
 def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, NodeList, NodeList]:
-    """Return the outputs on a new graph whose inputs are the variables: no simplification can look behind
-    these.
+    """Return the outputs on a new graph in which the variables are inputs, so that no simplification uses
+    their definitions.
     """
     own = Graph()
     inputs = [own.input(str(k), True) for k in range(len(variables))]
@@ -208,7 +210,9 @@ def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -
 
 
 def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
-    """Row, column and node of the entries that are not zero by structure; None where JAX does better."""
+    """Return row, column and node of the structurally nonzero entries; None if JAX's own derivative is
+    better.
+    """
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None

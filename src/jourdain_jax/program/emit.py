@@ -22,7 +22,9 @@ PIECE = 128  # operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
-    """Return values of the outputs as JAX scalars (or numbers), given those of inputs and of nodes computed before."""
+    """Return values of the outputs as JAX scalars (or numbers), from those of inputs and of nodes computed
+    before.
+    """
     outputs, values = list(outputs), dict(known)
     needed = graph.needed(outputs, values)
     depth: dict[int, int] = {}  # the longest chain of operations that ends in a node
@@ -44,7 +46,8 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
 def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> NodeList:
     """Return the needed nodes, each soon after its arguments, with the longest chains of operations first.
 
-    So chains are followed from their beginning, sums grow term by term, and little is carried from piece to piece.
+    Chains are then followed from their beginning, sums grow term by term, and few values are carried between
+    pieces.
     """
     seen, order = set(known), []
 

@@ -35,7 +35,8 @@ class Graph:
     """Nodes are integers; `op[n]` and `args[n]` define node n, `value[n]` is the number of a constant, the
     name of an input, or the description of a call.
 
-    Products of matrices with more than `most_multiplications` are not taken apart; `keeps_rules`: nor are functions with a derivative of their own.
+    Products of matrices with more than `most_multiplications` are not expanded; with `keeps_rules`, neither
+    are functions with their own derivative.
     """
 
     def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
@@ -76,7 +77,7 @@ class Graph:
         return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is not a number
 
     def input(self, name: str, varies: bool) -> int:
-        """A named input: a parameter, or (`varies`) time, a coordinate, a speed, an input of the scene."""
+        """Return a named input: a parameter, or (`varies`) time, coordinate, speed or input of the scene."""
         return self._node("input", (), name, varies)
 
     def is_const(self, node: int) -> bool:
@@ -119,7 +120,7 @@ class Graph:
         return self._node("add", (a, b) if a < b else (b, a))
 
     def _without_wave(self, a: int, b: int) -> int | None:
-        """x of a = sin(w)^2 x, b = cos(w)^2 x or the reverse; None where the products are not of this kind."""
+        """Return x of a = sin(w)^2 x, b = cos(w)^2 x or the reverse; None for products of another form."""
         factors = self._factors(a), self._factors(b)
         if len(factors[0]) != len(factors[1]):
             return None
@@ -249,7 +250,7 @@ class Graph:
     # arrays and calls
 
     def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
-        """Scalars put together; if they are all entries of one array, in order, that array."""
+        """Combine scalars into an array. If they are all entries of an array, in order, return that."""
         entries = tuple(entries)
         whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
         if whole is not None and self.value[whole][1:] == (shape, dtype) and entries == tuple(self.entries(whole).ravel().tolist()):
@@ -274,7 +275,7 @@ class Graph:
         return list(self.args[array]) if self.op[array] == "array" else self.entries(array).ravel().tolist()
 
     def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
-        """The operation of a node, applied to other arguments; `of`: the graph of the node, if another one."""
+        """Apply the operation of a node to other arguments; `of`: the graph of the node (default: this)."""
         graph, args = of or self, tuple(args)
         op, value = graph.op[node], graph.value[node]
         if op == "array":
@@ -326,7 +327,9 @@ class Graph:
         return self.needed(outputs, known=())
 
     def needed(self, outputs: Iterable[int], known) -> NodeList:
-        """Return the nodes needed for the outputs if the nodes in `known` are known, in order."""
+        """Return, in order, the nodes that must be computed for the outputs when the nodes in `known` are
+        given.
+        """
         args = self.args
         seen = {node for node in outputs if node not in known}
         stack = list(seen)
@@ -338,9 +341,7 @@ class Graph:
         return sorted(seen)  # arguments are older than what uses them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """Return nodes that depend on parameters only and are used by varying nodes; numbers, not truth
-        values.
-        """
+        """Return nodes of numbers that depend on parameters only and that varying nodes use."""
         outputs = list(outputs)
         found = {a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]} | set(outputs)
         return tuple(sorted(n for n in found if not (self.varies[n] or self.is_const(n) or self.is_truth(n))))
@@ -370,13 +371,11 @@ class Graph:
         return reciprocal and uses[node] == 1 and node not in outputs
 
     def operations(self, outputs: Iterable[int]) -> int:
-        """Return the number of operations on varying quantities for the outputs; expressions of parameters
-        only do not count.
-        """
+        """Return the number of operations on varying quantities; those of parameters only do not count."""
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:
-        """Return how many more operations node a needs than node b; only unshared ones are counted."""
+        """Return how many more operations node a needs than node b, counting only unshared ones."""
         if a == b:
             return 0
         needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]

@@ -62,13 +62,15 @@ class IdentityProbes:
         return found
 
     def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
-        """Return probes at which some inputs, and the bounds of their round-off, are changed and all others
-        are kept.
+        """Return probes at which some inputs, and the bounds of their round-off, are replaced; all others
+        stay.
         """
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
-        """Return these probes, of another graph; `names`: of its inputs, and of those that they replace."""
+        """Return these probes for another graph; `names`: new names of inputs, each with the name that it
+        replaces.
+        """
         errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 
@@ -78,8 +80,8 @@ class IdentityProbes:
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """Return the probes numbered `at`, for each group of names in turn with the values that these inputs
-        had at another probe; all others are kept.
+        """Return the probes with indices `at`, once for each group of names. The inputs of that group have
+        their values from another probe.
         """
 
         def in_turn(name, x):
@@ -96,8 +98,8 @@ def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return whether the rows of each pair, values of expressions at generic probes, are equal to round-off,
-    at the `regular` ones.
+    """Return whether the rows of each pair (values of expressions at generic probes) are equal to round-off,
+    at the `regular` probes.
     """
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
@@ -113,8 +115,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return the replacements, each of one node by another, that by themselves change none of the `nodes`;
-    `probes`: generic ones.
+    """Return the replacements of one node by another that, each alone, change none of the `nodes`; `probes`:
+    generic ones.
     """
     graph, here = probes.graph, probes(nodes)
 
@@ -142,7 +144,8 @@ def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: n
 
 
 def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbes:
-    """Such probes for the graph of `probes`; inputs named in `unchanged` (the parts of quaternions, which have a norm) keep their values.
+    """Return generic probes for the graph of `probes`. Inputs in `unchanged`, such as parts of quaternions,
+    keep their values.
 
     Parameters, named p..., are positive.
     """
@@ -159,10 +162,10 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
 
 
 def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
-    """Return generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton
-    from `near`; meaningless where it does not converge.
+    """Return generic `probes` with `coordinates` (names of inputs, with their nodes) moved onto rows = 0, by
+    Gauss-Newton from `near`. Where this does not converge, the probes are meaningless.
 
-    The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
+    The probes stay unchanged if the rows contain a function for which equations cannot be solved.
     """
     if not taken_for_what_they_are(probes.graph, rows):
         return probes

@@ -40,9 +40,7 @@ def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
 
 
 def effects_of(jaxpr) -> str:
-    """Return which operation does more than compute, as printing does, in words without a verb; nothing where
-    none does.
-    """
+    """Name an operation that does more than compute, such as printing; empty if there is none."""
     for equation in jaxpr.eqns:
         if equation.effects:
             inner = called(equation.primitive.name, equation.params)
@@ -100,14 +98,16 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
 def refuse(equation) -> None:
     """ValueError where an equation can be no part of a scene."""
     if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
-        raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw them outside, and give them as parameters or inputs")
+        raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
+            "them outside, and give them as parameters or inputs")
 
 
 def own_rule(name: str, params) -> str:
-    """Return the function with a derivative unknown to the graph; nothing for functions of this package,
-    whose rules match their values.
+    """Name the function if its derivative is its own and unknown to the graph; empty if not. Functions of
+    this package do not count, since their rules agree with their values.
 
-    Those of JAX are not: `softplus` and `sinc` compute with branches, which hide their derivatives where two of them meet.
+    JAX's own functions do count: `softplus` and `sinc` compute with branches, which give wrong derivatives
+    where two branches meet.
     """
     if name == "stop_gradient":
         return "`stop_gradient`, whose derivative is zero by decree,"

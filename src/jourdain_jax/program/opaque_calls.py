@@ -74,7 +74,9 @@ class _Opaque:
 
 
 def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[Value]:
-    """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
+    """Return the outputs of a closed jaxpr at the given arguments, as `interpret` does, with calls for the
+    parts that have no scalar form.
+    """
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
     outputs = _flat(needed_only(closed), inputs, steps)
@@ -113,7 +115,7 @@ def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
 
 
 def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:
-    """Finds by trying which steps have a scalar form; returns the variables that are numbers."""
+    """Find by trial which steps have a scalar form; return the variables that are numbers."""
     values: dict = {}
 
     def introduce(v: _Variable) -> Nodes | None:
@@ -151,8 +153,8 @@ def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
 
 
 def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
-    """Mark everything opaque that depends on opaque parts within a call, and find the parts that form one
-    call.
+    """Mark the steps that depend on opaque parts within the same call as opaque, and find the steps that form
+    one call.
     """
     maker = {v: step for step in steps for v in step.outputs}
     number = {id(step): k for k, step in enumerate(steps)}

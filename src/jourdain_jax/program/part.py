@@ -8,8 +8,8 @@ from jourdain_jax.program.graph import Graph
 
 
 def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
-    """Return a new graph, and for every node of `graph` its number there; -1 for unneeded ones. So a program
-    keeps no failed attempts alive.
+    """Return a new graph with only the needed nodes and, for every node of `graph`, its index there (-1 if
+    not needed). A program then keeps no failed attempts in memory.
     """
     kept = [n for n in graph.reachable(needed) if n > graph.one]  # in the old order, so that no sum is turned round
     found, place = Graph(graph.most_multiplications, graph.keeps_rules), np.full(len(graph.op), -1, np.int64)

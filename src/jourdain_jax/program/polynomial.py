@@ -25,8 +25,9 @@ class NormalForms:
     """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the reverse took
     fewer operations in no model).
 
-    - `most_terms`: of a normal form; 0: none are made, and nodes stay as they are.
-    - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
+    - `most_terms`: the largest number of terms of a normal form; 0: nodes stay unchanged.
+    - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x if it is known, and `guards` records x with
+      its sign.
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
 
@@ -46,7 +47,7 @@ class NormalForms:
         self._reciprocals: dict[int, int | None] = {}  # x of an atom 1/x, None of any other
 
     def simplified(self, node: int) -> int:
-        """Return the node in normal form where that takes fewer operations, otherwise the node with its parts
+        """Return the node in normal form if that takes fewer operations; otherwise the node with its parts
         simplified.
         """
         if node not in self._simplified:
@@ -116,7 +117,7 @@ class NormalForms:
         return node if found is None else self.rebuilt(found)
 
     def _root(self, p: Polynomial) -> Polynomial:
-        """sqrt p: |x| comes out of x^2 y, and |sin x| out of y (1 - cos(x)^2)."""
+        """Return sqrt p, with |x| extracted from x^2 y, and |sin x| from y (1 - cos(x)^2)."""
         rooted = self._rooted(p)
         if rooted is None:
             atom = self.graph.call("sqrt", self.rebuilt(p))
@@ -131,7 +132,7 @@ class NormalForms:
         return p
 
     def _rooted(self, p: Polynomial) -> tuple[NodeList, Polynomial] | None:
-        """Return atoms to take out of the root, and the rest; None if there are none."""
+        """Return atoms to extract from the root, and the rest; None if there are none."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
@@ -206,8 +207,8 @@ class NormalForms:
         return result
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
-        """Return the terms of a monomial with squares replaced and without pairs x, 1/x; kept: the square of
-        an atom is known before the atom is part of anything.
+        """Return the terms of a monomial, with squares replaced and pairs x, 1/x cancelled. The result is
+        cached: the square of an atom is known before the atom is used.
         """
         found = self._reductions.get(monomial)
         if found is None:
@@ -252,7 +253,8 @@ class NormalForms:
     # and back
 
     def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
-        """Return a node for the polynomial, divided by `divisor` (of parameters alone), with few operations.
+        """Return a node for the polynomial, divided by `divisor` (which depends on parameters only), with few
+        operations.
         """
         graph = self.graph
         terms = []
@@ -273,7 +275,7 @@ class NormalForms:
         return gathered
 
     def quotient(self, p: Polynomial, q: Polynomial) -> int:
-        """Return a node for p/q, with common factors of all terms of q cancelled term by term."""
+        """Return a node for p/q, with the common factors of all terms of q cancelled term by term."""
         graph = self.graph
         if not p:
             return graph.zero

@@ -54,13 +54,13 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
 
 
 def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dict) -> list[int]:
-    """Return the nodes to be written, in order; a ValueError if a call of JAX is among them."""
+    """Return the nodes to be written, in order. Raises ValueError if a call of JAX is among them."""
     nodes = graph.needed(outputs, names)
     reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
         raise ValueError(
-            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; "
-            "print the scene without that load, or write it in scalar operations"
+            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; print the scene without that "
+            "load, or write it in scalar operations"
         )
     return nodes
 

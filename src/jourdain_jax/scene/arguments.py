@@ -41,7 +41,9 @@ F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
-    """A scene with its choices (`motion/model.py: Model`); functions that call `as_scene` take it in place of the scene."""
+    """A scene with its choices (`motion/model.py: Model`); functions that call `as_scene` accept it in place
+    of the scene.
+    """
 
     scene: Scene
     formulation: Any
@@ -50,18 +52,21 @@ class BuiltFor:
     reference: Any
 
     def __getattr__(self, name: str):
-        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its `.scene`")
+        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its "
+            "`.scene`")
 
 
 def as_scene(scene) -> Scene:
-    """Return the scene itself; a ValueError if it is none, or the class and not an instance."""
+    """Return the scene itself. Raises ValueError if it is no scene, or a class in place of an instance."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, BuiltFor):
         return scene.scene
     if isinstance(scene, type) and issubclass(scene, Scene):
-        raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write `{scene.__name__}()`, with parameters in the parentheses")
-    raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")
+        raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write "
+            f"`{scene.__name__}()`, with parameters in the parentheses")
+    raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of "
+        "`jj.Scene`")
 
 
 def as_rolling(scene, what: str) -> Scene:
@@ -71,17 +76,17 @@ def as_rolling(scene, what: str) -> Scene:
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
         raise ValueError(
-            f"`{what}` needs contacts that roll and rows that hold, but {named} of `{type(scene).__name__}` may slip; "
-            "omit the friction there"
+            f"`{what}` needs contacts that roll and rows that hold, but {named} of `{type(scene).__name__}` "
+            "may slip; omit the friction there"
         )
     return scene
 
 
 def of_known_numbers(function: F) -> F:
-    """Return the function of a scene, or of a motion, and more, run on numbers also inside `jit`, `vmap` and
+    """Return the function of a scene or motion so that it runs on numbers also inside `jit`, `vmap` and
     derivatives.
 
-    A DifferentiationModeError that names it where one is traced.
+    Raises DifferentiationModeError with its name where an argument is traced.
     """
 
     @wraps(function)
@@ -89,7 +94,8 @@ def of_known_numbers(function: F) -> F:
         known = known.scene if isinstance(known, BuiltFor) else known
         if is_traced(known, args, kwargs):
             raise DifferentiationModeError(
-                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are unknown there; call it outside"
+                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are "
+                "unknown there; call it outside"
             )
         with at_once():
             return function(known, *args, **kwargs)
@@ -99,18 +105,21 @@ def of_known_numbers(function: F) -> F:
 
 def as_time(t) -> Scalar:
     """Return a time in s, as a number of the default floating-point type."""
-    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(real_type())
+    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for "
+        "many").astype(real_type())
 
 
 def one_time(t, name: str = "t"):
-    """Return a time on NumPy, unless it is traced; None stays. A ValueError names it if it is not a number.
+    """Return a time on NumPy, unless it is traced; None stays None. Raises ValueError with its name if it is
+    not a number.
     """
-    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
+    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use "
+        "`jax.vmap` for many")
 
 
 def vector_of_times(ts) -> Float[Entries, "times"]:
-    """Return times in s, on NumPy unless they are traced. A ValueError unless they are a vector of at least
-    one number.
+    """Return times in s, on NumPy unless they are traced. Raises ValueError unless they are a vector of at
+    least one number.
     """
     ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
     if ts.ndim != 1 or ts.size == 0:
@@ -133,7 +142,8 @@ def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
         return x  # as it should be, in a twentieth of the time of what follows
     listed = ", ".join(names)
     if isinstance(x, Mapping):
-        raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
+        raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of "
+            f"{listed}; `jj.start(scene, **values)` makes one by name")
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
     return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice).astype(real_type())
 
@@ -151,7 +161,7 @@ class ChangingInputs(eqx.Module):
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
-    """Return values of the scene's inputs at one instant: from a vector, a dictionary (missing ones are
+    """Return values of the scene's inputs at one instant, from a vector, a dictionary (omitted ones are
     zero), or None for all zero.
     """
     names = scene.inputs.entries
@@ -163,7 +173,8 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
     check_names(inputs, names, f"`{type(scene).__name__}` has no input `{{}}`")
     advice = "a function of time is for `simulate`; here give its value at this instant"
     inputs = {name: scene.modes.number(name, x, "`inputs`") if name in dict(scene.modes.pairs) else x for name, x in inputs.items()}
-    values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
+    values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of "
+        f"`{type(scene).__name__}`", (), advice=advice) for name in names]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)
 
 
@@ -173,8 +184,8 @@ _NOTE = "Lines of jourdain_jax between yours are omitted from this traceback; JA
 
 
 def shown_from_users_lines(function: F) -> F:
-    """Return the function, whose errors show users' lines where any of these was on the way: a method of a
-    scene, an input, an event; in usual modes of promotion.
+    """Return the function. If one of the user's lines is in the traceback of an error (a method of a scene,
+    an input, an event), the error shows it. JAX's usual modes of promotion apply.
     """
 
     @wraps(function)
@@ -200,7 +211,8 @@ def warn(text: str, kind: type[Warning] = UserWarning) -> None:
 
 
 def _is_shortened(error: BaseException) -> bool:
-    """Return whether the error comes from a user's line, called from here; then it has the note."""
+    """Return whether the error comes from a user's line that was called from here. If so, add the note to it.
+    """
     if jax.config.jax_traceback_filtering == "off":
         return False
     if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):
@@ -219,7 +231,8 @@ def _frames(traceback: TracebackType | None) -> list[TracebackType]:
 
 
 def _is_users(frame: FrameType) -> bool:
-    """Return whether a line stands neither here nor in an installed package or Python's own library."""
+    """Return whether a line is neither in this package nor in an installed package or Python's own library.
+    """
     return not frame.f_code.co_filename.startswith((_OURS, *_INSTALLED, "<frozen"))
 
 

@@ -19,9 +19,8 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
-    ValueError for other shapes. Its velocity comes by differentiating the position.
-    Where the mass depends on time or coordinates, `m a` holds with its momentary value; the thrust of ejected
-    mass is a load.
+    Raises ValueError for other shapes. Its velocity is the derivative of the position. If the mass depends on
+    time or coordinates, `m a` holds with its momentary value; state the thrust of ejected mass as a load.
     """
 
     mass: Scalar  # kg
@@ -35,16 +34,19 @@ class Particle(eqx.Module):
 class RigidBody(eqx.Module):
     """A rigid body.
 
-    - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body axes.
-    - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to space components. Its column `R[:, k]` is body axis
-      k in the inertial frame; a row `R[k]` is not, and nothing can tell the two apart for you.
-    - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none). With `solid` "box", "ellipsoid" or
-      "wheel", the one point of it is the corner of a box that holds this solid.
+    - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body
+      axes.
+    - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to
+      space components. Its column `R[:, k]` is body axis k in the inertial frame. A row `R[k]` is not, and no
+      check can find such a confusion.
+    - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only
+      (default: none). With `solid` "box", "ellipsoid" or "wheel", its only point is the corner of a box
+      around this solid.
 
-    ValueError for other shapes. Velocities come by differentiating the pose.
-    Where mass or inertia depend on time or coordinates, they count as they are at each instant, `m a` and `I
-    alpha + omega x I omega`: mass that leaves
-    or joins carries its momentum, and its thrust is a load. A skater who draws in the arms is several bodies.
+    Raises ValueError for other shapes. Velocities come by differentiating the pose. If mass or inertia depend
+    on time or coordinates, their momentary values count in `m a` and `I alpha + omega x I omega`: mass that
+    leaves or joins carries its momentum, and its thrust must be stated as a load. A skater who draws in the
+    arms must be modelled by several bodies.
     """
 
     mass: Scalar  # kg
@@ -61,9 +63,11 @@ class RigidBody(eqx.Module):
         self.inertia = jnp.diag(matrix) if matrix.shape == (3,) else checked_real(matrix, what, (3, 3), advice=advice)
         self.position = checked_real(position, "position of a rigid body", (3,))
         self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)")
-        self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
+        self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid "
+            "body")
         if self.outline.ndim != 2 or self.outline.shape[1] != 3:
-            raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); give points of a line in its body frame, m")
+            raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); "
+                "give points of a line in its body frame, m")
         self.solid = solid
 
     @staticmethod
@@ -91,7 +95,8 @@ class RigidBody(eqx.Module):
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
         mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
-        moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell") * mass * radius**2
+        moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a "
+            "shell") * mass * radius**2
         return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * np.ones((1, 3)), "ellipsoid")
 
     @staticmethod

@@ -41,10 +41,12 @@ def rod(a: Vector, b: Vector, length: Number) -> Scalar:
     """Return the geometric constraint of a massless rod of the given `length` (m) between two points `a`, `b`
     (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
 
-    To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).
+    To first order this is the excess length; its multiplier is the thrust (positive, N) in the rod. It is
+    smooth even if the points meet. Eq. (5).
     """
     apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
-    length = checked_positive(length, "length of a rod", advice="give it in m; to keep two points together use `jj.pin`")
+    length = checked_positive(length, "length of a rod", advice="give it in m; to keep two points together "
+        "use `jj.pin`")
     return (apart @ apart - length**2) / (2 * length)
 
 
@@ -52,7 +54,8 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
     """Return the geometric constraints `b - a` of a joint that keeps two points `a`, `b` (m, inertial frame)
     together.
 
-    `axes`: letters of the inertial axes along which it holds (`"xy"` in a plane); ValueError for others. Eq. (5).
+    `axes`: letters of the inertial axes along which it holds (`"xy"` in a plane). Raises ValueError for
+    others. Eq. (5).
     """
     if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
         raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")

@@ -32,7 +32,8 @@ class Coulomb(eqx.Module):
 
     def __init__(self, sliding, static=None):
         self.sliding = checked_real(sliding, "coefficient of friction", ())
-        self.static = self.sliding if static is None else checked_real(static, "coefficient of static friction", ())
+        self.static = self.sliding if static is None else checked_real(static, "coefficient of static "
+            "friction", ())
 
 
 class Slipping(TypedDict, total=False):
@@ -47,15 +48,15 @@ class Contact(eqx.Module):
     """A point contact of a body with the ground, rolling without slip; for contacts beyond `ball_contact` and
     similar functions.
 
-    - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point that touches.
-    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a ground z = 0 at rest).
+    - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point of contact.
+    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a
+      ground z = 0 at rest).
     - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`; pictures show it.
     - `height`: "coordinates" if they keep the point on the ground, "row" for a geometric constraint.
-    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
-      force where `height="coordinates"`.
-    - `distance` (m): the gap, where it is not the point's height above the plane.
-    - `shape`: set by `ball_contact` and similar functions, for pictures; other looks are given by the
-      scene's `visuals`.
+    - `carried`: names of the bodies that this contact holds up, together with all other contacts of these
+      bodies (default: all of the scene), for the normal force with `height="coordinates"`.
+    - `distance` (m): the gap, if it is not the point's height above the plane.
+    - `shape`: set by `ball_contact` and similar functions, for pictures; the scene's `visuals` override it.
     - `friction`, `restitution`: as in `ball_contact`.
 
     If the coordinates determine the point, this avoids the search for it: `jj.Contact(pose["disc"], p,
@@ -78,25 +79,27 @@ class Contact(eqx.Module):
     def __init__(
         self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
     ):
-        """A contact of the `body` at its `point` with the tangent `plane` of a ground."""
+        """Make a contact of the `body` at its `point` with the tangent `plane` of a ground."""
         check_kind(body, BodyPose | str, "the body of a contact", 'the pose of a body; write pose["name"]')
         self.body = body if isinstance(body, str) else body.name
         if plane is not None and not isinstance(plane, Plane):
             advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
-            raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest{advice}")
+            raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a "
+                f"`jj.Plane(...)`, or None for z = 0 at rest{advice}")
         if ground is not None:
             _checked_ground(ground, self.body)
         if shape is not None and not isinstance(shape, get_args(Shape)):
             advice = "omit it, and state the body's look in `visuals`"
             raise ValueError(
-                f"`shape` of the contact of `{self.body}` is {described(shape)}, "
-                f"expected a shape set by `ball_contact` or a similar function; {advice}"
+                f"`shape` of the contact of `{self.body}` is {described(shape)}, expected a shape set by "
+                f"`ball_contact` or a similar function; {advice}"
             )
         self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
         self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
         self.height = _checked_height(height)
         self.carried = _checked_carried(carried, self.body)
-        self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
+        self.distance = None if distance is None else checked_real(distance, "distance of the contact of "
+            f"`{self.body}`", ())
         self.shape, self.ground = shape, ground
         self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
 
@@ -124,20 +127,23 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     """Return the rolling contact of a ball with a ground, without slip; the contact point is `c - a n`.
 
     - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
-    - `centre`: c (3,) of what rolls in m, body frame (default: the mass centre).
+    - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" if they keep the body on the ground, "row" for a geometric constraint.
-    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
-      `height="coordinates"`.
-    - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. With it the contact flies, rolls or slips (`motion.phase`), and needs
-      `height="row"`; None (default): it rolls, with whatever friction it needs. `restitution` e, from 0
-      (default) to 1, of impacts.
-    - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law on the slip afterwards. Along the normal impulse, with friction against the slip of
-      each moment: "newton", until w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic", until its work is
-      -e^2 times. These three are for balls and for slip that keeps its direction, as in a plane: a result code where it would turn.
+    - `carried`: names of the bodies that this contact holds up, together with all other contacts of these
+      bodies (default: all), for the normal force with `height="coordinates"`.
+    - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
+      slips (`motion.phase`), and needs `height="row"`; None (default): it rolls, with any friction that it
+      needs. `restitution` e of impacts, from 0 (default) to 1.
+    - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip afterwards. The others
+      follow the impact along its normal impulse, with friction against the momentary slip: "newton", until
+      w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic",
+      until its work is -e^2 times that of compression. They are for balls and for slip that keeps its
+      direction, as in a plane; where slip would turn there is a result code.
 
-    Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height or a length that is not positive; for a ball that does
-    not fit into the cylinder or sphere, where its scene is built.
+    It has two velocity rows (m/s), along the ground's tangents. Raises ValueError for an unknown height and a
+    length that is not positive; for a ball that does not fit into the cylinder or sphere, when its scene is
+    built.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
@@ -194,13 +200,14 @@ def _radius(body: BodyPose, radius) -> Scalar:
 def rolling(
     body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
 ) -> Contact:
-    """Return the contact of a rolling shape, a function of its centre (m, inertial frame); the other
+    """Return the contact of a rolling shape, which is a function of its centre (m, inertial frame). Other
     arguments: as in `ball_contact`.
     """
     _checked_height(height)
     check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
-        raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
+        raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a "
+            "`jj.RigidBody`")
     ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position
     if centre is not None:
         at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
@@ -212,27 +219,31 @@ def rolling(
 def _checked_ground(given, body: str) -> Ground:
     if not isinstance(given, get_args(Ground)):
         known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
-        raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
+        raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or "
+            "None for z = 0 at rest")
     return given
 
 
 def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="moreau") -> tuple[Coulomb | None, Scalar | None, str]:
     if impact not in IMPACTS:
-        raise ValueError(f"`impact` of the contact of `{body}` is {described(impact)}, expected one of {', '.join(IMPACTS)}")
+        raise ValueError(f"`impact` of the contact of `{body}` is {described(impact)}, expected one of "
+            f"{', '.join(IMPACTS)}")
     if friction is None:
         return None, None, impact
     if height != "row":
         raise ValueError(
-            f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the ground; '
-            'give the body coordinates of its own for its height, and write height="row"'
+            f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
+            'ground; give the body coordinates of its own for its height, and write height="row"'
         )
-    law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
+    law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, "friction of the "
+        f"contact of `{body}`", ()))
     return law, checked_real(restitution, f"restitution of the contact of `{body}`", ()), impact
 
 
 def _checked_height(height: str) -> str:
     if height not in _HEIGHTS:
-        raise ValueError(f"contact height `{height}` is unknown; expected `coordinates` (kept by the coordinates) or `row` (a geometric row)")
+        raise ValueError(f"contact height `{height}` is unknown; expected `coordinates` (kept by the "
+            "coordinates) or `row` (a geometric row)")
     return height
 
 
@@ -241,5 +252,6 @@ def _checked_carried(carried, body: str) -> Labels | None:
         return None
     names = () if isinstance(carried, str) or not isinstance(carried, Iterable) else tuple(carried)
     if not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f'`carried` of the contact of `{body}` is {described(carried)}, expected names of bodies; write ("{body}",)')
+        raise ValueError(f'`carried` of the contact of `{body}` is {described(carried)}, expected names of '
+            f'bodies; write ("{body}",)')
     return names

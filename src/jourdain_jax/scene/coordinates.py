@@ -28,7 +28,7 @@ class Quaternion:
 
 @dataclass(frozen=True)
 class Names:
-    """Names of the entries of a flat vector, with runs of entries that may be reached together."""
+    """Names of the entries of a flat vector, and of runs of entries that can be read together."""
 
     entries: Labels
     groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
@@ -38,8 +38,8 @@ class Names:
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Return the position of `name`; otherwise a ValueError lists the valid names, and the `kind` of
-        name.
+        """Return the position of `name`. Raises ValueError with the valid names, and the `kind` of name, if
+        there is none.
         """
         check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
@@ -71,7 +71,9 @@ class Coordinates:
         return q
 
     def default_rates(self, q: Float[Array, "coordinates"], u: Speeds) -> Float[Array, "coordinates"]:
-        """`qdot` from the default speeds: `xdot = x_rate`, `d quaternion/dt = 1/2 quaternion (0, omega)`."""
+        """Return `qdot` from the default speeds: `xdot = x_rate`, `d quaternion/dt = 1/2 quaternion (0,
+        omega)`.
+        """
         parts: list[tuple[int, Array]] = [(i, u[k : k + 1]) for i, k in self.plain]
         parts += [(i, quaternion_rate(q[i : i + 4], u[k : k + 3])) for i, k in self.quaternions]
         return jnp.concatenate([part for _, part in sorted(parts, key=lambda p: p[0])]) if parts else jnp.zeros(0)
@@ -139,7 +141,8 @@ def _named(names, kind: str) -> Names:
 
 def _split(names, what: str) -> list[str]:
     if not isinstance(names, str):
-        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, separated by spaces: jj.{what}('a b c')")
+        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, separated by "
+            f"spaces: jj.{what}('a b c')")
     return names.split()
 
 
@@ -147,9 +150,11 @@ def _check_names(names: Sequence[str], kind: str) -> None:
     counts = Counter(names)
     for name in names:
         if not name.isidentifier():
-            raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and underscores")
+            raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and "
+                "underscores")
         if keyword.iskeyword(name):
-            raise ValueError(f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; choose another")
+            raise ValueError(f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; "
+                "choose another")
         if counts[name] > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
         if name == "t" and kind != "input":

@@ -44,8 +44,8 @@ _MEANT = {  # what other programs and textbooks call them
 
 
 def check_description(scene, base: Any) -> None:
-    """Raise a ValueError that names a mistake in the description of `scene`, a subclass of `base`; traced
-    values are not checked.
+    """Raise ValueError with a mistake in the description of `scene`, a subclass of `base`; traced values are
+    not checked.
     """
     kind: Any = type(scene)
     misspelt = _misspelt(kind, base)
@@ -60,13 +60,15 @@ def check_description(scene, base: Any) -> None:
     check_kind(scene.modes, Modes, f"`modes` of `{kind.__name__}`", "jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
-            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but not the rates of its coordinates; "
-            "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
+            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but not the rates "
+            "of its coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
+            "coordinates"
         )
     _check_counts(scene)
     for name in scene.speed_names.entries:
         if name in scene.coordinate_names.entries:
-            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed named `{name}`; rename one of them")
+            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed named `{name}`; rename one of "
+                "them")
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
     if isinstance(example, dict):
@@ -75,7 +77,7 @@ def check_description(scene, base: Any) -> None:
 
 
 def checked_arguments(kind: type, given: dict) -> None:
-    """A ValueError with the nearest valid name where a scene is built with an argument that it does not take."""
+    """Raise ValueError with the nearest valid name where a scene is made with an unknown argument."""
     known = {field.name for field in fields(kind) if field.init}
     unknown = [name for name in given if name not in known]
     if not unknown:
@@ -97,8 +99,9 @@ def _misspelt(kind: type, base: type) -> str:
         for name, member in vars(owner).items():
             if name in own and name not in annotated:
                 return (
-                    f"`{owner.__name__}` sets `{name}`, a field of a class that it extends, without an annotation, which has no effect on scenes; write "
-                    f"`{name}: float = jj.parameter(...)`, or give the value when a scene is made: `{kind.__name__}({name}=...)`"
+                    f"`{owner.__name__}` sets `{name}`, a field of a class that it extends, without an "
+                    f"annotation, which has no effect on scenes; write `{name}: float = jj.parameter(...)`, "
+                    f"or give the value when a scene is made: `{kind.__name__}({name}=...)`"
                 )
             known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
             if known or name in read or isinstance(member, type | staticmethod | classmethod):
@@ -117,15 +120,16 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """A count that is not a static field would be a number of the equations, and a loop or a branch over it
-    could not be traced.
+    """Raise ValueError for a count that is not a static field: it would be traced, and loops and branches
+    over it could not run.
     """
     for field in fields(scene):
         value = getattr(scene, field.name)
         if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):
             raise ValueError(
-                f"field `{field.name}` of `{type(scene).__name__}` is {value}, which is not a parameter; for a count or switch write "
-                f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"
+                f"field `{field.name}` of `{type(scene).__name__}` is {value}, which is not a parameter; for "
+                f"a count or switch write `{field.name}: {type(value).__name__} = eqx.field(static=True, "
+                f"default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"
             )
 
 
@@ -134,7 +138,8 @@ def _check_domain(scene) -> None:
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
         if has_unit(pair) or np.shape(pair) != (2,) or not _is_ordered(known_numbers(pair)):
-            raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
+            raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite "
+                "numbers (low, high) with low <= high")
 
 
 def _is_ordered(pair: np.ndarray) -> bool:

@@ -82,8 +82,8 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Return whether it is an expression of SymPy, whose symbols and functions have numbers of their own in
-    every process, and show themselves by their names.
+    """Return whether it is an expression of SymPy. Such an expression is identified by its text, since its
+    symbols are numbered differently in every process.
     """
     sympy = sys.modules.get("sympy")
     return sympy is not None and isinstance(x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction)
@@ -107,8 +107,8 @@ def _function(f: FunctionType, of) -> object:
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the values that the code reads by name: for a module of the user, also the attributes that
-        it names.
+        """Return the values that the code reads by name; for a user's module, also the attributes that it
+        uses.
         """
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)

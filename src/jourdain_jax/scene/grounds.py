@@ -61,20 +61,24 @@ class Plane(_Ground):
     slopes down along x, or a rotation matrix (3, 3), such as `jj.rot_x(0.1)`. `Plane(normal=n)`: the plane with this unit vector as normal, in place
     of a tilt. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
 
-    The no-slip rows are along the turned x and y axes. With `normal`: along the x and y axes after the shortest turn that takes z (or -z, where n
-    points down) to n; with `along` as well, any vector that is not normal to the plane: along it, as seen in the plane, and across.
+    The no-slip rows are along the rotated x and y axes. With `normal`, they are along the x and y axes after
+    the shortest rotation that takes z (or -z, if n points down) to n. If `along` is given too (any vector
+    that is not normal to the plane), they are along its projection onto the plane, and across it.
 
-    A moving plane states its motion twice: `origin` and `tilt` or `normal` as functions of time, and `velocity` and `angular_velocity`, their rates and
-    what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
-    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is not a
-    unit vector, where its scene is built.
+    A moving plane states its motion twice: by `origin` and `tilt` or `normal` as functions of time, and by
+    `velocity` and `angular_velocity`, which are their rates plus motion within the plane itself (a belt, a
+    turntable). Along the normal both must agree, which is checked when a scene is probed. Raises ValueError
+    for an `along` that is normal to the plane, and for both `tilt` and `normal`; for a normal that is not a
+    unit vector, when its scene is built.
     """
 
     normal: Vector3  # unit vector, out of the ground
     tangents: Tangents  # unit vectors along the no-slip rows
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
-        """The plane z = 0, turned by `tilt` (rad, about y; or a rotation matrix); or the one with this `normal`, and its first tangent `along`."""
+        """Make the plane z = 0, rotated by `tilt` (rad, about y; or a rotation matrix), or the plane with
+        this `normal` and the first tangent `along`.
+        """
         if tilt is not None and normal is not None:
             raise ValueError("a plane has both a `tilt` and a `normal`, expected one of them; omit one")
         if normal is None:
@@ -88,8 +92,8 @@ class Plane(_Ground):
 
     @property
     def axes(self) -> Matrix3:
-        """Rotation matrix with the two tangents and the normal as columns: from components in the plane to
-        those in the inertial frame.
+        """Return the rotation matrix with the two tangents and the normal as columns: from components in the
+        plane to the inertial frame.
         """
         return jnp.concatenate([self.tangents, self.normal[None]]).T
 
@@ -117,7 +121,9 @@ class _Round(_Ground):
 
     @abstractmethod
     def arm_to(self, point: Vector) -> Vector3:
-        """The vector from the nearest point of the axis, or the centre, to the `point` (m, inertial frame)."""
+        """Return the vector from the nearest point of the axis, or from the centre, to the `point` (m,
+        inertial frame).
+        """
 
     @abstractmethod
     def _tangents(self, normal: Vector3) -> Tangents:
@@ -126,12 +132,15 @@ class _Round(_Ground):
     def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
         """Take radius, side and motion, checked."""
         if side not in ("inside", "outside"):
-            raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are")
+            raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies "
+                "are")
         self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
         self._moves(what, **motion)
 
     def value(self, point: Vector) -> Scalar:
-        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
+        """Return f (m) at a `point` (m, inertial frame): half the difference of squared distance and squared
+        radius, divided by the radius.
+        """
         arm = self.arm_to(point)
         outward = (arm @ arm - self.radius**2) / (2 * self.radius)
         return -outward if self.side == "inside" else outward
@@ -156,7 +165,9 @@ class Cylinder(_Round):
     axis: Vector3  # unit vector
 
     def __init__(self, radius, axis, *, side: str, **motion: Unpack[RigidMotion]):
-        """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`; `motion`: of the ground."""
+        """Make a cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`,
+        touched from its `side`; `motion`: of the ground.
+        """
         self._is("a cylinder", radius, side, motion)
         self.axis = checked_real(axis, "axis of a cylinder", (3,), advice="give a unit vector")
 
@@ -177,7 +188,8 @@ class Sphere(_Round):
     """
 
     def __init__(self, radius, *, side: str, **motion: Unpack[RigidMotion]):
-        """A sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground."""
+        """Make a sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground.
+        """
         self._is("a sphere", radius, side, motion)
 
     def arm_to(self, point: Vector) -> Vector3:
@@ -191,10 +203,10 @@ class Sphere(_Round):
 class Surface(_Ground):
     """The smooth surface `f(x, y, z) = 0`; f is positive on the side of the bodies.
 
-    `f`: a function of three numbers (m, inertial frame) to one, twice differentiable by JAX, with a gradient that does not vanish where it is touched;
-    it may close over traced numbers, a surface that moves over the time: `lambda x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at
-    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame.
-    ValueError: an `f` that is not a such function.
+    `f`: a function of three numbers (m, inertial frame) that returns one, twice differentiable by JAX, with a
+    nonzero gradient where bodies touch it. It may close over traced numbers, as for a moving surface: `lambda
+    x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity`
+    (rad/s) describe a moving surface; all in the inertial frame. Raises ValueError for any other `f`.
     """
 
     f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
@@ -207,7 +219,8 @@ class Surface(_Ground):
     def value(self, point: Vector) -> Scalar:
         """Return f at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
-        return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, positive on the side of the bodies")
+        return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, "
+            "positive on the side of the bodies")
 
     def plane_at(self, point: Vector) -> Plane:
         """Return the tangent plane at a `point` (m, inertial frame) of the surface."""
@@ -219,9 +232,10 @@ class Surface(_Ground):
 class HeightMap(_Ground):
     """The surface `z = h(x, y)`, with the bodies above it.
 
-    `h`: a function of two numbers (m, inertial frame) to one (m), twice differentiable by JAX. `velocity` (m/s) of its material point at `origin` (m)
-    and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. The first no-slip row is along x, as seen in the surface.
-    ValueError: an `h` that is not a such function.
+    `h`: a function of two numbers (m, inertial frame) that returns one (m), twice differentiable by JAX.
+    `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity` (rad/s) describe a moving
+    surface; all in the inertial frame. The first no-slip row is along the projection of x onto the surface.
+    Raises ValueError for any other `h`.
     """
 
     h: Callable = eqx.field(static=True)  # (x, y) -> height, m
@@ -241,7 +255,8 @@ class HeightMap(_Ground):
         return z - self.height_at(x, y)
 
     def plane_at(self, point: Vector) -> Plane:
-        """Return the tangent plane at a `point` (m, inertial frame) of the surface; only its x and y count.
+        """Return the tangent plane at a `point` (m, inertial frame) of the surface; only its x and y are
+        used.
         """
         x, y, _ = as_real(point)
         o, i = jnp.zeros_like(x), jnp.ones_like(x)
@@ -267,11 +282,10 @@ def normal_at(ground: Ground, point: Vector3) -> Vector3:
 
 def tangents_of(n: Vector3) -> Tangents:
     """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y
-    after the shortest turn of z (or -z) to n.
+    after the shortest rotation of z (or -z) to n.
 
-    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and with them the no-slip
-    constraints, but not their solutions.
-    Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
+    No field of tangents is continuous on a whole sphere. These change at n_z = 0, and with them the no-slip
+    constraints, but not their solutions. Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
     """
     x, y, z = n
     s = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))
@@ -287,15 +301,18 @@ def _turned(tilt) -> Matrix3:
 
 
 def _tangents_along(n, along) -> Tangents:
-    along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the plane")
+    along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the "
+        "plane")
     first = along - (n @ along) * n
     if not np.all(known_numbers((first @ first) / (along @ along)) > 1e-8):
-        raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another vector")
+        raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another "
+            "vector")
     first = first / jnp.sqrt(first @ first)
     return jnp.stack([first, jnp.cross(n, first)])
 
 
 def _function(f, what: str, example: str) -> Callable:
     if not callable(f):
-        raise ValueError(f"{what} is given by {described(f)}, expected a function of numbers; write {example}")
+        raise ValueError(f"{what} is given by {described(f)}, expected a function of numbers; write "
+            f"{example}")
     return f

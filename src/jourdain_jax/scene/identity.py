@@ -28,9 +28,9 @@ from jourdain_jax.scene.parameters import stacked_parameters
 def clear_caches() -> None:
     """Empty the caches of this package and of JAX, and free their memory.
 
-    Every scene is traced, probed and compiled again at its next use. Call this after a change of values that
-    helpers, modules or classes hold. Machine code
-    stays: it depends on the text of its program alone, and another thread may be running it.
+    Every scene is traced, probed and compiled again at its next use. Call this after a change of values in
+    helpers, modules or classes. Machine code stays: it depends on the text of its program only, and another
+    thread may be running it.
     """
     for name, module in list(sys.modules.items()):
         if name.startswith("jourdain_jax.") and ".native" not in name:
@@ -41,11 +41,10 @@ def clear_caches() -> None:
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """Decorate a function of a scene (and of further case keys) to run once per class and values, on concrete
-    parameters, also during tracing.
+    """Decorate a function of a scene (and of further keys) to run once per class and values, on concrete
+    parameters, even during tracing.
 
-    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on
-    numbers that replace them.
+    `of_traced`: a function that runs instead, every time, for scenes with traced parameters.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -106,9 +105,10 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Inside, numbers of `scene`, as far as it has them, replace parameters of its class that are traced.
+    """Return a context in which numbers of `scene` replace traced parameters of its class, where it has
+    numbers.
 
-    For those that are `varied` (names; None: all), generic ones near them.
+    Parameters that are `varied` (names; None: all) are replaced by generic numbers near those of the scene.
     """
     token = _STAND_IN.set((scene, varied))
     try:
@@ -121,7 +121,8 @@ def with_reference_parameters(scene):
     """Return the scene with numbers in place of traced parameters: generic ones near the reference, the
     class's defaults, or one.
 
-    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
+    Generic numbers are used so that a default of zero (a tilt, a rate) does not hide a term, and two equal
+    defaults do not count as the same length.
     """
     leaves, treedef = jax.tree.flatten(scene)
     unknown = [is_traced_type(type(x)) for x in leaves]
@@ -153,7 +154,7 @@ def _defaults(scene) -> list:
 
 
 def _generic(x, near, place: int) -> np.ndarray:
-    """Return numbers of the shape of x, near the given ones (or one), unlike those at any other `place`."""
+    """Return numbers of the shape of x, near the given ones (or one), different for every `place`."""
     draws = np.random.default_rng(place).uniform(size=np.shape(x))
     try:
         near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
@@ -168,10 +169,11 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return numbers that differ from the given ones by fractions, `change` (of equal shape, after any
+    """Return numbers that differ from the given ones by the fractions `change` (of equal shape, after any
     leading axes), with `zero` in place of each zero.
 
-    A tensor of inertia becomes that of the body stretched, sheared and turned, since tensors whose entries are changed one by one may be those of no body:
+    A tensor of inertia becomes that of the body stretched, sheared and rotated, since separately changed
+    entries may belong to no body:
 
     S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
     """
@@ -188,8 +190,8 @@ def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _is_inertia(x: np.ndarray) -> bool:
-    """Return whether numbers can be a tensor of inertia, and are no rotation; within a hundredth, as
-    published moments are.
+    """Return whether numbers can be a tensor of inertia, and are not a rotation matrix. A per cent is
+    tolerated, the accuracy of published moments.
     """
     if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
         return False
@@ -197,10 +199,10 @@ def _is_inertia(x: np.ndarray) -> bool:
 
 
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
-    """Decorate a function of a scene (and of further case keys) that depends on its class and the shapes of
-    its parameters only, to run once.
+    """Decorate a function of a scene (and of further keys) that depends only on its class and the shapes of
+    its parameters, to run once.
 
-    `most`: cases that are kept.
+    `most`: the number of stored results.
     """
     known: dict = {}
     keeping = Lock()  # threads may ask at the same time; they may work the same out
@@ -226,7 +228,9 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Use stored results of these functions inside, by their name and the first part of the case."""
+    """Return a context that uses stored results of these functions, by their name and the first part of the
+    key.
+    """
     token = _BEFORE.set(found)
     try:
         yield

@@ -19,9 +19,11 @@ from jourdain_jax.scene.names import check_names
 class Load(eqx.Module):
     """One impressed force system, with virtual power `sum F . dv + sum L . domega + sum Q_k du_k`.
 
-    - `forces`: body -> (3,) in N, inertial frame, at the mass centre; `torques`: body -> (3,) in N m, inertial frame, about the mass centre.
+    - `forces`: body -> (3,) in N, inertial frame, at the mass centre; `torques`: body -> (3,) in N m,
+      inertial frame, about the mass centre.
     - `generalized`: speed -> force on it, in N or N m.
-    - `potential` in J, whose gradient it must be (`verify` looks); None: not conservative, its work is integrated along the motion.
+    - `potential` in J, with the forces as its gradient (`verify` checks this); None: not conservative, so
+      that its work is integrated along the motion.
     """
 
     forces: dict[str, Vector3]  # N, inertial frame, at the mass centre
@@ -80,7 +82,8 @@ def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = Non
     No potential. ValueError for an unknown body.
     """
     motion = _motion(motion, "torque")
-    moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
+    moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial "
+        "frame, N m")
     names = [body] if reaction is None else [body, reaction]
     check_names(names, motion.bodies, "torque on unknown body `{}`")
     return Load(torques={name: sign * moment for name, sign in zip(names, (1.0, -1.0), strict=False)})
@@ -122,7 +125,8 @@ def generalized_force(motion: Motion, **forces: Any) -> Load:
 
 def _motion(motion: Motion, what: str) -> Motion:
     if not isinstance(motion, Motion):
-        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: the argument of `loads(self, motion)`")
+        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: the argument of "
+            "`loads(self, motion)`")
     return motion
 
 

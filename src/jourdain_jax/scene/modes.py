@@ -33,7 +33,7 @@ class Modes:
         return tuple(name for name, _ in self.pairs)
 
     def number(self, name: str, value, where: str):
-        """Return the number of a mode's value, given by its name or as a number; ValueError if there is none.
+        """Return the number of a mode's value from its name or number. Raises ValueError if there is none.
         `where`: the origin of the value.
         """
         names = self.values[name]
@@ -41,7 +41,8 @@ class Modes:
             check_name(value, names, f"{where} gives mode `{name}` the value `{value}`")
             return float(names.index(value))
         if not is_traced(value) and not (np.shape(value) == () and float(value) in range(len(names))):
-            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; {nearest('', names)} Or give its number")
+            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; "
+                f"{nearest('', names)} Or give its number")
         return value
 
 
@@ -59,7 +60,8 @@ def modes(**values) -> Modes:
     """
     for name, of_mode in values.items():
         if isinstance(of_mode, str) or not all(isinstance(value, str) for value in of_mode) or len(set(of_mode)) < 2:
-            raise ValueError(f"mode `{name}` has the values {of_mode!r}, expected two names or more: jj.modes({name}=('open', 'closed'))")
+            raise ValueError(f"mode `{name}` has the values {of_mode!r}, expected two names or more: "
+                f"jj.modes({name}=('open', 'closed'))")
     return Modes(tuple((name, tuple(of_mode)) for name, of_mode in values.items()))
 
 
@@ -69,7 +71,8 @@ class Event:
 
     - `value`: the event happens where it falls through zero.
     - `to`: mode -> its value afterwards, by name.
-    - `jump`: coordinate or speed -> its value afterwards; what is not named stays. Named speeds must satisfy the velocity rows.
+    - `jump`: coordinate or speed -> its value afterwards; all others keep theirs. Named speeds must satisfy
+      the velocity rows.
     - `stop`: whether the motion ends here, as it does at a plain value.
 
     **Examples**

@@ -30,7 +30,8 @@ class Point(eqx.Module):
 
 def fixed_point(position: Any) -> Point:
     """Return a point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
-    position = checked_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
+    position = checked_real(position, "position of a fixed point", (3,), advice="give three components in "
+        "the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -58,10 +59,11 @@ class BodyPose(eqx.Module):
         return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
 
     def place(self, local: Any) -> Vectors:
-        """Return position (inertial frame) of the point with body-frame coordinates `local` (m, relative to
-        the mass centre).
+        """Return the position (m, inertial frame) of the point with body-frame coordinates `local` (m,
+        relative to the mass centre).
         """
-        local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
+        local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in "
+            "its body frame, m")
         return self.position + self.orientation @ local.astype(self.position.dtype)
 
 
@@ -84,7 +86,8 @@ class BodyMotion(eqx.Module):
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
     def velocity_at(self, position) -> Vectors:
-        """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`.
+        """Return the velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame):
+        `v + omega x (position - r)`.
 
         `position`: three components, or along a motion three at each time.
         """

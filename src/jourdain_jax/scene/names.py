@@ -10,7 +10,7 @@ Labels = tuple[str, ...]
 
 
 class UnknownNameError(KeyError):
-    """A name that does not exist; unlike a plain KeyError it prints its message without quotes."""
+    """A name that does not exist. Unlike a plain KeyError, it prints its message without quotes."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
@@ -25,7 +25,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
-    """Raise an error with the text `what`, and the nearest valid name, unless the name is valid."""
+    """Raise an error with the text `what` and the nearest valid name, unless the name is valid."""
     if name not in valid:
         raise error(f"{what}; {nearest(name, valid)}")
 
@@ -44,7 +44,7 @@ def as_names(names: "str | Iterable[str]") -> Labels:
 
 
 def as_labels(labels: "str | Iterable[str]") -> Labels:
-    """Return names of another tool as a tuple, which may have blanks: a text is one."""
+    """Return names of another tool as a tuple. They may contain blanks, so a single text is one name."""
     return (labels,) if isinstance(labels, str) else as_names(labels)
 
 
@@ -59,7 +59,8 @@ class Named(eqx.Module):
             if slot == name:
                 return self.array[..., first] if length == 0 else self.array[..., first : first + length]
         if not isinstance(name, str):
-            raise TypeError(f"`{name}` was given, but entries are accessed by name; write `q.yaw`, `q['yaw']`, or `q.array[0]` for the first of all")
+            raise TypeError(f"`{name}` was given, but entries are accessed by name; write `q.yaw`, "
+                "`q['yaw']`, or `q.array[0]` for the first of all")
         raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):

@@ -44,7 +44,7 @@ class StatefulError(ValueError):
 
 
 class NamesRead:
-    """Names that the methods of classes, or functions, read; a pytree without leaves, whose structure changes
+    """Names that methods of classes, or functions, read: a pytree without leaves, whose structure changes
     with their values.
     """
 
@@ -57,7 +57,9 @@ class NamesRead:
         return names_read, self._roots
 
     def now(self) -> tuple["NamesRead", int]:
-        """Return itself and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
+        """Return the names with their present values, and a version number; equal contents have equal
+        numbers. Raises ValueError where a name now refers to an object with state.
+        """
         found = [x for look in self._looks for x in look()]
         if len(found) != len(self._seen) or not all(map(is_, found, self._seen)):
             self._look()
@@ -96,15 +98,16 @@ jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lam
 
 @lru_cache(maxsize=1024)
 def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
-    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
-    state; of a function such an object is a constant, unless `strict`.
+    """Return the names that the methods of classes, and functions, read. Raises ValueError where a name in a
+    method refers to an array, a container or an object with state; in a function such an object is a
+    constant, unless `strict`.
     """
     return NamesRead(roots, strict)
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """Return present values of the names that a function reads; None if one has state, or it is not a
-    function, so that its trace cannot be kept.
+    """Return present values of the names that a function reads; None if one has state or it is no function,
+    so that its trace cannot be stored.
     """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
@@ -113,7 +116,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 
 def is_function(x) -> bool:
-    """Return whether it is a function that may read something, and not a module that holds numbers."""
+    """Return whether it is a function that may read values, and not a module that holds numbers."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(_attribute(x, "__wrapped__"))
 
 
@@ -129,9 +132,7 @@ def is_installed(name: str | None) -> bool:
 
 
 def functions_in(member) -> list[FunctionType]:
-    """Return the functions of Python's in a member of a class, without wrappers that other modules put around
-    them.
-    """
+    """Return the Python functions in a member of a class, without wrappers of other modules."""
     found, member = [], member.fget if isinstance(member, property) else member
     while member is not None and not isinstance(member, type):
         if isinstance(member, FunctionType) and (member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")):
@@ -142,8 +143,8 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def _attribute(x, name: str):
-    """Return an attribute, or None; an object's own `__getattr__` may raise anything, and so does a variable
-    that is not yet set.
+    """Return an attribute, or None if reading it fails: an object's own `__getattr__` may raise any error,
+    and so does a variable that is not yet set.
     """
     try:
         return getattr(x, name, None)
@@ -152,8 +153,8 @@ def _attribute(x, name: str):
 
 
 def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[], list]], ...]:
-    """Return the names that a function loads itself, with their sources: its globals, and the variables of
-    enclosing functions; None if not yet set.
+    """Return the names that a function itself loads, with their sources: globals, and variables of enclosing
+    functions (None if not yet set).
     """
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
@@ -163,8 +164,8 @@ def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[], list]], ...]:
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]:
-    """Return names used by code, including attributes, or only by some instructions; inner functions
-    included.
+    """Return names used by code (by some instructions only, if given), including attributes and inner
+    functions.
     """
     own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
     return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
@@ -184,7 +185,7 @@ class _Same:
 
 
 def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
-    """Return the key of a name's value; for a value with state its identity, or, if `where` is given, a
+    """Return the key of a name's value; for a value with state its identity, or, if `where` is given, raise
     StatefulError.
     """
     try:
@@ -194,8 +195,10 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
             return _Same(x)
     what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without being noticed"
     raise StatefulError(
-        f"{where} reads `{name}`, {'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
-        f"make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no numbers, or replace it by a tuple of numbers"
+        f"{where} reads `{name}`, "
+        f"{'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
+        f"make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no "
+        "numbers, or replace it by a tuple of numbers"
     )
 
 
@@ -203,7 +206,7 @@ def key(x: Any) -> Hashable:
     """Return a key of a value without state: its type and value; for functions, modules and classes their
     identity.
 
-    **Raises** StatefulError for what may change: arrays, containers, objects.
+    **Raises** StatefulError for values that may change: arrays, containers, objects.
     """
     if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | PurePath):
         return type(x), repr(x)
@@ -230,7 +233,7 @@ def _parts(x: Any) -> tuple | None:
 
 
 def _is_constant(x: Any) -> bool:
-    """Return whether it is a module, a class, a function, or something else that has no state of its own."""
+    """Return whether it is a module, a class, a function, or another object without state."""
     if isinstance(x, BuiltinFunctionType | MethodType):
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":

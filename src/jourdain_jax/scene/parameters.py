@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, as_real, described, has_unit, know
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array; other values stay, to be refused by name: a converter
-    does not know the name.
+    """Return a parameter as a floating-point array. Other values stay unchanged here; they are refused later,
+    when the name of the field is known.
     """
     try:
         return as_real(value)
@@ -42,7 +42,9 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
 
 
 def parameter_faults(scene) -> dict[str, Flag]:
-    """Parameter name -> whether it is not finite or has the wrong sign; also under jit and vmap, where nothing can be raised."""
+    """Return parameter name -> whether it is not finite or has the wrong sign; also under jit and vmap, where
+    nothing can be raised.
+    """
     faults = {}
     for name, value, metadata in parameters_of(scene):
         right = jnp.isfinite(value)
@@ -53,25 +55,31 @@ def parameter_faults(scene) -> dict[str, Flag]:
 
 
 def check_parameters(scene) -> None:
-    """Raise a ValueError that names a parameter which is not finite or has the wrong sign; traced values are not checked."""
+    """Raise ValueError with the name of a parameter that is not finite or has the wrong sign; traced values
+    are not checked.
+    """
     for name, value, metadata in parameters_of(scene):
         where = f"parameter `{name}` of `{type(scene).__name__}`"
         if has_unit(value) or not hasattr(value, "dtype"):
-            raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
+            raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array "
+                "of numbers")
         if not jnp.issubdtype(value.dtype, jnp.floating):
-            raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check where it was computed")
+            raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check "
+                "where it was computed")
         numbers = known_numbers(value)
         if not np.all(np.isfinite(numbers)):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):
-            raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value above zero")
+            raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value "
+                "above zero")
         if metadata["non_negative"] and not np.all(numbers >= 0):
-            raise ValueError(f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value that is not negative")
+            raise ValueError(f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value "
+                "that is not negative")
 
 
 def stacked_parameters(scene) -> str:
-    """Return the parameters of a scene with one axis more than their defaults, in words, as for a batch of
-    scenes; empty if there are none.
+    """Name the parameters of a scene that have one axis more than their defaults, as a batch of scenes has;
+    empty if there are none.
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}
@@ -79,8 +87,9 @@ def stacked_parameters(scene) -> str:
     if not many:
         return ""
     return (
-        f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than by default; "
-        "for many scenes at once use `jax.vmap` over them, or `rollout` with `parameters={name: values}`"
+        f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than by "
+        "default; for many scenes at once use `jax.vmap` over them, or `rollout` with `parameters={name: "
+        "values}`"
     )
 
 

@@ -19,7 +19,7 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
     """Return an inertia matrix (3, 3) about the mass centre in kg m^2, possible for all values of the
     numbers.
 
-    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13), d: logarithms of lengths times square roots of masses, s: these themselves, sqrt(kg) m; or, of a body
+    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13) in sqrt(kg) m, of which d are logarithms; for a body
     that is symmetric about its x-z plane, (d1, d2, d3, s13): Ixy = Iyz = 0.
 
         class Frame(jj.Scene):
@@ -29,11 +29,12 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
 
     **Raises** ValueError for another shape. Differentiable at all numbers.
     """
-    numbers = checked_real(numbers, "`numbers` of `inertia_from_log_cholesky`", advice="give (d1, d2, d3, s12, s23, s13), or (d1, d2, d3, s13)")
+    numbers = checked_real(numbers, "`numbers` of `inertia_from_log_cholesky`", advice="give (d1, d2, d3, "
+        "s12, s23, s13), or (d1, d2, d3, s13)")
     if numbers.shape not in ((6,), (4,)):
         raise ValueError(
-            f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of a body that is symmetric about its x-z plane; "
-            "make them from an inertia matrix by `log_cholesky`"
+            f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of "
+            "a body that is symmetric about its x-z plane; make them from an inertia matrix by `log_cholesky`"
         )
     zero = jnp.zeros((), numbers.dtype)
     d1, d2, d3 = jnp.exp(numbers[:3])
@@ -45,16 +46,19 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
 
 
 def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]:
-    """Return the numbers (6,) from which `inertia_from_log_cholesky` makes this inertia matrix, (3, 3) or
+    """Return the numbers (6,) from which `inertia_from_log_cholesky` computes this inertia matrix: (3, 3) or
     three principal moments, kg m^2, about the mass centre.
 
-    `symmetric`: four numbers, of a body that is symmetric about its x-z plane. **Raises** ValueError for another shape, a matrix that is not symmetric or has
-    Ixy or Iyz where `symmetric` says that there are none, and for moments that no body with a thickness has; traced matrices give NaN there instead.
+    `symmetric`: return four numbers, for a body that is symmetric about its x-z plane. **Raises** ValueError
+    for another shape, a matrix that is not symmetric, nonzero Ixy or Iyz despite `symmetric`, and for moments
+    that no body with a thickness has; traced matrices give NaN there instead.
     """
-    I = checked_real(inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal moments, kg m^2")
+    I = checked_real(inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal "
+        "moments, kg m^2")
     I = jnp.diag(I) if I.shape == (3,) else I
     if I.shape != (3, 3):
-        raise ValueError(f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a matrix or three principal moments, kg m^2")
+        raise ValueError(f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a "
+            "matrix or three principal moments, kg m^2")
     S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
     if known_numbers(I).size:
         _check(np.asarray(I), np.asarray(S), symmetric)
@@ -69,9 +73,11 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
     if not np.all(np.abs(I - I.T) <= 1e-9 * size):
         raise ValueError("`inertia` of `log_cholesky` is not symmetric; give Ixy = Iyx, Ixz = Izx, Iyz = Izy")
     if symmetric and max(abs(I[0, 1]), abs(I[1, 2])) > 1e-9 * size:
-        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but `symmetric` excludes them; omit `symmetric`")
+        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but "
+            "`symmetric` excludes them; omit `symmetric`")
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
-            f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 (`inertia` of `log_cholesky`): each must be "
-            "positive, and less than the sum of the other two; for a flat body, give the largest a little less than that sum"
+            f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 "
+            "(`inertia` of `log_cholesky`): each must be positive, and less than the sum of the other two; "
+            "for a flat body, give the largest a little less than that sum"
         )

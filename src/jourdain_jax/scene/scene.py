@@ -47,13 +47,11 @@ class Scene(eqx.Module):
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
     Methods are traced once, as everywhere in JAX: values from outside the fields of the scene are constants.
-    Numbers, texts, tuples of them and functions
-    that a method itself reads as global names, or as variables of an enclosing function, may change: the next
-    call notices it, as well as a replaced method
-    and code changed by `%autoreload`. Arrays, lists, dictionaries and objects
-    with state are refused by name: make them parameters or static fields. Changes of values read by
-    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()`
-    starts again.
+    Numbers, texts, tuples of them and functions that a method itself reads, as global names or as variables
+    of an enclosing function, may change: the next call notices it, as it notices a replaced method and code
+    changed by `%autoreload`. Arrays, lists, dictionaries and objects with state are refused by name: make
+    them parameters or static fields. Changes of values that helper functions read, of attributes of modules
+    and classes, and of files are not noticed: call `jj.clear_caches()` after them.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -70,7 +68,8 @@ class Scene(eqx.Module):
     switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts that have friction
 
     def __init_subclass__(cls, **options):
-        """Look at the names that the methods read; ValueError where one stands for an object with state."""
+        """Check the names that the methods read. Raises ValueError where one refers to an object with state.
+        """
         super().__init_subclass__(**options)
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
             modes = dict(cls.modes.pairs)
@@ -92,7 +91,8 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):
-            raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class attribute: coordinates = jj.coordinates('x y ...')")
+            raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class "
+                "attribute: coordinates = jj.coordinates('x y ...')")
         check_description(self, Scene)
         hold_leaves(self)
         check_parameters(self)
@@ -106,8 +106,8 @@ class Scene(eqx.Module):
         raise NotImplementedError(f"scene `{type(self).__name__}` has no bodies; define `bodies(self, t, q)`")
 
     def coordinate_rates(self, t: Scalar, q: Named, u: Named) -> Float[Array, "coordinates"]:
-        """Return `qdot = N(q,t) u + nu(q,t)`, affine in u. Default: every coordinate's own rate, quaternions
-        by body angular velocity.
+        """Return `qdot = N(q,t) u + nu(q,t)`, affine in u. Default: each speed is the rate of its coordinate,
+        or the body angular velocity of a quaternion.
         """
         return self.coordinates.default_rates(q.array, u.array)
 
@@ -116,8 +116,8 @@ class Scene(eqx.Module):
         return ()
 
     def potential(self, pose: Pose) -> Scalar | None:
-        """Return potential energy (J) at a `pose` besides that of the loads, a function of time and
-        coordinates; None if there is none.
+        """Return the potential energy (J) at a `pose` in addition to that of the loads, a function of time
+        and coordinates; None if there is none.
         """
         return None
 
@@ -125,7 +125,7 @@ class Scene(eqx.Module):
         """Return a function S (J s) of a `pose` whose rate is subtracted from the Lagrangian, L = T - V -
         dS/dt; None if there is none.
 
-        The motion does not depend on it, but integrators built on a discrete Lagrangian do: it shows how far
+        The motion does not depend on it, but integrators built on a discrete Lagrangian do. It shows how much
         their accuracy depends on the choice of L.
         """
         return None
@@ -154,26 +154,26 @@ class Scene(eqx.Module):
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
-        """Named events at a `motion`: positive while it may continue; it stops where a value falls through
-        zero, or is not a number beyond. At a
-        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion
-        continue.
+        """Return named events at a `motion`: values that are positive while it may continue. It stops where a
+        value falls through zero, or is not a number beyond. A value of zero at the start that rises has not
+        happened. A `jj.Event` in place of a value may let the motion continue.
 
-        Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
-        through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),
-        and where a relation in it (`<`, `where`, `abs`, ...) changes. A smooth dip of a stop event that is narrower than the longest step may be passed over:
-        choose values that fall once, or give a smaller `max_step`.
+        If several events happen in one step, the first in time counts. A value that falls through zero and
+        rises again within one step is found if the cubic through values and rates at the ends of the step
+        shows it (default solvers), or the dense output at three times in the step (other adaptive ones), and
+        where a relation in it (`<`, `where`, `abs`, ...) changes. A smooth dip of a stop event that is
+        narrower than the longest step may be missed: use values that fall once, or a smaller `max_step`.
         """
         return {}
 
     def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
-        """Return named quantities of a `motion` that this scene conserves, besides its energy; for checks and
-        summaries.
+        """Return named quantities of a `motion` that this scene conserves, besides its energy; used in checks
+        and summaries.
         """
         return {}
 
     def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
-        """Return looks of bodies at a `pose`, by name, `""` for shapes fixed in the inertial frame; for
+        """Return shapes of bodies at a `pose`, by name, `""` for shapes fixed in the inertial frame; for
         pictures only. See `jj.Visual`.
 
         Omitted bodies are drawn by their `outline`, their contacts, or their inertia.
@@ -202,20 +202,23 @@ class Scene(eqx.Module):
         """Return a copy of this scene with changed parameters: `changes`, name -> value in the parameter's
         unit.
 
-        ValueError for an unknown name (with the nearest valid one) or a value that the parameter does not allow.
+        Raises ValueError for an unknown name (with the nearest valid one) or a value that the parameter does
+        not allow.
         """
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:
             if name not in self.__dataclass_fields__:
-                raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}")
+                raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; "
+                    f"{nearest(name, names)}")
         return replace(self, **changes)
 
     def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
         """Return q and u with the named `values`, the rest at the reference (zero; the identity for
-        quaternions); and the given names.
+        quaternions), and the given names.
 
-        A quaternion or its angular velocity may be given whole, by its own name; of a quaternion that is named in part, the other parts are zero.
-        ValueError for an unknown name or a wrong shape, and for parts of a quaternion that are no attitude without the others.
+        A quaternion or its angular velocity may be given as a whole, by its own name. If a quaternion is
+        given in part, its other parts are zero. Raises ValueError for an unknown name or a wrong shape, and
+        for parts of a quaternion that alone define no attitude.
         """
         q, u, given = vectors_named(self, values)
         return jnp.asarray(q), jnp.asarray(u), given
@@ -236,7 +239,8 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
         hits = _put(coordinates, q, name, value) + _put(speeds, u, name, value)
         if not hits:
             valid = coordinates.entries + speeds.entries
-            raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
+            raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; "
+                f"{nearest(name, valid)}")
         given += hits
     for first, _ in scene.coordinates.quaternions:
         given += _completed(coordinates.entries[first : first + 4], q, first, given)
@@ -244,8 +248,8 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
 
 
 def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str]:
-    """Return the other parts of a quaternion that is named in part, put to zero: otherwise its attitude would
-    be any one that has these parts.
+    """Return the omitted parts of a partly given quaternion as zero, without which its attitude would be
+    ambiguous.
     """
     named = [name for name in parts if name in given]
     if len(named) in (0, 4):
@@ -255,8 +259,9 @@ def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str
     if np.any(abs(known_numbers(square) - 1) > 1e-4):  # parts may be typed with a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
-            f"of the quaternion `{group}` only {told} is given, with squares that sum to {float(square):.4g}, not an attitude; give all four "
-            f"parts, {group}=(w, x, y, z), or parts whose squares sum to 1, with zero for the others"
+            f"of the quaternion `{group}` only {told} is given, with squares that sum to "
+            f"{float(square):.4g}, not an attitude; give all four parts, {group}=(w, x, y, z), or parts "
+            "whose squares sum to 1, with zero for the others"
         )
     return [name for name in parts if name not in named]
 
@@ -270,7 +275,8 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
     shape = () if type(value) is float else np.shape(value)
     if name in names.entries:
         if shape != ():
-            raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use `jax.vmap` or `rollout` for many")
+            raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use "
+                "`jax.vmap` or `rollout` for many")
         entries[names.entries.index(name)] = value
         return [name]
     first, length = next(rest for group, *rest in names.groups if group == name)
@@ -292,7 +298,7 @@ def _names_read(kind: type[Scene], *functions: Callable) -> NamesRead:
 
 
 class HeldFunction(eqx.Module):
-    """A function that JAX takes for part of the structure of the scene, as it takes a static field."""
+    """A function that JAX treats as part of the structure of the scene, like a static field."""
 
     function: Callable[..., Any] = eqx.field(static=True)
     read: NamesRead
@@ -307,9 +313,10 @@ class HeldFunction(eqx.Module):
 
 
 def hold_leaves(scene) -> None:
-    """Holds the functions in a scene that is being built, however deep in its fields, and makes arrays of floats, as parameters are.
+    """Make the functions in a new scene static, at any depth of its fields, and convert floats to arrays as
+    parameters are converted.
 
-    A ValueError for texts, which nothing can hold but a static field.
+    Raises ValueError for texts, which only a static field can hold.
     """
 
     def held(leaf):
@@ -325,8 +332,9 @@ def hold_leaves(scene) -> None:
         text = next((leaf for leaf in leaves if isinstance(leaf, str) or has_unit(leaf)), None)
         if text is not None:
             raise ValueError(
-                f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected numbers; "
-                f"give the number, or for a text write `{field.name}: str = eqx.field(static=True, default={text!r})`"
+                f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected "
+                f"numbers; give the number, or for a text write `{field.name}: str = eqx.field(static=True, "
+                f"default={text!r})`"
             )
         if any(callable(leaf) or type(leaf) is float for leaf in leaves):
             object.__setattr__(scene, field.name, jax.tree.map(held, value))

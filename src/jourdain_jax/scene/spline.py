@@ -48,22 +48,24 @@ class Spline(eqx.Module):
 
 
 def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
-    """Return times and values, at least so many, one `kind` for each `of` a scene. ValueError for other
-    shapes, and for invalid numbers.
+    """Return times and values, of which there must be at least `least`; `kind` and `of` name them in errors.
+    Raises ValueError for other shapes and for invalid numbers.
     """
     ts = checked_real(ts, f"`ts` of `{kind}`", advice="give times in s")
     values = checked_real(values, f"`values` of `{kind}`", advice="give one number per time")
     if ts.ndim != 1 or ts.shape[0] < least or values.shape != ts.shape:
         raise ValueError(
-            f"`{kind}` was given times of shape {ts.shape} and values of shape {values.shape}, expected two vectors of one length, at least {least}; "
-            f"give one value per time, and one `{kind}` per {of}"
+            f"`{kind}` was given times of shape {ts.shape} and values of shape {values.shape}, expected two "
+            f"vectors of one length, at least {least}; give one value per time, and one `{kind}` per {of}"
         )
     knots, numbers = known_numbers(ts), known_numbers(values)
     if not (np.all(np.isfinite(knots)) and np.all(np.diff(knots) > 0)):
-        raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
+        raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the "
+            "samples by time and merge repeated ones")
     if not np.all(np.isfinite(numbers)):
         first = int(np.argmin(np.isfinite(numbers)))
-        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit missing samples")
+        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit "
+            "missing samples")
     return ts, values
 
 

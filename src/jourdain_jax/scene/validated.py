@@ -28,7 +28,8 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
     """Return the bodies of a scene by name."""
     bodies = _dictionary(scene, "bodies", (t, q), '{"disc": jj.RigidBody(...)}')
     if not bodies:
-        raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such as {{"disc": jj.RigidBody(...)}}')
+        raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such '
+            'as {"disc": jj.RigidBody(...)}')
     for name, body in bodies.items():
         check_kind(
             body, get_args(Body), f"body `{name}` of `{_name(scene)}`",
@@ -55,7 +56,8 @@ def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
     given = scene.loads(motion)
     loads = (given,) if isinstance(given, Load) else tuple(given) if isinstance(given, Iterable) and not isinstance(given, dict | str) else None
     if loads is None:
-        raise ValueError(f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of loads; write return (jj.gravity(motion, 9.81),)")
+        raise ValueError(f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of "
+            "loads; write return (jj.gravity(motion, 9.81),)")
     return tuple(_checked_load(scene, i, load) for i, load in enumerate(loads))
 
 
@@ -69,7 +71,8 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
         forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
         torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
         generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
-        potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
+        potential=None if load.potential is None else checked_real(load.potential, "potential of "
+            f"{where}", ()),
     )
     return Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
 
@@ -128,7 +131,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
             "a `jj.disc_contact(...)` or another contact"
         )
         if (contact.friction is not None) != (name in scene.switching.contacts):
-            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside the method `contacts`; state `friction=` in that method")
+            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside the method "
+                "`contacts`; state `friction=` in that method")
     return contacts
 
 
@@ -141,9 +145,11 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
         for what, changed in (("to", event.to), ("jump", event.jump)):
             check_kind(changed, Mapping, f"`{what}` of {where}", "a dictionary by name")
         if event.stop and (event.to or event.jump):
-            raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, or `stop`")
+            raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, "
+                "or `stop`")
         check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")
-        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves `{{}}`, which is not a coordinate or speed")
+        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves "
+            "`{}`, which is not a coordinate or speed")
         found[name] = Event(
             checked_real(event.value, where, (), advice=advice),
             {mode: checked_real(scene.modes.number(mode, value, where), f"mode `{mode}` of {where}", ()) for mode, value in event.to.items()},
@@ -160,16 +166,18 @@ def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
-    """Return the scene's own looks of its bodies, `""` for shapes fixed in the inertial frame."""
+    """Return the scene's own shapes of its bodies; `""` is for shapes fixed in the inertial frame."""
     given = _dictionary(scene, "visuals", (pose,), '{"ball": jj.Visual.ball(0.1)}')
     found = {}
     for name, looks in given.items():
         if name and name not in pose:
-            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" (the inertial frame); {nearest(name, pose.bodies)}')
+            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" '
+                f'(the inertial frame); {nearest(name, pose.bodies)}')
         found[name] = (looks,) if isinstance(looks, Visual) else tuple(looks) if isinstance(looks, list | tuple) else (looks,)
         for look in found[name]:
             if not isinstance(look, Visual):
-                raise ValueError(f"`visuals` of `{_name(scene)}` gives {described(look)} for `{name}`, expected shapes, such as jj.Visual.ball(0.1)")
+                raise ValueError(f"`visuals` of `{_name(scene)}` gives {described(look)} for `{name}`, "
+                    "expected shapes, such as jj.Visual.ball(0.1)")
     return found
 
 
@@ -177,10 +185,12 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
     """Return a method's result, which must be a dictionary by name."""
     given = getattr(scene, method)(*at)
     if not isinstance(given, dict):
-        raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary by name; write return {example}")
+        raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary "
+            f"by name; write return {example}")
     for name in given:
         if not isinstance(name, str):
-            raise ValueError(f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, expected names (texts) as keys")
+            raise ValueError(f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, "
+                "expected names (texts) as keys")
     return given
 
 

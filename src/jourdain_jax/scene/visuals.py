@@ -20,7 +20,9 @@ from jourdain_jax.scene.grounds import tangents_of
 
 
 class Faces:
-    """Corners (points, 3) and faces of a mesh, known numbers; two are the same only if they are one object."""
+    """Corners (points, 3) and faces of a mesh, as known numbers. Two meshes are equal only if they are one
+    object.
+    """
 
     def __init__(self, corners: np.ndarray, polygons: tuple[tuple[int, ...], ...]):
         self.corners, self.polygons = corners, polygons
@@ -66,8 +68,8 @@ class Visual(eqx.Module):
 
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":
-        """Return a ball of the given `radius` (m), its octants painted in turn, so that one sees it roll;
-        `look` as for all shapes.
+        """Return a ball of the given `radius` (m), whose octants are painted in turn, so that its rolling is
+        visible; `look`: as for all shapes.
         """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
@@ -111,17 +113,19 @@ class Visual(eqx.Module):
         (default: thin); `colour`, `opacity` as for all.
         """
         if len(points) < 2:
-            raise ValueError(f"a line to be drawn has {len(points)} points, expected at least two; write jj.Visual.line(a, b)")
+            raise ValueError(f"a line to be drawn has {len(points)} points, expected at least two; write "
+                "jj.Visual.line(a, b)")
         stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
         radius = None if radius is None else _lengths(radius, "radius of a line", ())
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
 
     @staticmethod
     def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
-        """Return a spring between two points `a`, `b` (m, body frame): a wire of so many `turns` of the given
+        """Return a spring between two points `a`, `b` (m, body frame): a wire with this number of `turns` and
         `radius` (m); `colour`, `opacity` as for all shapes.
         """
-        a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float) for p in (a, b))
+        a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, "
+            "m").astype(float) for p in (a, b))
         radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
         along = jnp.where(length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0]))
         share = np.linspace(0.0, 1.0, 12 * turns + 1)[:, None]
@@ -135,16 +139,19 @@ class Visual(eqx.Module):
     def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """Return a body of flat faces.
 
-        `vertices` (points, 3) in m and `faces`, one row of numbers of vertices for each, anticlockwise seen from outside, are known numbers; `scale`, one
-        factor or three, may depend on parameters. `look` as for all shapes.
+        `vertices` (points, 3) in m and `faces`, one row of vertex indices for each, anticlockwise seen from
+        outside, are known numbers; `scale`, one factor or three, may depend on parameters. `look` as for all
+        shapes.
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
         if corners.ndim != 2 or corners.shape[1] != 3 or not np.all(np.isfinite(corners)):
-            raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m")
+            raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, "
+                "m")
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
         if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
-            raise ValueError(f"faces of a mesh need at least three vertex numbers each, from 0 to {len(corners) - 1}, in order")
+            raise ValueError("faces of a mesh need at least three vertex numbers each, from 0 to "
+                f"{len(corners) - 1}, in order")
         factors = jnp.broadcast_to(_lengths(scale, "scale of a mesh"), (3,))
         return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
@@ -157,11 +164,13 @@ class Visual(eqx.Module):
         without faces.
         """
         if not os.path.isfile(path):
-            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative paths begin at `{os.getcwd()}`")
+            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative "
+                f"paths begin at `{os.getcwd()}`")
         try:
             read = needed("trimesh", "reading a mesh from a file", "robots").load(os.fspath(path), force="mesh")
         except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
-            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj") from None
+            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as "
+                ".stl or .obj") from None
         if not len(read.faces):
             raise ValueError(f"the file `{os.fspath(path)}` has no faces, expected a mesh")
         return Visual.mesh(read.vertices, read.faces, scale=scale, **look)
@@ -181,7 +190,8 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
 
 def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None) -> Visual:
     """Return a shape of this kind; the other arguments as for all shapes."""
-    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(real_type())
+    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, "
+        "m").astype(real_type())
     turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
 
@@ -189,7 +199,9 @@ def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacit
 def _checked(visual: Visual) -> Visual:
     colour = visual.colour
     if colour is not None and not (isinstance(colour, str) and len(colour) == 7 and colour[0] == "#" and set(colour[1:].lower()) <= set("0123456789abcdef")):
-        raise ValueError(f'colour of a {visual.kind} is {described(colour)}, expected six hexadecimal digits, such as "#1f77b4"')
+        raise ValueError(f'colour of a {visual.kind} is {described(colour)}, expected six hexadecimal '
+            'digits, such as "#1f77b4"')
     if not isinstance(visual.opacity, int | float) or not 0 < visual.opacity <= 1:
-        raise ValueError(f"opacity of a {visual.kind} is {visual.opacity!r}, expected a number above 0 and at most 1")
+        raise ValueError(f"opacity of a {visual.kind} is {visual.opacity!r}, expected a number above 0 and "
+            "at most 1")
     return visual

@@ -52,18 +52,20 @@ def stability_chart(
     - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
     - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
       parameter, at least 3.
-    - `prior`: parameter (one number) -> `jj.Normal`, as `measured_bicycle(...).prior`: `chart.bands` are the
-      standard deviations that these make, to the first order and independent, where the first number keeps its
-      value.
+    - `prior`: parameter (one number) -> `jj.Normal`, as `measured_bicycle(...).prior`. `chart.bands` then has
+      the standard deviations of the second number on each boundary, to first order, for independent
+      parameters.
     - `asked`: arguments of `family`: `held`, `inputs`, `names`.
 
-    A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
-    number, found to round-off. A boundary that does not pass the middle is not seen, and one that turns back along the first number has gaps.
+    A family along the second number, at the middle value of the first, finds the boundaries. Each is then a
+    `critical` point as a function of the first number, found to round-off. A boundary that does not pass the
+    middle value is missed, and one that turns back along the first number has gaps.
 
     **Returns** a `StabilityChart`. **Raises** as `family`; ValueError where there are not two axes; a prior that is no `jj.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
-        raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, each with its first and its last value")
+        raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, "
+            "each with its first and its last value")
     (first, ends), (second, (begin, end)) = axes.items()
     values = np.linspace(*ends, points)
     scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]  # the ends are values that it may have
@@ -75,7 +77,8 @@ def stability_chart(
     try:
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
-        raise ValueError(f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter that is one number") from None
+        raise ValueError(f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter "
+            "that is one number") from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []
     for change in middle.changes:
@@ -94,7 +97,7 @@ def stability_chart(
 @compiled_quickly
 def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
     """Return the point of a scene with this value, the arguments of the program there, and the pseudo-inverse
-    of the equations' derivatives.
+    of the equations' Jacobian.
     """
     scene = scene.replace(**{first: x})
     X, inverse, *found = followed_to(special, scene)

@@ -47,7 +47,9 @@ SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE
 
 
 class Sensitivities(Printed, eqx.Module):
-    """Derivatives of one eigenvalue by every parameter, the change of the steady motion included; `found["c"]`."""
+    """Derivatives of one eigenvalue by every parameter, including the change of the steady motion;
+    `found["c"]`.
+    """
 
     mode: str = eqx.field(static=True)
     eigenvalue: complex  # 1/s
@@ -63,20 +65,22 @@ class Sensitivities(Printed, eqx.Module):
     def _text(self) -> str:
         head = f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g}, {MEANINGS[self.code]}"
         rows = [(name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()]
-        return "\n".join([head, f"  derivatives, where {', '.join(self.held) or 'nothing'} keeps its value:", *table(rows)])
+        return "\n".join([head, f"  derivatives, where {', '.join(self.held) or 'nothing'} keeps its "
+            "value:", *table(rows)])
 
 
 @of_known_numbers
 def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels) -> Sensitivities:
-    """Return derivatives of the eigenvalue s of small motions about a steady state, all by two reverse
-    passes.
+    """Return derivatives of the eigenvalue s of small motions about a steady state by all parameters, from
+    two reverse passes.
     """
     scene, state, f = small
     equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f))
     z = equations.start
     look = equations(z)
     if not largest(look.R) < 1e-6:
-        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no derivatives; find a steady one by `jj.steady`")
+        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no "
+            "derivatives; find a steady one by `jj.steady`")
     fixed = _held(equations, look, as_names(held))
     (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
     apart = np.abs(values - s)
@@ -105,8 +109,8 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
 
 
 def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
-    """Return unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise speeds
-    in order, then coordinates.
+    """Return the unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise
+    speeds in their order, then coordinates.
     """
     beside = null_space(look.J)
     count, speeds = beside.shape[1], equations.scene.speed_names.entries
@@ -115,12 +119,13 @@ def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
         if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
             chosen.append(k)
     if not len(chosen) == count >= len(named):
-        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` that distinguish them ({', '.join(named)} do not)")
+        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` "
+            f"that distinguish them ({', '.join(named)} do not)")
     return chosen
 
 
 class CriticalPoint(Printed, eqx.Module):
-    """A special point of a family; `point["lean"]`, `point.speed`. All is NaN unless `code` is 0."""
+    """A special point of a family; `point["lean"]`, `point.speed`. All numbers are NaN unless `code` is 0."""
 
     state: State
     parameters: dict[str, Float[Array, "*batch"]]  # those that vary along the family
@@ -152,7 +157,7 @@ class CriticalPoint(Printed, eqx.Module):
 
 class _Program:
     """R, the residual of `F (a b) = (a b) S`, C a and C b, with their derivatives, as functions of all
-    numbers, a, b, and S by rows.
+    numbers, a, b, and S (by rows).
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[tuple[int, ...], ...]) -> None:
@@ -216,8 +221,8 @@ class Special(eqx.Module):
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return rows L with L X = c: they fix given values, size and phase of a and b relative to a nearby
-        point, and w where it is zero.
+        """Return rows L with L X = c. They fix given values, the size and phase of a and b relative to a
+        nearby point, and w where it is zero.
         """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
@@ -237,8 +242,8 @@ class Special(eqx.Module):
         return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
-        """Return the step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the
-        largest.
+        """Return the Gauss-Newton step, the pseudo-inverse of G_X, and the ratio of its smallest to its
+        largest pivot.
         """
         (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
         G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
@@ -267,9 +272,11 @@ def _solution(special: Special, scene: Scene) -> CriticalPoint:
 
 
 def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """X, the pseudo-inverse of G_X, its least pivot over the largest, and a code: all is NaN unless it is 0.
+    """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. All
+    are NaN unless the code is 0.
 
-    Parameters go straight from those of the family to these; steps are cut where corrections do not shrink at once, so that none leads to another point.
+    Parameters go straight from those of the family to the given ones. A step whose corrections do not shrink
+    at once is shortened, so that it cannot lead to another point.
     """
 
     def once(carried):
@@ -314,9 +321,11 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
-        raise ValueError("`critical` needs a family of steady motions, but this is a family of periodic motions")
+        raise ValueError("`critical` needs a family of steady motions, but this is a family of periodic "
+            "motions")
     if type(scene) is not type(equations.scene):
-        raise ValueError(f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a `{type(scene).__name__}`")
+        raise ValueError(f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
+            f"`{type(scene).__name__}`")
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
     return _solution(special, scene)
@@ -328,7 +337,8 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
         names = ", ".join(sorted(set().union(*known.values())))
-        raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; it has: {names or 'none'}")
+        raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; "
+            f"it has: {names or 'none'}")
     start = curve.equations.start
     return min(found, key=lambda point: largest(curve.equations.place(point) - start))
 
@@ -345,8 +355,8 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
-            raise ValueError(f"steady motions continue in {freedoms.shape[1]} directions at equal parameters, "
-                "so a zero eigenvalue is not a special point; hold more, by `held`")
+            raise ValueError(f"steady motions continue in {freedoms.shape[1]} directions at equal "
+                "parameters, so a zero eigenvalue is not a special point; hold more, by `held`")
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
     elif point.kind == PAIR:

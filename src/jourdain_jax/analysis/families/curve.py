@@ -36,7 +36,9 @@ class Point:
 def solved(
     equations: Motions, z: Vector, rows: Float[np.ndarray, "fixed unknowns"], targets: Float[np.ndarray, "fixed"], most: int = 8, longest: float = np.inf
 ) -> tuple[Vector, Look, int] | None:
-    """z with R = 0 and `rows z = targets`, the equations there and the number of corrections; None where Newton's method does not converge."""
+    """Return z with R = 0 and `rows z = targets`, the equations there and the number of corrections; None
+    where Newton's method does not converge.
+    """
     for k in range(most):
         look = equations(z)
         if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
@@ -50,8 +52,8 @@ def solved(
 
 
 def along(equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True) -> Point | None:
-    """Return the point of the curve at a distance along the tangent of another one; None if none is found.
-    Without modes it copies those of the other one.
+    """Return the point of the curve at a given distance along the tangent of another point; None if none is
+    found. Without `modes`, the modes of that point are copied.
     """
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
@@ -65,10 +67,11 @@ def along(equations: Motions, point: Point, s: float, guess: Vector | None = Non
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
-    """Return points of a curve from its start on, and why it ends: at a target, at its own start, or where no
-    further point is found.
+    """Return the points of a curve from its start on, and the reason why it ends: a target, its own start, or
+    no further point.
 
-    A step is halved where it turns sharply, takes many corrections, or moves eigenvalues so far that it is open which is which.
+    A step is halved where the curve turns sharply, where it takes many corrections, or where eigenvalues move
+    so far that they cannot be matched.
     """
     points, step, easy = [start], LONGEST / 10, 3
     while len(points) < most:
@@ -86,7 +89,8 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
                 if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
                     points[-1] = end
                 left = _left(equations, points[-1])
-                return (points[:-1], left) if left else (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
+                return (points[:-1], left) if left else (points, f"{equations.unknowns[k]} is "
+                    f"{target * equations.size[k]:g}")
         if left := _left(equations, there):
             return points[:-1], left
         if _closed(equations, start, here, there):
@@ -101,8 +105,8 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Return why a curve ends before a point: a parameter there has not the sign declared for it; None where
-    all have.
+    """Return why a curve ends before a point, namely that a parameter has the wrong sign there; None where
+    all signs are right.
     """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):
@@ -135,11 +139,11 @@ def reversed_at(point: Point) -> Point:
 
 
 def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
-    """Return the point between two neighbours at which a smooth `test`, of modes or not, changes its sign;
-    None where the curve is lost, or undefined.
+    """Return the point between two neighbours at which a smooth `test` changes its sign; None where the curve
+    is lost or undefined.
 
-    By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
-    it often lies in the middle.
+    The interval is repeatedly divided, not in the middle, and a short one is interpolated linearly. At a
+    branch point itself the equations lose rank, and by symmetry such a point often lies in the middle.
     """
     share, short = 0.4, 1e-6  # a piece that short differs from its chord by the square of its length
     (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there

@@ -57,7 +57,8 @@ class Motions(ABC):
 
     def index(self, name: str) -> int:
         """Return the number of an unknown; a ValueError with the nearest names if there is none."""
-        check_name(name, self.unknowns, f"`{name}` is not an unknown of the {self.what} of `{type(self.scene).__name__}`")
+        check_name(name, self.unknowns, f"`{name}` is not an unknown of the {self.what} of "
+            f"`{type(self.scene).__name__}`")
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:
@@ -81,7 +82,9 @@ class Motions(ABC):
 
     @abstractmethod
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """What tells small motions apart, in any order, without what belongs to going on along the family."""
+        """Return what distinguishes small motions, in any order, without the zeros that belong to motion
+        along the family.
+        """
 
     def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
         """Return the equations, with a row for each unknown that keeps its value."""
@@ -91,7 +94,9 @@ class Motions(ABC):
 
 
 class SteadyEquations(Motions):
-    """R, J, F and the rows of (q, y) of one scene as functions of z; unknowns that are `held` keep their values at the guess."""
+    """R, J, F and the rows of (q, y) of one scene as functions of z; `held` unknowns keep their values at the
+    guess.
+    """
 
     what, modes = "steady motions", "eigenvalues, 1/s"
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
@@ -127,8 +132,8 @@ class SteadyEquations(Motions):
         return self.with_held(v[self.rows], J, z, (F, C))
 
     def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
-        """Return directions of (q, y), in columns, along which steady motions continue at equal parameters,
-        in SI units.
+        """Return the directions of (q, y), in columns and SI units, along which steady motions continue at
+        equal parameters.
         """
         count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
         return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
@@ -137,12 +142,11 @@ class SteadyEquations(Motions):
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of going on
-        along the family or along what is held.
+        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros that belong
+        to motion along the family or to held quantities.
 
-        Directions along which steady motions continue, T, belong to zeros by structure, and are taken out as
-        a subspace, not by their size: with P orthonormal
-        and across T the others are those of P' A P.
+        Steady motions continue along T; these directions have zero eigenvalues by structure and are removed
+        as a subspace. With P orthonormal and across T, the others are the eigenvalues of P' A P.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
         F, C = look.small
@@ -158,14 +162,15 @@ class SteadyEquations(Motions):
 
 
 def numbered(scene: Scene) -> Scene:
-    """Return a scene with the place of its first number among all numbers in each parameter."""
+    """Return a scene in which each parameter is replaced by the index of its first number among all numbers.
+    """
     leaves, treedef = jax.tree.flatten(scene)
     return jax.tree.unflatten(treedef, np.cumsum([0, *map(np.size, leaves[:-1])]).tolist())
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Return sizes of some coordinates, by their domain, and of all speeds: the units in which unknowns are
-    measured.
+    """Return the sizes of some coordinates, by their domain, and of all speeds. They are the units of the
+    unknowns.
     """
     low, high = coordinate_bounds(scene)
     of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]

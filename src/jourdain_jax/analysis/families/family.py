@@ -57,11 +57,10 @@ class FamilyPoint(Printed):
 @dataclass(frozen=True, repr=False, eq=False)
 class Family(Printed):
     """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
-    periodic one are those at the start of a period.
+    periodic motion are those at the start of a period.
 
-    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to
-    what is held, are omitted. Of periodic
-    motions they are multipliers, all of them.
+    Eigenvalues keep their columns along the curve. Zeros due to motion along the family or to held quantities
+    are omitted. For periodic motions, all multipliers take the place of eigenvalues.
     """
 
     equations: Motions
@@ -75,7 +74,8 @@ class Family(Printed):
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
         """Return values of a coordinate, a speed, or the parameter that varies, at all points."""
-        check_name(name, self.equations.by_name, f"a family of `{type(self.equations.scene).__name__}` has no `{name}`", UnknownNameError)
+        check_name(name, self.equations.by_name, f"a family of `{type(self.equations.scene).__name__}` has "
+            f"no `{name}`", UnknownNameError)
         return np.array([self.equations.values(point.z)[name] for point in self.points])
 
     @property
@@ -100,7 +100,9 @@ class Family(Printed):
 
     @property
     def changes(self) -> tuple[FamilyPoint, ...]:
-        """Points at which an eigenvalue passes zero, a pair the imaginary axis, or two meet; or a multiplier 1 or -1, a pair the unit circle."""
+        """Points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two meet; for
+        multipliers, points at which one passes 1 or -1, or a pair the unit circle.
+        """
         return tuple(point for point in self.special if point.modes)
 
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
@@ -138,7 +140,8 @@ class Family(Printed):
         known, ends = self.equations, self.ends
         moved = {name: float(np.ptp(self[name])) / size for name, size in zip(known.unknowns, known.size, strict=True)}
         shown = [name for name in dict.fromkeys((*known.vary, *known.unknowns)) if moved[name] > SHOWN and " in piece " not in name][:8]
-        lines = [f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, {int(self.stable.sum())} of them stable"]
+        lines = [f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, "
+            f"{int(self.stable.sum())} of them stable"]
         lines += ["  " + ends[0]] if ends[0] == ends[1] else [f"  begins: {ends[0]}", f"  ends: {ends[1]}"]
         rows = [("", *shown, "modes")]
         points = [self.point(self.points[0], "first point"), *self.special, self.point(self.points[-1], "last point")]
@@ -151,7 +154,8 @@ class Family(Printed):
             [
                 *lines,
                 *table(rows),
-                f"  {known.modes}, at the first point: {', '.join(f'{name} {value}' for name, value in eigenvalues)}",
+                f"  {known.modes}, at the first point: "
+                f"{', '.join(f'{name} {value}' for name, value in eigenvalues)}",
             ]
         )
 
@@ -178,20 +182,23 @@ def family(
         jj.family(sleigh, jj.periodic(sleigh, guess, jnp.pi, inputs=torque), vary="drag")     # multipliers in place of eigenvalues
 
     **Arguments**
-    - `guess`: as of `steady`; or a branch point of another family of steady motions, whose other curve is followed; or a `PeriodicMotion` of this class of
-      scenes, with the inputs, the event and what is held of its search.
-    - `until`: name -> value at which the curve ends. It is followed towards it from the guess, whose value of that name is kept at the start; without
-      `until` in both directions. A curve that closes ends there, and one along a parameter before it leaves
-      the sign declared for it.
-    - `vary`: a parameter of the scene, one number, that changes along the curve.
+    - `guess`: as of `steady`; or a branch point of another family of steady motions, whose other curve is
+      followed; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
+      quantities of its search.
+    - `until`: name -> value at which the curve ends. The curve is followed towards it from the guess, whose
+      value of that name is kept at the start; without `until` it is followed in both directions. A closed
+      curve ends at its start, and a curve along a parameter ends before it leaves the sign declared for it.
+    - `vary`: a parameter of the scene (one number) that changes along the curve.
     - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as of `steady`.
-    - `names`: of the modes at the start, by ascending real part and of a pair the positive imaginary part first;
-      default: the `mode_names` of the scene at the point farthest out (of a bicycle the fastest), or "mode 1", ...
-    - `max_points`: at most, in each direction.
+    - `names`: of the modes at the start, by ascending real part, for a pair the one with positive imaginary
+      part first; default: the `mode_names` of the scene at the point farthest out (for a bicycle the
+      fastest), or "mode 1", ...
+    - `max_points`: the largest number of points in each direction.
 
-    **Returns** a `Family`, traced by pseudo-arclength, with special points located to round-off. Steps are at most 0.1 of the sizes of the unknowns (of a
-    coordinate the width of its domain, of a speed 10 SI units) and turn by at most 10 degrees. Two special points of one kind within a step are found where
-    what tells them bends like a parabola there (1 mm apart on a curve of 1 m they are); others may be missed.
+    **Returns** a `Family`, traced by pseudo-arclength, with special points located to round-off. Steps are at
+    most 0.1 of the sizes of the unknowns (for a coordinate the width of its domain, for a speed 10 SI units)
+    and turn by at most 10 degrees. Two special points of one kind within one step are found only if the test
+    between them bends like a parabola, as it does for points 1 mm apart on a curve of 1 m.
 
     **Raises** ValueError: an unknown name; no steady motion near the guess; none or several freedoms (the error names what may be held); a start that is a
     branch point itself; `NotLowered` where the scene has no scalar program. `DifferentiationModeError` inside `jit`: differentiate `steady` or `linearize`.
@@ -199,7 +206,8 @@ def family(
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
     numbers = [name for name, value, _ in parameters_of(scene) if np.ndim(value) == 0]
-    check_names(varied, numbers, f"`vary` names `{{}}`, expected a parameter of `{type(scene).__name__}` that is one number")
+    check_names(varied, numbers, f"`vary` names `{{}}`, expected a parameter of `{type(scene).__name__}` "
+        "that is one number")
     equations: Motions
     if isinstance(guess, PeriodicMotion):
         equations = OrbitEquations(scene, guess, varied, held)
@@ -208,9 +216,11 @@ def family(
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
         scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
         equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
-    known = {name: checked_known(value, f"`until` of `{name}`", (), advice="give the value at which the curve ends") for name, value in until.items()}
+    known = {name: checked_known(value, f"`until` of `{name}`", (), advice="give the value at which the "
+        "curve ends") for name, value in until.items()}
     if not_numbers := [name for name, value in known.items() if not np.isfinite(value)]:
-        raise ValueError(f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite number")
+        raise ValueError(f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite "
+            "number")
     targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in known.items()]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:
@@ -218,7 +228,8 @@ def family(
     elif point.kind == "branch point" and len(point.tangent) == len(equations.unknowns):
         begin = across(equations, point.tangent / equations.size)
     else:
-        raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch point of one with the same unknowns")
+        raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch "
+            "point of a family with the same unknowns")
     points, ends = followed(equations, begin, targets, max_points)
     # between its neighbours a branch point is found as any other
     labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)

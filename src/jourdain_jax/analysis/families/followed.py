@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import largest
 
 
 def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
-    """Return all points of a curve, in order, and the reasons why it ends at the first and the last; only
-    towards the targets, if there are any.
+    """Return all points of a curve in order, and the reasons why it ends at either side. If there are
+    targets, the curve is followed towards them only.
     """
     ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
     if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
@@ -33,7 +33,8 @@ def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]
         for test in tests_between(equations, here, there, turning):
             if test.changes(here, there):
                 point = located(equations, here, there, test.of, bool(test.columns))
-                found.append((test, point) if point else (replace(test, kind=f"{test.kind}, before this point"), there))
+                found.append((test, point) if point else (replace(test, kind=f"{test.kind}, before this "
+                    "point"), there))
         branch = next((point for test, point in found if test.kind == "branch point"), None)
         if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
             found = [(test, branch if largest(point.z - branch.z) < 1e-4 else point) for test, point in found]
@@ -41,8 +42,8 @@ def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]
 
 
 def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> list[Point]:
-    """Return the points, and one wherever a test nearly vanishes between them, not beside branch points: two
-    special points may be there within a step.
+    """Return the points, and one more wherever a test nearly vanishes between two of them (except near branch
+    points), since two special points may lie there.
     """
     points, k = list(points), 1
     while k < len(points) - 1:
@@ -60,8 +61,8 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
 
 
 def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
-    """Return the steady motion near the guess: named values are kept as long as the rest can be found, then
-    only held or followed ones.
+    """Return the steady motion near the guess. All named values are kept if possible; otherwise only those
+    that are held or followed.
     """
     z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
     if not np.all(np.isfinite(look.R)):
@@ -72,17 +73,19 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
         if found and largest(found[1].R) < 1e-9:
             break
     else:
-        raise ValueError(f"no {equations.what[:-1]} of `{scene}` was found near the guess; search from further away by `jj.steady`")
+        raise ValueError(f"no {equations.what[:-1]} of `{scene}` was found near the guess; search from "
+            "further away by `jj.steady`")
     z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
     count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
     if count == 0:
-        raise ValueError(f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold fewer quantities, or name a parameter by `vary`")
+        raise ValueError(f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold "
+            "fewer quantities, or name a parameter by `vary`")
     if count > 1:
         free = [f"`{name}`" for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True) if share > 1e-3]
         raise ValueError(
-            f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: name {count - 1} of {', '.join(free)} in `held`, "
-            "or start beside a branch point"
+            f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: "
+            f"name {count - 1} of {', '.join(free)} in `held`, or start beside a branch point"
         )
     return Point(z, V[-1], look, equations.eigenvalues(look, V[-1]))
 

@@ -73,7 +73,9 @@ class PeriodicMotion(Printed, eqx.Module):
 
     @property
     def stable(self) -> Flag:
-        """Whether no small motion grows; multipliers of symmetries and conserved quantities are one, up to round-off."""
+        """Whether no small motion grows. Multipliers of symmetries and conserved quantities are one, up to
+        round-off.
+        """
         return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
 
     def _text(self) -> str:
@@ -81,8 +83,10 @@ class PeriodicMotion(Printed, eqx.Module):
             return f"{int(self.converged.sum())} of {self.converged.size} periodic motions found\n{self.state}"
         head = f"periodic motion of {float(self.period):.9g} s" if self.converged else "no periodic motion found near the guess"
         shifts = ", ".join(f"{name} by {float(value):.6g}" for name, value in self.shift.items())
-        lines = [f"{head}: residual {float(self.residual):.1e}", *([f"in a period, it shifts {shifts}"] if shifts else []), str(self.state)]
-        return "\n".join([*lines, f"multipliers: {', '.join(complex_numbers(self.multipliers))} ({'stable' if self.stable else 'unstable'})"])
+        lines = [f"{head}: residual {float(self.residual):.1e}", *(["in a period, it shifts "
+            f"{shifts}"] if shifts else []), str(self.state)]
+        return "\n".join([*lines, f"multipliers: {', '.join(complex_numbers(self.multipliers))} "
+            f"({'stable' if self.stable else 'unstable'})"])
 
 
 @shown_from_users_lines
@@ -106,18 +110,21 @@ def periodic(
 
     **Arguments**
     - `guess`: a `State`, or named values (a start, as `simulate` takes it), of a state near the motion.
-    - `period`: s, kept as it is; of loads or inputs that repeat themselves. With `until` a rough value is enough.
-    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the period is found, too. For scenes
-      in which nothing depends on time.
-    - `held`: names of coordinates and speeds that keep the guess's value at the start, where several periodic motions lie side by side.
-    - `shift`: name -> change of a coordinate in a period, `{"crank": 2 * jnp.pi}` for an angle that goes round.
-    - `pieces`: number of equal parts of the period, which are integrated side by side. Increase it where disturbances grow by more than
-      1e3 in a part.
-    - `options`, `by_name`: as of `simulate`, `inputs` among them; the default tolerance is 1e-12.
+    - `period`: in s. It is kept, and must be that of the loads or inputs, unless `until` is given; then a
+      rough value is enough.
+    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the
+      period is then found as well. Nothing in the scene may depend on time.
+    - `held`: names of coordinates and speeds that keep the guess's value at the start, needed if there are
+      neighbouring periodic motions.
+    - `shift`: name -> change of a coordinate in a period, `{"crank": 2 * jnp.pi}` for a rotating crank.
+    - `pieces`: number of equal parts of the period, which are integrated side by side. Increase it where
+      disturbances grow by more than 1e3 in a part.
+    - `options`, `by_name`: as of `simulate`, including `inputs`; the default tolerance is 1e-12.
 
-    **Returns** a `PeriodicMotion`; look at `converged` and `residual`, nothing is raised where none is found. Stop events do not end the
-    motion, but one that has passed at any of 100 times in the period counts as not found. Runs under `jit` and `vmap`; differentiable in
-    the parameters of the scene, where the motion is a smooth function of them and its multipliers are distinct.
+    **Returns** a `PeriodicMotion`. Check `converged` and `residual`, since nothing is raised where none is
+    found. Stop events do not end the motion, but a motion that has passed one, as seen at 100 times in the
+    period, counts as not found. Runs under `jit` and `vmap`; differentiable in the parameters of the scene,
+    where the motion is a smooth function of them and its multipliers are distinct.
 
     **Raises** ValueError: an unknown name, a period that is not positive; TypeError for unknown options.
     """
@@ -136,7 +143,8 @@ def periodic(
     if until is not None:
         check_name(until, events, f"`until` names `{until}`, which is not an event of {who}")
         if timed := structure_of(scene).timed:
-            raise ValueError(f"`until` finds the period where nothing depends on time, and in {who} {' and '.join(timed)} do; give `period` alone")
+            raise ValueError(f"`until` needs a scene in which nothing depends on time, but in {who} "
+                f"{' and '.join(timed)} do; omit `until`")
     for given, valid in ((held, names), (shift, entries)):
         check_names(given, valid, f"{who} has no `{{}}` to hold or to shift")
     start = as_state(modelled(built), guess, what="guess", inputs=inputs_at(inputs, 0.0))
@@ -150,7 +158,9 @@ def periodic(
 
 
 class _Shooting(eqx.Module):
-    """R and its slopes, as functions of the states at which pieces begin, shape (pieces, states), and of the period."""
+    """R and its derivatives as functions of the states at which pieces begin, shape (pieces, states), and of
+    the period.
+    """
 
     scene: Scene
     inputs: Inputs
@@ -202,7 +212,8 @@ class _Shooting(eqx.Module):
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
     def aligned(self, there: States, here: States) -> States:
-        """Return the state `there`, with the signs of its quaternions that bring it nearest to `here`."""
+        """Return the state `there`, with the signs of its quaternions chosen to bring it nearest to `here`.
+        """
         for first, _ in self.scene.coordinates.quaternions:
             part = slice(first, first + 4)
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
@@ -213,7 +224,7 @@ class _Shooting(eqx.Module):
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
     def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
-        """Return R, in units of the sizes of its entries, for pieces that end at `ends`."""
+        """Return R for pieces that end at `ends`; each entry is divided by the size of its quantity."""
         zs, _ = self.pieces_of(x)
         there = jnp.roll(zs, -1, axis=0)
         changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
@@ -249,8 +260,8 @@ class _Shooting(eqx.Module):
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
-        """Return eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going
-        on along the motion where the period is unknown.
+        """Return the eigenvalues of the product M_n .. M_1, whose factors come from df_k/dz_k and f_k,
+        largest first. If the period is unknown, the eigenvalue of motion along the orbit is omitted.
         """
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
@@ -301,7 +312,7 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R with its derivatives, and multipliers, of one scene as functions of z: the unknowns of a periodic
+    """R, its derivatives and the multipliers of one scene as functions of z: the unknowns of a periodic
     motion, and a varying parameter.
     """
 

@@ -24,7 +24,9 @@ SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalue
 
 @dataclass(frozen=True)
 class Test:
-    """A function that changes its sign at a special point of a kind, with its reliable size."""
+    """A function that changes its sign at special points of one kind, and the magnitude above which its value
+    is reliable.
+    """
 
     kind: str
     of: Callable[[Point], float]
@@ -38,8 +40,8 @@ class Test:
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Return the location where a test with the values f at three neighbours, the second at zero, nearly
-    vanishes, by a parabola; None at a change of sign.
+    """Return the place where a test nearly vanishes without changing its sign, from a parabola through its
+    values f at three neighbours (the second at zero); None where it changes its sign.
     """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
@@ -53,8 +55,8 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
-    """Return the tests between two neighbours: of folds of the named unknowns, branch points, and
-    eigenvalues.
+    """Return the tests between two neighbouring points: of folds of the named unknowns, of branch points, and
+    of eigenvalues.
     """
     held = len(here.z) - 1
     U = np.linalg.svd(here.look.J)[0][:, :held]
@@ -77,9 +79,11 @@ def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[
 
 
 def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
-    """Unit tangents of the two curves that cross at a branch point: a a' in its null space with l . R_zz a a = 0.
+    """Return unit tangents of the two curves that cross at a branch point: a and a' in its null space with l
+    . R_zz a a = 0.
 
-    R_zz by central differences of J; l: the left null vectors, of which only one has such a form that does not vanish.
+    R_zz is a central difference of J. Of the left null vectors l only one gives a quadratic form that is not
+    zero.
     """
     look = equations(z)
     U, _, V = np.linalg.svd(look.J)

@@ -25,8 +25,8 @@ def matched(before: Modes, now: Modes) -> Modes:
 
 
 def surely_matched(before: Modes, now: Modes) -> bool:
-    """Return whether every eigenvalue moved by less than half of its distance to others that are not its
-    partner.
+    """Return whether every eigenvalue moved by less than half of its distance to the nearest other one, apart
+    from its complex partner.
     """
     columns = range(len(now))
     beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
@@ -40,9 +40,10 @@ def are_partners(before, now, k: int, j: int) -> bool:
 
 
 def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
-    """Return names of the columns: as stated by the user, by the scene, or by number."""
+    """Return names of the columns: those of the user, of the scene, or numbers."""
     named = getattr(scene, "mode_names", None)
     names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
     if len(names) != len(values):
-        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes")
+        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(values)} "
+            "modes")
     return names

@@ -31,8 +31,8 @@ SLOTS = (
 
 
 class _Record(NamedTuple):
-    """Hold the forward steps of a motion, their number, their window, and a checkpoint for `every` so many
-    windows.
+    """The forward steps of a motion: their number, the window that is kept in memory, and a checkpoint for
+    `every` given number of windows.
     """
 
     going: Going
@@ -54,8 +54,8 @@ def cotangents(
 ) -> tuple[Array, list[Array]]:
     """Return cotangents of the initial state, and of the known arrays with the numbers `asked`.
 
-    `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and of its time, of times of transitions.
-    `memory`: bytes, of which the window and the checkpoints take at most a quarter each.
+    `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and its time, and of
+    times of transitions. `memory`: bytes; the window and the checkpoints each take at most a quarter.
     """
     form, slot = of.form, Slot.of(of.form, of.method)
     begun, fixed = of.begun(start)
@@ -105,7 +105,7 @@ def cotangents(
     end, index = record.going, numbers(len(start.goals), begun.y)
 
     def added(g, first, last):
-        """Add the cotangents of the states saved at the times number `first` to `last - 1`."""
+        """Add the cotangents of the states saved at the times with indices `first` to `last - 1`."""
         more = lambda: g + jnp.sum(jnp.where((index >= first) & (index < last), g_ys, 0.0), axis=0)  # noqa: E731
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(first < last)), more, lambda: g)
 

@@ -71,7 +71,7 @@ def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
 
 @dataclass
 class Functions:
-    """Evaluate rates, projection, events and their cotangents on rows in memory, as a step calls them."""
+    """Evaluates rates, projection, events and their cotangents on rows in memory, as a step calls them."""
 
     w: ArrayWriter
     form: Form
@@ -194,7 +194,7 @@ class Functions:
     def _reset_at(self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]) -> tuple[list, list]:
         """Return the state after an event with its tangents, and its time with its tangents.
 
-        `parts`: the state and the arrays that vary with their tangents; `fixed`: the others, by their places;
+        `parts`: the state and the varying arrays, with tangents; `fixed`: the other arrays, by index;
         `modes`: those after the event.
         """
         given = lambda at: (dict(zip((k for k in range(len(fixed) + len(at)) if k not in fixed), at, strict=True)) | fixed)  # noqa: E731
@@ -243,8 +243,8 @@ class Functions:
         self._store([x[None] for x in times], self.w.at(after, of["t"].start), 1)
 
     def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
-        """Pull cotangents back through the state after an event; that of its time is added after those of the
-        arrays.
+        """Pull cotangents back through the state after an event. The cotangent of the event's time is added
+        after those of the arrays.
         """
         known, of_state = sum(self.sizes()), lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
         self._pull(of_state, y, g, self.count, to_y, to_known)
@@ -270,7 +270,9 @@ class Functions:
         self.w.store(solved, told)
 
     def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
-        """Project a state onto its constraints; store the change, relative to the step, as `told[1]`."""
+        """Project a state onto its constraints. Store the size of the change, relative to the step, as
+        `told[1]`.
+        """
         free = self.w.load(y, self.y)
         self.project(state, t, y)
         rows = jax.lax.stop_gradient((self.w.load(state, self.y), free, self.w.load(y, self.y)))
@@ -286,7 +288,9 @@ class Functions:
     # cotangents, of motions without tangents
 
     def _pull(self, f: Callable, y: Pointer, g: Pointer, rows: int, to_y: Pointer, to_known: Pointer) -> None:
-        """Store the cotangent of the state under `f`, and add those of the requested arrays to `to_known`."""
+        """Store the cotangent of the state, pulled back through `f`, and add those of the requested arrays to
+        `to_known`.
+        """
 
         def of(y, asked):
             return f(

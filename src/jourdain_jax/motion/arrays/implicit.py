@@ -18,7 +18,7 @@ from jourdain_jax.motion.trajectories import results
 
 
 def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
-    """Try a step; put slopes at its start, middle and end into `k` where events or pivots need them."""
+    """Try a step; store rates at its start, middle and end in `k` where events or pivots need them."""
     reach, y = p["h"], p.pointer
     if method.even:
         reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
@@ -53,7 +53,9 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
-    """Return the smallest pivot at the ends and the middle of a step, and whether one changed sign or a row turned."""
+    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed sign or a
+    row turned.
+    """
     at, pivots, halves, every = (
         w.room(form.integrated),
         w.room(max(len(form.monitored), 1)),

@@ -85,7 +85,7 @@ class Loop(NamedTuple):
         return state
 
     def tried(self, going: Going, fixed: dict, start: Start) -> tuple[Going, Array]:
-        """Try a step in all lanes that are on their way; return also the slopes of its stages."""
+        """Try a step in all lanes that are still under way. Return also the rates at its stages."""
         w = self.writer(start)
         state, k = self.rows_in(w, going, fixed), w.room(self.form.integrated * self.method.needed)
         step(
@@ -106,7 +106,9 @@ class Loop(NamedTuple):
         return self.form.rows[name].start
 
     def saving(self, start: Start, going: Going, ys: Array | None) -> tuple[Going, Array | None]:
-        """Pass the times reached, save the states there (with `ys`), and set the next time to go to."""
+        """Pass the times that were reached, save the states there (with `ys`), and set the next time to
+        reach.
+        """
         code_, t_, goal_ = map(self._row, ("code", "t", "goal"))
         times, y = len(start.goals), going.y
 

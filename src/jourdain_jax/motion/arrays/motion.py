@@ -35,7 +35,7 @@ def loop_of(
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion.
 
-    `of_events`: what the form says of events.
+    `of_events`: the events of the form.
     """
     goals, knots, field, y0 = setup.goals(setup.ts), setup.knots, setup.field, begun.y0
     args, most, eps = (
@@ -72,7 +72,7 @@ def loop_of(
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """Return the motion as a function of its start; `at_once`: lanes of a block (0: all lanes of `vmap`)."""
+    """Return the motion as a function of its start; `at_once`: lanes in a block (0: all lanes of `vmap`)."""
     return differentiated(
         lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
     )
@@ -110,7 +110,9 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """Run blocks of lanes one after another; their axis is first outside, last inside (known arrays: first)."""
+    """Run blocks of lanes one after another. Outside, the axis of lanes is the first; inside it is the last,
+    except for known arrays.
+    """
     given = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched)
     )
@@ -131,7 +133,9 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function (state, time t, time d) -> state, moved along its rates by d, which is zero."""
+    """Return a function (state, time t, shift d) -> state. The value of d is zero; a tangent of d moves the
+    state along its rates.
+    """
     known, others = eqx.partition(args, eqx.is_inexact_array)
 
     def moved_by(y, t, d):

@@ -29,7 +29,7 @@ class Rows(NamedTuple):
 
 @dataclass(eq=False)
 class Room:
-    """Hold rows: each an array of its own, or (an array of several rows, the index in it)."""
+    """Holds rows, each as its own array or as (an array of several rows, the index in it)."""
 
     rows: list
     number: int  # of the rooms that a writer has made
@@ -43,7 +43,7 @@ class Pointer(NamedTuple):
 
 
 class ArrayWriter:
-    """Run the source of a step on arrays of JAX. `functions`: the object whose methods `run` calls."""
+    """Runs the source of a step on arrays of JAX. `functions`: the object whose methods `run` calls."""
 
     real, truth = "real", "truth"
     where, magnitude, larger, smaller, root = map(
@@ -120,7 +120,7 @@ class ArrayWriter:
         return row[0][row[1]] if isinstance(row, tuple) else row
 
     def _of(self, rows: list) -> Array:
-        """Return rows as one array, made of as long parts of other arrays as there are."""
+        """Return rows as one array, made of the longest available parts of other arrays."""
         parts: list[tuple[Array, int, int]] = []
         for row in rows:
             array, i = row if isinstance(row, tuple) else (row[None], 0)
@@ -138,7 +138,9 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return which existing rooms the body stores to, and the shapes of its results; restore the rooms."""
+        """Return the rooms into which the body stores, and the shapes of its results, found by a trace that
+        leaves the rooms unchanged.
+        """
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)
         stored, self._stored = self._stored, outer
@@ -202,7 +204,9 @@ class ArrayWriter:
         return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
 
     def put_at(self, place: Pointer, rows: int, index: Array, value: Array, where: Array) -> None:
-        """Put a value into the row of each lane's own index, in lanes `where` this holds; nowhere beyond the last row."""
+        """Put a value into the row with each lane's own index, in lanes for which `where` is true. Indices
+        beyond the last row are skipped.
+        """
         every = Rows(0, rows)
         here = jnp.reshape(jnp.arange(rows), (-1, *[1] * len(self.lanes))) == index
         self.store(jnp.where(here & where, value, self.load(place, every)), place, every)

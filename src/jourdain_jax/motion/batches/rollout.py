@@ -76,18 +76,21 @@ class Rollout(Printed, eqx.Module):
 
     @property
     def continued(self) -> np.ndarray:
-        """Numbers of the samples that lost their privileged speeds and were repeated with the full state."""
+        """Return the indices of samples that lost their privileged speeds and were repeated with the full
+        state.
+        """
         return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
         """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
         `levels` (0 to 1), shape (levels, times).
 
-        Lanes that ended are omitted from then on; NaN where none is left. ValueError where lanes were saved
-        at times of their own.
+        Lanes that have ended are omitted from then on; NaN where none remain. Raises ValueError where lanes
+        were saved at different times.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
-            raise ValueError("lanes were saved at different times, so there are no common quantiles; give all of them one start time, or one `ts`")
+            raise ValueError("lanes were saved at different times, so there are no common quantiles; give "
+                "all of them one start time, or one `ts`")
         values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
@@ -122,13 +125,15 @@ class Rollout(Printed, eqx.Module):
             named = ""
             if code == results.EVENT:
                 events = np.asarray(self.lanes.event)[lanes]
-                named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
+                named = " " + ", ".join(f"`{self.lanes.event_names[i]}` "
+                    f"{int(np.sum(events == i))}" for i in np.unique(events))
             elif code != results.SUCCESS:
                 faults = dict.fromkeys(name for i in lanes[:10] for name in self.lane(int(i)).faults)
                 named = f" ({', '.join(faults)})" * bool(faults) + ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
-            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
+            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run "
+                "with the full state")
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
@@ -151,15 +156,18 @@ def rollout(
 ) -> Rollout:
     """Simulate a batch of motions; the samples of the batch are called lanes.
 
-    - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
-    - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
-    - `chunk`: lanes that run together (default: on a CPU 512, otherwise all), fewer where they would pass the `memory` that `jj.build` was given (4 GiB);
-      `progress`: a bar (default: with several chunks).
-    - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All lanes have the same inputs; where they are to
-      differ, use `jax.vmap` of `simulate`.
+    - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a
+      `State` with a leading axis of lanes.
+    - `parameters`: parameter name -> array with a leading axis of lanes, for parameters that differ between
+      lanes.
+    - `chunk`: number of lanes that run together (default: on a CPU 512, otherwise all), fewer if they would
+      exceed the `memory` given to `jj.build` (4 GiB); `progress`: a bar (default: with several chunks).
+    - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All
+      lanes have the same inputs; for different ones use `jax.vmap` of `simulate`.
 
-    Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. Derivatives of
-    what lies after a failure are NaN; `jnp.where(rollout.lanes.succeeded, ..., 0.0)` leaves such lanes out of a loss, and of its derivatives.
+    Raises ValueError for unknown names and unequal lengths. Failing lanes do not raise: see `Rollout.failed`
+    and `print(rollout)`. Derivatives of results after a failure are NaN; `jnp.where(rollout.lanes.succeeded,
+    ..., 0.0)` excludes such lanes from a loss and from its derivatives.
 
     **Examples**
 
@@ -176,7 +184,8 @@ def rollout(
     starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
-            raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')
+            raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": '
+                'jnp.linspace(0.0, 1.0, 8)}')
     advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
     parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
@@ -220,9 +229,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
-    """Checks times, and inputs for jumps between them, where all lanes have one span and it is known.
+    """Check times, and inputs for jumps between them, if all lanes have one known span.
 
-    Inside the lanes it is traced: a lane whose own time does not fit gets a result code.
+    Other spans are traced; there, a lane with an invalid time gets a result code.
     """
     ts, t0, t1 = (span[name] for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):
@@ -247,7 +256,9 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 
 def _with_arrays(options: AllOptions) -> AllOptions:
-    """Return options with their numbers as arrays, so that another tolerance or first step compiles nothing."""
+    """Return options with their numbers as arrays, so that another tolerance or first step needs no
+    compilation.
+    """
     real, (solver, order) = real_type(), solver_of(options)
     numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
@@ -275,12 +286,14 @@ def _lanes(scene: Scene, starts, parameters: dict):
 def _common_length(lengths: dict) -> int:
     for what, length in lengths.items():
         if length is None:
-            raise ValueError(f"{what} has no axis of lanes; give an array with one entry per lane, or set it on the scene itself")
+            raise ValueError(f"{what} has no axis of lanes; give an array with one entry per lane, or set it "
+                "on the scene itself")
     counts = set(lengths.values())
     if len(counts) > 1:
         raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) + "; give arrays of one length")
     if not counts or counts == {0}:
-        raise ValueError("no lanes: give at least one start value or parameter as an array with one entry per lane, or use `simulate` for one motion")
+        raise ValueError("no lanes: give at least one start value or parameter as an array with one entry "
+            "per lane, or use `simulate` for one motion")
     return counts.pop()
 
 

@@ -30,29 +30,30 @@ from jourdain_jax.scene.scene import Scene
 class DiscreteGradient(FixedStepMethod):
     """The energy-preserving discrete-gradient method in reduced form, `simulate(..., solver=DiscreteGradient(step=h))`; h in s.
 
-    With z = (q, y), y the privileged speeds, and the rates written as `zdot = S(z) grad H(z)`, S skew and H = T + V: `z_1 - z_0 = h S(z_m) gbar`,
-    z_m = (z_0 + z_1)/2, gbar Gonzalez's discrete gradient of H. Order 2, symmetric in time; T + V is kept to round-off, velocity rows hold exactly.
-    A discrete gradient rather than a projection onto the energy after each step: it is symmetric, and moves no other integral by a correction.
+    With z = (q, y), y the privileged speeds, and the rates written as `zdot = S(z) grad H(z)`, S skew and H =
+    T + V: `z_1 - z_0 = h S(z_m) gbar`, z_m = (z_0 + z_1)/2, gbar Gonzalez's discrete gradient of H. Order 2,
+    symmetric in time; T + V is kept to round-off, and velocity rows hold exactly. Unlike a projection onto
+    the energy after each step, it is symmetric and corrects no other integral.
 
     Needs a minimal state and a constant T + V: rows linear and homogeneous in the speeds, loads with potentials, nothing that depends on time, and
     no geometric rows.
 
-    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also
-    where the other methods drift
-    for lack of symmetry. Other integrals are kept to the order of the method only, and it is the most
-    expensive of these methods per step.
+    Use it for long motions of conservative scenes in which a drift of the energy would change the answer.
+    Other integrals are kept to the order of the method only, and a step costs more than with the other
+    methods.
 
     Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
     J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
     """
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the minimal `field` of the state. ValueError where the energy of the `scene` is not
-        constant, or there is no minimal state; `asked`: the state that was requested.
+        """Return the minimal `field` of the state. Raises ValueError where the energy of the `scene` is not
+        constant, or there is no minimal state; `asked`: the requested state.
         """
         fault = _fault(scene, field, asked)
         if fault:
-            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint(step=...)")
+            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use "
+                "solver=jj.ImplicitMidpoint(step=...)")
         return field
 
     def solve(self, args: tuple, t, y: Integrated, h) -> Solution:

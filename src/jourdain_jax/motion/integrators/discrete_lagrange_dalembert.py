@@ -41,7 +41,7 @@ RULES = ("midpoint", "trapezoidal")
 
 
 def lagrangian(scene: Scene, t, q, u, inputs) -> Scalar:
-    """`L = T - V - dS/dt` in J, for speeds that are the coordinate rates; S is the scene's gauge."""
+    """Return `L = T - V - dS/dt` in J, for speeds that are the coordinate rates; S is the scene's gauge."""
     T, V = energies_at(scene, motion_at(scene, t, q, u, inputs))
     if gauge_of(scene, pose_at(scene, t, q)) is None:
         return T - V
@@ -94,8 +94,8 @@ def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
 
 
 def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int) -> Float[Array, "rows"]:
-    """Return all rows over the interval; the first `geometric` ones as `g(t_1, q_1)/h`, which so hold at
-    every node.
+    """Return all rows over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so that they are
+    satisfied at every node.
     """
     rows = over.mean(lambda t, q, v: velocity_residual(scene, t, q, v, inputs(t)), q0, q1)
     return rows if geometric == 0 else rows.at[:geometric].set(position_residual(scene, over.t1, q1) / over.h)
@@ -107,7 +107,7 @@ def _has_forces(scene: Scene, t, q) -> bool:
 
 
 def _force(scene: Scene, t, q, u, inputs) -> Speeds:
-    """`Q = sum beta' F + gamma' L + Q_direct` of the loads without a potential."""
+    """Return `Q = sum beta' F + gamma' L + Q_direct` of the loads without a potential."""
     motion, partial = motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u)
     loads = resultants(scene, motion, conservative=False)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
@@ -126,8 +126,9 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
     Order 2, symmetric in time, variational where there are no velocity rows (then symplectic, with the momenta of symmetries kept). Needs speeds
     that are the coordinate rates and rows linear or affine in them.
 
-    Worth it for long motions of reversible scenes in the coordinates that L likes: energy errors stay bounded there. Not as a rule: a gauge term
-    that changes no equation of motion, or a scene that is not reversible, makes the energy drift. The implicit midpoint rule knows no gauge.
+    Use it for long motions of reversible scenes whose coordinates suit L: energy errors stay bounded there.
+    In general they do not: a gauge term that changes no equation of motion, or a scene that is not
+    reversible, makes the energy drift. The implicit midpoint rule does not depend on the gauge.
 
     Source: J. Cortes and S. Martinez, Nonholonomic integrators, Nonlinearity 14 (2001) 1365; R. McLachlan and M. Perlmutter, J. Nonlinear Sci. 16 (2006)
     283; J. E. Marsden and M. West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001) 357, sections 2.1 and 3.2 (forces).
@@ -137,18 +138,22 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
 
     def __check_init__(self):
         if self.rule not in RULES:
-            raise ValueError(f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; {nearest(str(self.rule), RULES)}")
+            raise ValueError(f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; "
+                f"{nearest(str(self.rule), RULES)}")
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the full `field` of the state, which the method itself keeps on the rows. ValueError where
-        it does not apply to the `scene`, and where another state was `asked` for.
+        """Return the full `field` of the state, without projection since the method satisfies the rows
+        itself. Raises ValueError if it does not apply to the `scene`, or if another state was requested
+        (`asked`).
         """
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)
         if fault:
-            raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use solver=jj.ImplicitMidpoint(step=...)")
+            raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use "
+                "solver=jj.ImplicitMidpoint(step=...)")
         if asked == "minimal":
-            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of its `Formulation` at 'auto'")
+            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of its "
+                "`Formulation` at 'auto'")
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
@@ -177,7 +182,7 @@ def _solved(args, over: Interval, y: Integrated) -> Solution:
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
 def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
-    """`p^+ - p_0 - A_0' lambda` and the discrete rows, of x = (q_1 - q_0, lambda)."""
+    """Return `p^+ - p_0 - A_0' lambda` and the discrete rows, for x = (q_1 - q_0, lambda)."""
     _, scene, inputs, *_ = args
     n = q0.shape[0]
     q1, impulse = q0 + x[:n], x[n:]
@@ -187,9 +192,7 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 
 def _projected(args, over: Interval, q0, q1) -> Speeds:
-    """Return speeds on the rows with the momentum at the end of the interval, but for a constraint impulse:
-    linear in both.
-    """
+    """Return speeds on the rows with the momentum at the end of the interval, up to a constraint impulse."""
     _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)
     _, p1 = discrete_momenta(scene, over, q0, q1, inputs)

@@ -71,12 +71,14 @@ def _each(w, condition, a: Values, b: Values) -> tuple:
 
 
 def reach_of_noise(w, span):
-    """Return the time in which a value rises by no more than it may be below zero at a start."""
+    """Return the time in which a value rises by at most the amount by which round-off may make it negative at
+    a start."""
     return w.eps**LEAVES * w.magnitude(span)
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> tuple[list, list]:
-    """Return which events have happened at a state, of a start; and which values, though they rise from zero there, are not positive after a step."""
+    """Return the events that have happened at a start, and the values that rise from zero there but are not
+    positive after one step."""
     sunk, sinks = [], []
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate = slope * direction
@@ -87,7 +89,7 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> t
 
 
 def first_event(w, before: Values, after: Values):
-    """Return the index of the event that is the first to happen, by its secant."""
+    """Return the index of the first event to happen, by its secant."""
     best, first = None, 0.0
     for i, (b, a) in enumerate(zip(before, after, strict=True)):
         share = b / (b - a)
@@ -99,15 +101,13 @@ def first_event(w, before: Values, after: Values):
 
 
 def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of the cubic a + m s + A s^2 + B s^3 through values and slopes at the ends of a step h, where s runs from 0 to 1."""
+    """Return m, A, B of a + m s + A s^2 + B s^3 (0 <= s <= 1) by values and rates at the ends of a step h."""
     m_0, m_1, rise = h * slope_a, h * slope_b, b - a
     return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
 
 
 def falls_through(w, h, a, slope_a, b, slope_b):
-    """Return the fraction of a step at which the cubic falls to zero; where Newton's method fails, that of
-    the straight line.
-    """
+    """Return the fraction of a step at which the cubic falls to zero, or else the straight line."""
     m, A, B = cubic(h, a, slope_a, b, slope_b)
     s = line = a / (a - b)
     for _ in range(4):
@@ -117,10 +117,11 @@ def falls_through(w, h, a, slope_a, b, slope_b):
 
 
 def trial(w, t, c, step, last, guess) -> tuple:
-    """Return the next time to try in a step of length `step`, and whether the last one is near enough, of the times and values of a bracket.
+    """Return the next time to try in a step of length `step`, and whether the last one is near enough, from
+    the times and values of a bracket.
 
-    The first one is after the part `guess` of the backward pass. With `last` the search ends, at a time where the value is a number.
-    """
+    The first trial divides the bracket by the fraction `guess`. With `last` the search ends, at a time where
+    the value is a number."""
     eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
@@ -145,8 +146,8 @@ def trial(w, t, c, step, last, guess) -> tuple:
 class Search(NamedTuple):
     """Bounds of the event's time.
 
-    A bracket: three times with the values of all events there, the last one tried, one on the other side of the event, and one that was either before.
-    """
+    A bracket consists of three times with the values of all events there: the last trial, a time on the other
+    side of the event, and an earlier bound."""
 
     t: Values
     c: Any
@@ -157,7 +158,7 @@ class Search(NamedTuple):
 
     @property
     def trying(self):
-        """Whether trials start at the last state before the event; then Newton's shifts do, each where the last one ended."""
+        """Whether trials start at the last state before the event and go on by Newton's method."""
         return self.left > DIFFERENTIABLE + 1.0
 
 
@@ -170,10 +171,10 @@ def search_of(form: Form, p: Lanes) -> Search:
 
 
 def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
-    """Advance the search by a step, its `start` and `end` (time, values of all events, rates), in lanes where it `changes`.
+    """Advance the search by a step with its `start` and `end` (time, values of all events, rates), in lanes
+    where it `changes`.
 
-    `begins`: it is the step of the event. Returns the index of the event that is followed.
-    """
+    `begins`: whether the event is in this step. Returns the index of the event that the search follows."""
     old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
     # narrowed: the time tried, one on the other side of the event, and one that was either before
     same = ~(no_event(c_1) ^ no_event(old.c[0]))
@@ -208,15 +209,15 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
 
 
 def is_flat(w, c_dot, slope):
-    """Return whether a value has no slope where it falls through zero, beside its mean `slope` over the step."""
+    """Return whether a value has no slope at its zero, relative to its mean `slope` over the step."""
     return w.magnitude(c_dot) <= FLAT * slope
 
 
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
-    """Return after which part of a step `h` the first dip is lowest, a value that falls below zero between the ends; 1 where none does.
+    """Return the fraction of a step `h` at which a value that falls below zero between the ends is lowest,
+    for the first such value; 1 if there is none.
 
-    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
-    """
+    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))"""
     share = None
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
         m_0, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -229,7 +230,8 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half of the part of a step `h` for which all values stay positive that rise from zero and `sink` in it, by their cubics; at most a half."""
+    """Return half the fraction of a step `h` during which the values that rise from zero stay positive, as
+    their cubics show. It is at most a half."""
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
         m, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -241,11 +243,11 @@ def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sink
 def monitored(
     w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
 ) -> dict[str, Number]:
-    """Return the outcome of a step `h` in which an event may have happened or is being located, or before
-    which one has; changes the state `y1` after it.
+    """Return the result of a step `h` that may contain an event, or in which an event is being located. The
+    state `y1` after the step changes accordingly.
 
-    `k`: slopes at its ends; `new`: time, step size, code and counts after it; `accept`: it is a step of the motion.
-    """
+    `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`: whether it is a step
+    of the motion."""
     count, y, t = form.events, p.pointer, p["t"]
 
     def events(t: Number, y: Number, slope: Number) -> list[list[Number]]:
@@ -263,9 +265,8 @@ def monitored(
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of events that have not been left: one that rises above zero within a step and
-        falls again happens again.
-        """
+        """Reverse the sign of events that were not left, so that a value that rises above zero and falls
+        again within a step counts as a new event."""
         if not form.goes_on:
             return found
         off = p.every("disarmed")
@@ -361,12 +362,11 @@ def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
 def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
     """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates.
 
-    Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
+    Each tangent of time in turn moves the state, in the directions e of which it is composed,
 
         dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
 
-    where values, tangents and rates are those before; dt is NaN where c has no slope there.
-    """
+    where values, tangents and rates are those before the event; dt is NaN where c has no slope there."""
     count, times = form.events, form.rows["dt"]
 
     def put() -> None:
@@ -391,7 +391,7 @@ def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, 
 
 
 def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
-    """Add the rates from row `rates` of `k`, times `dt`, to the rows from `rows` of `y`."""
+    """Add `dt` times the rates from row `rates` of `k` on to the rows of `y` from `rows` on."""
 
     def moved(i: int | Number) -> Number:
         before = w.load(y, i + rows)

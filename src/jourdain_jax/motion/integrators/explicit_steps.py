@@ -33,7 +33,7 @@ SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A tableau. Its stages run as a loop: one copy of the vector field to compile."""
+    """A Runge-Kutta tableau. Its stages run as a loop, so that the vector field is compiled only once."""
 
     name: str
     order: int
@@ -51,12 +51,12 @@ class Method:
 
     @property
     def at_the_end(self) -> int:
-        """Return the last stage of a step at its end (or of all stages, if none is at the end)."""
+        """Return the last stage at the end of a step, or the last of all stages if none is at the end."""
         return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
-    """Return a method from its nodes and the rows of A, both without the first stage, and the weights of its
+    """Return a method from its nodes and the rows of A (both without the first stage), and the weights of its
     embedded method.
     """
     stages = len(c) + 1
@@ -131,7 +131,7 @@ _ALL = {method.name: method for method in (TSIT5, DOPRI5, DOPRI8)}
 
 
 def method_of(solver) -> Method | None:
-    """Return the method of a solver of diffrax; None where our own loop has no such one."""
+    """Return the method of a solver of diffrax; None if our own loop has no such method."""
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
 
@@ -146,7 +146,9 @@ class Aim(NamedTuple):
 
 
 def aimed(w, p, target, reach, shift=None) -> Aim:
-    """Return the step to the `target`, half of the way there, or as far as `reach`; `shift`: of a search for an event, where there may be one."""
+    """Return the length of a step to the `target`, to half of the way, or to `reach`, whichever applies;
+    `shift`: from a search for an event, if there is one.
+    """
     locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
     lands = ~locating & (reach >= 0.999 * rest)
     size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
@@ -176,9 +178,7 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
 
 
 def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """Return the code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step
-    that would be next.
-    """
+    """Return the result code of a motion whose `span` has ended; `h`: the length of the next step."""
     # the last steps against the average one
     # 0.01 of the average step: a singularity is near
     shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
@@ -189,17 +189,20 @@ LEAST_ORDER, MOST_ORDER = 4, 30
 
 
 class Taylor(eqx.Module):
-    """Taylor series of the motion, `simulate(..., solver=jj.Taylor())`: for small scenes and tight tolerances, and where many times are saved.
+    """Taylor series of the motion, `simulate(..., solver=jj.Taylor())`: for small scenes, tight tolerances,
+    and many saved times.
 
-    y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, by machine code of the CPU. The order is p = ceil(1 - log(rtol)/2) unless it is given,
-    and a step is as long as its last two terms stay within the tolerance (Jorba and Zou). States at times to save come from the series: steps do not end
-    there. Against Dopri8 at equal error, a Chaplygin sleigh takes half of the time alone at 1e-12, a scene of some hundred operations more time than it.
+    y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, by machine code of the CPU. By default
+    the order is p = ceil(1 - log(rtol)/2), and a step is as long as its last two terms stay within the
+    tolerance (Jorba and Zou). Saved states come from the series: steps do not end there. Against Dopri8 at
+    equal error, a Chaplygin sleigh takes half of the time alone at 1e-12, a scene of some hundred operations
+    more time than it.
 
-    **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`.
-    **Raises** from `simulate`: ValueError without machine code, for sampled inputs, and for equations that
-    branch or are too long.
-    Derivatives: forward mode by series too, and by Dopri8 where those of second derivatives were too long; reverse mode goes over the motion once more by it.
-    Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99.
+    **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`. **Raises** from `simulate`:
+    ValueError without machine code, for sampled inputs, and for equations that branch or are too long.
+    Derivatives: forward mode by series too, or by Dopri8 if the series of second derivatives are too long;
+    reverse mode runs the motion once more by Dopri8. Source: A. Jorba and M. Zou, Experimental Mathematics 14
+    (2005) 99.
     """
 
     order: int | None = eqx.field(static=True, default=None)
@@ -210,7 +213,7 @@ class Taylor(eqx.Module):
 
 
 def order_for(rtol: Number) -> int:
-    """p = ceil(1 - log(rtol)/2), at which the arithmetic for a length of time is least."""
+    """Return p = ceil(1 - log(rtol)/2), at which the cost per length of time is least."""
     # the tolerance that the order is for where it is traced
     tolerance = 1e-12 if is_traced(rtol) else float(rtol)
     return min(max(math.ceil(1 - math.log(tolerance) / 2), LEAST_ORDER), MOST_ORDER)

@@ -12,13 +12,16 @@ from jourdain_jax.motion.integrators.integrands import rates
 class ImplicitMidpoint(FixedStepMethod):
     """The implicit midpoint rule, `y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)`, for `simulate(..., solver=ImplicitMidpoint(step=h))`; h in s.
 
-    Order 2, symmetric in time, stable for any step where the motion is. Keeps every integral that is quadratic in the integrated state (with
-    the minimal state: in the coordinates and privileged speeds) to round-off; of unconstrained holonomic scenes in canonical coordinates it is
-    symplectic. Velocity rows hold exactly with the minimal state; with the full one they are projected after each step, which breaks the symmetry.
+    Order 2, symmetric in time, stable for any step where the motion is. It keeps every integral that is
+    quadratic in the integrated state (with the minimal state: in the coordinates and privileged speeds) to
+    round-off, and is symplectic for unconstrained holonomic scenes in canonical coordinates. Velocity rows
+    hold exactly with the minimal state; with the full one they are projected after each step, which breaks
+    the symmetry.
 
-    Worth it for long motions of reversible scenes, where its energy error stays bounded, for stiff ones, and where a quadratic integral matters;
-    otherwise the default solvers reach the same accuracy much faster. The equations of a step are solved by Newton's method to round-off, and
-    differentiated through the implicit function theorem. Between saved times it takes equal steps of at most `step` (s).
+    Use it for long motions of reversible scenes, where its energy error stays bounded, for stiff scenes, and
+    where a quadratic integral matters; otherwise the default solvers reach the same accuracy much faster. The
+    equations of a step are solved by Newton's method to round-off, and differentiated through the implicit
+    function theorem. Between saved times it takes equal steps of at most `step` (s).
 
     Source: Hairer, Lubich and Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
     """

@@ -45,9 +45,10 @@ class ImplicitMethod(eqx.Module):
         """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards); `args`: as in `integrands.py`."""
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """The form of the state that is integrated in place of `field`.
+        """Return the form of the state that is integrated in place of `field`.
 
-        ValueError where the method does not apply to the `scene`, or to the state that its `Formulation` `asked` for.
+        Raises ValueError where the method does not apply to the `scene`, or to the state that its
+        `Formulation` requests (`asked`).
         """
         return field
 
@@ -60,21 +61,23 @@ class FixedStepMethod(ImplicitMethod):
     even: ClassVar[bool] = True
 
     def __check_init__(self):
-        step = checked_unless_traced(self.step, f"`step` of `{self.name}`", (), advice="give the length of steps in s")
+        step = checked_unless_traced(self.step, f"`step` of `{self.name}`", (), advice="give the length of "
+            "steps in s")
         if isinstance(step, np.ndarray) and not 0 < float(step) < np.inf:
-            raise ValueError(f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length of steps in s")
+            raise ValueError(f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length "
+                "of steps in s")
 
 
 def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
-    """Return the size of each unknown, against which round-off counts: that of the state x and of its change;
-    1 where both are zero.
+    """Return the size of each unknown, relative to which round-off is judged: that of the state x and of its
+    change; 1 where both are zero.
     """
     size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(change))
     return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))
 
 
 def even_step(longest: Scalar, rest: Scalar) -> Scalar:
-    """Return the first of the fewest equal steps no longer than `longest` that cover a `rest`; a ratio 1e-9
-    above a whole number counts as that number.
+    """Return the length of the fewest equal steps, none longer than `longest`, that cover a `rest`. A ratio
+    1e-9 above a whole number counts as that number.
     """
     return rest / jnp.maximum(jnp.ceil(rest / longest - 1e-9), 1)

@@ -16,10 +16,11 @@ from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorF
 
 
 def state_norm(y: Integrated) -> PerLane:
-    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
+    """Return the root mean square over coordinates and speeds. Integrated work does not influence the step
+    size.
 
-    NaN counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last
-    allowed step.
+    NaN counts as infinite: the step then shrinks until the motion ends. A NaN itself would be tried until the
+    last allowed step.
     """
     squared = sum(jnp.sum(part**2, axis=0) for part in (y.q, y.v)) / (len(y.q) + len(y.v))
     squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)

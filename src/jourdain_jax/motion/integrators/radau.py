@@ -31,10 +31,11 @@ class RadauIIA(ImplicitMethod):
     """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff springs, dampers and drives.
 
     L-stable: fast decaying modes do not bound the steps. The equations of a step are solved by Newton's
-    method to round-off, and
-    differentiated through the implicit function theorem; a step whose equations are not solved is tried again at a fifth of its length. A step costs some
-    fifty evaluations and a linear system three times the size of the state: worth it where an explicit method would need many more steps for
-    stability than for accuracy. `simulate` turns to it by itself where its default solver runs out of steps on a stiff motion.
+    method to round-off, and differentiated through the implicit function theorem; a step whose equations are
+    not solved is tried again at a fifth of its length. A step costs some fifty evaluations and a linear
+    system three times the size of the state. This pays where an explicit method would need many more steps
+    for stability than for accuracy. With `retry=True`, `simulate` changes to it where its default solver runs
+    out of steps on a stiff motion.
 
     Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
     """

@@ -5,9 +5,9 @@ from jourdain_jax.motion.native.transitions import slowest
 
 
 def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
-    """Set the sides of relations at the start of a motion, in lanes that have tried no step.
+    """Set the sides of relations at the start of a motion, in lanes that have not yet tried a step.
 
-    A number that vanishes gets the sign that it has after d = eps^(1/4) span, by the midpoint rule.
+    A number that vanishes gets the sign that it has after the time d = eps^(1/4) span, by the midpoint rule.
     """
     if not form.sides:
         return
@@ -40,8 +40,8 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
 
 def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> list[list[Number]]:
-    """Return values and rates of events; for a relation at rest, the distance left until its number leaves
-    zero.
+    """Return values and rates of events. For a relation at rest, the value is the distance at which its
+    number leaves zero.
     """
     c, rate = (list(part) for part in found)
     for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
@@ -53,9 +53,10 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
 
 
 def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
-    """Return which values sink after an event, and the values, except those that still rise from zero.
+    """Return which values fall after an event, and the values; those that still rise from zero are not
+    falling.
 
-    A time to save may follow an event within round-off.
+    The next saved time may be within round-off of the event.
     """
     rising = [~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
     c_1 = [w.where(rises & ~(b > 0.0), 1.0, b) for b, rises in zip(c_1, rising, strict=True)]

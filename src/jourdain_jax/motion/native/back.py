@@ -85,14 +85,16 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
-    """`begin(job, state, who, lane)`: the start of the lane of the batch that has this place."""
+    """Write `begin(job, state, who, lane)`: begin, in a lane, the sample with this index in the batch."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = w.load(who, lane, "i64")
         begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
 
 
 def _write_note(w: MachineWriter, form: Form) -> None:
-    """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
+    """Write `note(job, state, who, saved)`: count the times that were reached, set the next one, and end
+    lanes that have reached all.
+    """
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form, state)
         with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
@@ -115,7 +117,9 @@ def _write_note(w: MachineWriter, form: Form) -> None:
 
 
 def _write_added(w: MachineWriter, form: Form) -> None:
-    """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
+    """Write `added(job, who, first, end, g)`: add the cotangents of the states saved at the times with
+    indices `first` to `end - 1`.
+    """
     count = form.integrated
     with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
         firsts, ends = w.room(), w.room()
@@ -135,8 +139,8 @@ def _write_added(w: MachineWriter, form: Form) -> None:
 
 
 def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that continued
-    in it.
+    """Write `step_back(state, here, g, by_known)`: go back over the step in the slot `here`, in lanes that
+    continued in it.
     """
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         step_back(w, form, method, asked, state, here, g, by_known)
@@ -217,8 +221,8 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
 
 
 def _write_project_back(w: MachineWriter, form: Form) -> None:
-    """Write `project_back(state, t, free, g, added)`, which turns cotangents of a projected state into those
-    of the state `free` before it.
+    """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into those of the
+    state `free` before it.
     """
     moves, count = form.moves, form.integrated
     with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
@@ -233,7 +237,9 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 
 
 def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """`event_back(job, state, who, g, by_known)`: as the function of this name, with cotangents of the time of the end from the job."""
+    """Write `event_back(job, state, who, g, by_known)`: the function of this name, with cotangents of the
+    end's time from the job.
+    """
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         located = is_located(w, Lanes(w, form, state))
         with w.when(w.any(located)):
@@ -246,7 +252,9 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
 
 
 def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """`reset_back(job, state, who, left, g, by_known)`: as the function of this name, with cotangents of the transition's time from the job."""
+    """Write `reset_back(job, state, who, left, g, by_known)`: the function of this name, with cotangents of
+    the transition's time from the job.
+    """
     with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
         w.store(w.where(is_noted(w, form, w.load(left)), w.load(left), 0.0), numbers)
@@ -309,8 +317,8 @@ def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Nu
 
 
 def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
-    """Return the derivative with respect to time of an event's part of a tangent; changes the cotangents `g`
-    of the state, the first of these, and adds to the others.
+    """Return the derivative with respect to time of an event's contribution to a tangent. It changes the
+    cotangents `g` of the state and adds to the others.
     """
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated
@@ -327,7 +335,8 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
     """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
     (with its time last), and the goals.
 
-    It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
+    It returns cotangents of the state at the start, and of the requested numbers among those that the rates
+    receive (`asked`). A state is followed by its tangent.
     """
     count = form.integrated + len(asked)
     run_rows = called(
@@ -340,8 +349,8 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
 
 
 def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable[..., Float[Array, "found"]]:
-    """Return cotangents of the start's state, and of the known numbers `asked` for, as a function of the
-    start, and of cotangents of the states at the goals, and of the end and its time.
+    """Return cotangents of the start's state and of the requested known numbers (`asked`), as a function of
+    the start and of cotangents of the states at the goals and of the end and its time.
     """
     n = form.y
 

@@ -71,7 +71,9 @@ def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], 
 
 
 def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Return values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
+    """Return values of all nodes of outputs that are given from outside; `known`: as returned by
+    `known_values`.
+    """
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
@@ -132,8 +134,8 @@ def write_projection(w: MachineWriter, form: Form) -> None:
 
 
 def _write_along(w: MachineWriter, form: Form) -> None:
-    """Write `along(state, tau, y)`: the error after a state `y` on the constraints is replaced by its part
-    along them, which a projection leaves.
+    """Write `along(state, tau, y)`: for a state `y` on the constraints, keep only the part of its error along
+    them, since a projection removes the rest.
     """
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
@@ -146,7 +148,8 @@ def _write_along(w: MachineWriter, form: Form) -> None:
 
 @lru_cache(maxsize=64)
 def event_program(form: Form) -> Outputs:
-    """Stop events with their rates, whose states are the rates of the state; `Unsupported` where an operation has no derivative on the graph.
+    """Return stop events with their rates, for states whose rates are known. Raises `Unsupported` where an
+    operation has no derivative on the graph.
 
     dc/dt = sum dc/dx_i dx_i/dt
     """
@@ -158,7 +161,9 @@ def event_program(form: Form) -> Outputs:
 
 
 def write_events(w: MachineWriter, form: Form) -> None:
-    """`events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and their rates where `y` changes at the rate `slope`."""
+    """Write `events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and
+    their rates where `y` changes at the rate `slope`.
+    """
     program, own, count = form.program, event_program(form), form.events
     with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
         known = dict(zip(own.variables, known_values(w, form, state, tau, y).values(), strict=True))
@@ -179,7 +184,7 @@ LARGEST_DERIVATIVE = 10_000, 40_000
 
 
 class Pulled(NamedTuple):
-    """Cotangents of the state and of the requested numbers, on a graph of their own."""
+    """Cotangents of the state and of the requested numbers, on a separate graph."""
 
     own: Outputs
     found: NodeList
@@ -192,14 +197,14 @@ class Pulled(NamedTuple):
 
 
 def check_derivatives(form: Form, order: int) -> None:
-    """Raise a DifferentiationModeError where machine code that integrates a form has no derivatives of an order."""
+    """Raise a DifferentiationModeError where machine code for a form has no derivatives of an order."""
     if reason := reason_against_derivatives(form, order):
         raise DifferentiationModeError(f'{reason}; use `jj.simulate(..., backend="xla")`')
 
 
 @lru_cache(maxsize=64)
 def reason_against_derivatives(form: Form, order: int) -> str:
-    """Return the reason why machine code cannot differentiate a form so many times; empty if it can."""
+    """Return the reason why machine code has no derivatives of this order for a form; empty if it has."""
     if order > len(LARGEST_DERIVATIVE):
         return "`simulate` was differentiated three times, and machine code has derivatives of the first two orders"
     for nodes in steps_of(form).values():
@@ -217,7 +222,7 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
     """Write `pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`;
     `asked`: the requested known numbers.
 
-    Of a state with a tangent also `pull_moved`; events are then those of the state alone.
+    For a state with a tangent, also write `pull_moved`; events are then those of the state alone.
     """
     for name, nodes in steps_of(form).items():
         _write_one_pulled(w, form, f"pull_{name}", pulled_program(form, nodes, asked, 0 if name == "events" else len(nodes)), work_stays=name in ("q", "u"))
@@ -254,11 +259,13 @@ def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> NodeList:
 
 
 def _moved(form: Form, asked: Sequence[int]) -> Pulled:
-    """Through what a stop event adds to the tangent of a state at a number for a time, and through the tangent of its time,
+    """Differentiate through the contribution of a stop event to the tangent of a state at a given time, and
+    through the tangent of its time,
 
         dt = -dc/cdot,   dy <- dy + f dt,   dc = dc/dy dy + dc/dp dp,   cdot = dc/dt + dc/dy f
 
-    The row after the state is the one of dt; the last row is the derivative of the whole along time.
+    The row after the state is that of dt. The last row is the derivative of the whole contribution along
+    time.
     """
     nodes = form.rates
     own = outputs_of(form, [*nodes, *form.program.events], len(nodes) + form.events)

@@ -33,7 +33,7 @@ CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max
 
 @dataclass(frozen=True)
 class Form:
-    """The integrated form: a lowered scene, with or without work, projection, events and monitored pivots."""
+    """The integrated form: a lowered scene with its options: work, projection, events, monitored pivots."""
 
     program: Lowered
     with_work: bool
@@ -70,8 +70,7 @@ class Form:
     @property
     def monitored(self) -> list[int]:
         """Return the monitored quantities at all stages of a step: pivots first, then directions of rows,
-        then distances from a loss of rank.
-        """
+        then distances from a loss of rank."""
         return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
 
     @property
@@ -108,7 +107,7 @@ class Form:
         return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
-        """Return nodes of fixed values, of time, of the state without work, and of the inputs."""
+        """Return the nodes of fixed values, of time, of the state without work, and of the inputs."""
         t = len(self.program.fixed)
         end = t + 1 + self.q_and_v
         return variables[:t], variables[t], variables[t + 1 : end], variables[end:]
@@ -125,16 +124,14 @@ class Form:
 
     @property
     def transitions(self) -> int:
-        """The most transitions of a motion that are noted; none where all events that the scene states end
-        it.
-        """
+        """Return the largest number of transitions that a motion notes; zero if all of the scene's events end
+        it."""
         return self.most if self.goes_on and not all(self.stops[: self.stated]) else 0
 
     @property
     def rows_of_transition(self) -> dict[str, range]:
         """Return the results of a transition: the state after it, modes, the loss of energy, and its time
-        with its tangents.
-        """
+        with its tangents."""
         counts = {"y": self.integrated, "mode": len(self.switched), "lost": 1, "t": 1 + len(self.moving)}
         return _in_a_row(counts)
 
@@ -150,7 +147,7 @@ class Form:
 
     @property
     def y(self) -> int:
-        """Numbers of the integrated state: the work, if any, comes after the coordinates and the speeds."""
+        """Return the number of integrated values: coordinates, speeds, and then the work, if any."""
         return self.q_and_v + self.with_work
 
     @property
@@ -160,7 +157,9 @@ class Form:
 
     @property
     def ends(self) -> int:
-        """Numbers of the state at the end, of its time and of the times of transitions, and of their tangents."""
+        """Return the number of values stored for the final state, its time, the times of transitions, and
+        their tangents.
+        """
         return (self.y + 1 + self.transitions) * (1 + len(self.moving))
 
     @property
@@ -221,19 +220,21 @@ StepWriter = Any  # `MachineWriter`, or `ArrayWriter`, by which the source runs 
 class MachineWriter(Writer):
     """Writes the source of a step as machine code.
 
-    What the source asks beside arithmetic and memory, so that each is one operation to whoever writes it in another way than as instructions in a row:
+    The source needs, beside arithmetic and memory, the following operations. Each is a method, so that a
+    writer may use another form than instructions in a row:
 
         if_any(c, body)            what the body does counts where c holds in any lane; lanes are told apart by `where`
         over_stages(n, body, x)    x <- body(i, x)
         each(rows, body)           the body for every row, none of which needs what another one makes
 
-    `common`: which rows of a start are the same in all lanes of a GPU, and given once.
+    `common`: rows of a start that are equal in all lanes of a GPU, and are stored once.
     """
 
     common: Sequence[bool] = ()
 
     def constant(self, pointer: Value, index: int) -> Value:
-        """Return a number that is the same in all threads of a GPU, in memory that nothing changes meanwhile.
+        """Return a number that is equal in all threads of a GPU, from memory that does not change during the
+        kernel.
         """
         place = self.converted("addrspacecast", self.at(pointer, index), "ptr addrspace(1)").name
         text = f"load {self.real}, ptr addrspace(1) {place}, align 8, !invariant.load !{{}}"
@@ -270,7 +271,9 @@ class MachineWriter(Writer):
         return numbers
 
     def put_at(self, place: Value, rows: int, index: Value, value: Value, where: Value) -> None:
-        """Put a value into the row of each lane's own index, in lanes `where` this holds; nowhere beyond the last row."""
+        """Put a value into the row with each lane's own index, in lanes for which `where` is true. Indices
+        beyond the last row are skipped.
+        """
         values, indices = self.room(), self.room()
         self.store(value, values)
         self.store(self.where(where & (index < float(rows)), index, -1.0), indices)
@@ -358,7 +361,7 @@ def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number
 def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
     """Return the vectors of all rows of this name, which steps do not change.
 
-    On a GPU what all lanes share is read where it was given.
+    On a GPU, rows that all lanes share are read from the operand.
     """
     rows = lanes.rows[name]
     if not any(w.common[row] for row in rows if w.device):
@@ -371,7 +374,7 @@ def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
 
 
 def room_of_lanes(w: MachineWriter, form: Form) -> Value:
-    """Return memory for all rows; on a GPU, after them, for where that is what all lanes share."""
+    """Return memory for all rows. On a GPU, the location of the shared rows follows."""
     return w.room(form.all + w.device)
 
 

@@ -96,7 +96,9 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
 
 
 def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
-    """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
+    """Compute all lanes, by this thread and by others that it starts and joins; the last argument is an array
+    of lanes and times.
+    """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
     of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
     arrays = [x.data for x in (*arguments, *results)]
@@ -149,8 +151,8 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
 
 
 def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
-    """Assign the sample with this number to a place; if it does not exist, the place is idle, with samples of
-    the first one.
+    """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with the data
+    of the first sample.
     """
     if form.sampled:
         begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
@@ -171,9 +173,9 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
 
 
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
-    """Return the rows of the start of a lane, each run with its source.
+    """Return the rows of a lane's start, each contiguous range with its source.
 
-    On a GPU, numbers that all lanes share and no step changes are not copied.
+    On a GPU, numbers that all lanes share and that steps do not change are not copied.
     """
     count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
     found, shared = [], w.common if w.device else [False] * form.given
@@ -212,8 +214,8 @@ def _write_begin(w: MachineWriter, form: Form) -> None:
 
 
 def _write_serve(w: MachineWriter, form: Form) -> None:
-    """Write `serve(job, state, who, lane)`: saves due states, and if the sample has ended, returns it and
-    begins the next one.
+    """Write `serve(job, state, who, lane)`: save due states; if the sample has ended, return it and begin the
+    next one.
     """
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form, state)
@@ -235,8 +237,8 @@ def _write_serve(w: MachineWriter, form: Form) -> None:
 
 
 def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> None:
-    """Write `save_within(job, state, who, k)`: saves due states before the end of a step, by the Taylor
-    coefficients `k` of its start.
+    """Write `save_within(job, state, who, k)`: save due states before the end of a step, from the Taylor
+    coefficients `k` at its start.
     """
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
@@ -272,7 +274,9 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
 
 
 def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
-    """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
+    """Save the state of a lane at a due time; at the end, save it for all remaining times, and begin the next
+    sample.
+    """
     times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
     number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
@@ -296,7 +300,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
-    """Return the kernel of the integrated form, by a tableau, or by Taylor series up to an order."""
+    """Return the kernel of the integrated form, by a tableau or by Taylor series up to an order."""
     steps = method if order is None else TaylorSteps(order)
 
     def shapes(*arguments):
@@ -324,7 +328,7 @@ OF_SAMPLES = 'machine code does not differentiate with respect to samples of an 
 
 
 def flow(form: Form, method: Method, order: int | None) -> Loop:
-    """Return the motion by a kernel; `order`: of Taylor series, in place of the tableau."""
+    """Return the motion by a kernel; `order`: that of a Taylor series, in place of the tableau."""
 
     def motion(form: Form) -> Loop:
         # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
@@ -340,8 +344,8 @@ def flow(form: Form, method: Method, order: int | None) -> Loop:
 
 
 def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
-    """Return the motion of a form, whose derivative is the motion of the state with one more tangent of each
-    part; `check`: whether there is such a one.
+    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`:
+    whether such a form is supported.
     """
     own = jax.custom_jvp(motion(form))
 

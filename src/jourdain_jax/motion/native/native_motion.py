@@ -47,15 +47,15 @@ Unknowns = Float[Array, "z"]
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
-    """Return each number of a function of time; for a tree of flags or of tangents in its place, the
-    replacements (None: nothing).
+    """Return each number of a function of time. If a tree of flags or tangents is given, return its entries
+    in their place (None: nothing).
     """
     return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers`, and all of `channel.held`, from the next replacements of each number; None if
-    there is none.
+    """Return `channel.numbers` and all of `channel.held` from the next replacements of each number; None if
+    there are none.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
@@ -72,7 +72,9 @@ def _each(part, shape: tuple[int, ...]) -> list:
 
 
 def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return z as a function of z and of a zero displacement of time along its `rates`."""
+    """Return z, which depends on a displacement of time along its `rates`. The value of the displacement is
+    zero; only its derivative matters.
+    """
 
     def moving_with_time(slope: Callable) -> Callable:
         @jax.custom_jvp
@@ -103,8 +105,8 @@ def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar],
 
 
 def _rates(form: Form) -> Callable[[Unknowns], Unknowns]:
-    """Return rates of z: the state, time, the known numbers, and the slopes of samples; zero except for the
-    first two and samples.
+    """Return rates of z, which holds the state, time, the known numbers, and the slopes of samples. Rates of
+    the known numbers are zero.
     """
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
@@ -134,8 +136,8 @@ MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is w
 
 
 def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None) -> str:
-    """Return why machine code cannot integrate a scene, by Taylor series up to an `order` where one is given,
-    in words; empty where it can.
+    """Return in words why machine code cannot integrate a scene (by Taylor series, if an `order` is given);
+    empty if it can.
     """
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
@@ -154,7 +156,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
 
 @lru_cache(maxsize=64)
 def _reason_against_program(form: Form, order: int | None) -> str:
-    """Return why machine code cannot evaluate the program of a form, in words; empty where it can."""
+    """Return in words why machine code cannot evaluate the program of a form; empty if it can."""
     program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:
@@ -183,8 +185,8 @@ def _reason_against_series(form: Form, order: int) -> str:
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
-    """Return the form for machine code; `most`: transitions of a motion; `stopping`: whether other events end
-    it.
+    """Return the form for machine code; `most`: the number of transitions of a motion; `stopping`: whether
+    other events end it.
     """
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Sampled))
@@ -201,7 +203,7 @@ def modes_among(inputs: Inputs) -> tuple[int, ...]:
 
 
 def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
-    """Return cotangents of the start, and of each number of the rates that is `asked` for, from those of the
+    """Return cotangents of the start, and of each requested number of the rates (`asked`), from those of the
     results.
 
     `memory`: bytes that records of steps may take.
@@ -221,8 +223,8 @@ def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return the state at a time t, as a function of it, of t, and of a zero time d, by which it is moved
-    along its rates.
+    """Return a function that moves a state at time t along its rates by a time d. The value of d is zero;
+    only its derivative matters.
     """
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(_rates(form))
 
@@ -270,8 +272,8 @@ def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scala
 
 
 def known_of(args: tuple) -> list:
-    """Return the known numbers of the rates: those of parameters only, of functions of time, and constant
-    inputs; None for samples.
+    """Return the known numbers of the rates: those of parameters only, those of functions of time, and
+    constant inputs; None for samples.
     """
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]

@@ -27,7 +27,7 @@ class Operands(NamedTuple):
         return jnp.broadcast_to(x, (*self.batch, *x.shape[x.ndim - rank :]))
 
     def _rows(self, values: Sequence) -> list[tuple[Any, int, bool]]:
-        """Return each vector, number or constant of a start, its rank, and whether all lanes share it."""
+        """Return each vector, number or constant of a start with its rank, and whether all lanes share it."""
         constant, row, found = dict(self.constant), 0, list[tuple[Any, int, bool]]()
         operands = [*range(self.samples, len(values) - self.others)]
         while operands or row in constant:
@@ -55,16 +55,17 @@ class Operands(NamedTuple):
         return jnp.moveaxis(jnp.concatenate(found), 0, -1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
-        """Return the arrays of a CPU: lanes come first in all but samples, which lanes may share."""
+        """Return the arrays of a CPU: the axis of lanes comes first, except in samples, which lanes may
+        share.
+        """
         rows, last = self._rows(values), len(values) - self.others
         starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
         return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
 
     def given_once(self, *values: Array) -> list[Array]:
-        """Return the arrays of a GPU: the rows of a start that all lanes share follow the others, without
-        lanes.
+        """Return the arrays of a GPU: the shared rows of a start follow the others, without lanes.
 
-        The last operand, the times, has no lanes either where all lanes share it.
+        The last operand, the times, has no lanes either if all lanes share it.
         """
         rows, last = self._rows(values), len(values) - self.others
         starts = [

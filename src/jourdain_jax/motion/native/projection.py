@@ -44,7 +44,9 @@ def cleared(w: MachineWriter, place: Value, count: int) -> None:
 
 
 def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
-    """`rotated(B)`: the rows of B made orthogonal in their first `columns` entries; the `rows` entries behind them turn with them."""
+    """Write `rotated(B)`: make the rows of B orthogonal in their first `columns` entries; the following
+    `rows` entries rotate with them.
+    """
     width = rows + columns
     with w.procedure("rotated", "B") as (B,):
         turned = w.room(type="i1")
@@ -70,7 +72,9 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> None:
-    """`inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter than `cutoff` times the longest."""
+    """Write `inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter than
+    `cutoff` times the longest.
+    """
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
         w.store(0.0, longest)
@@ -173,15 +177,15 @@ class Rows:
 
     @property
     def given(self) -> list[int]:
-        """Nodes of the arguments of a sample, before marks of free ones and the typical lengths of the
-        constraints.
+        """Return the nodes of a sample's arguments. Marks of free entries and the typical lengths of the
+        constraints come after them.
         """
         program = self.program
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
 
     def reason_against(self) -> str:
-        """Return why this is not written as machine code, in words; empty where it can be."""
+        """Return in words why this cannot be machine code; empty if it can."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
@@ -196,8 +200,8 @@ class Rows:
 
 
 def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
-    """Write the module: from `of.given`, marks of free ones, and lengths, to the projected quantities and the
-    residual.
+    """Write the module, which takes `of.given`, marks of free entries, and lengths, to the projected
+    quantities and the residual.
 
     `cutoff`: singular values of rows below this share of the largest one count as zero.
     """
@@ -228,7 +232,9 @@ def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) 
 
 
 def _write_metric(w: MachineWriter, of: Rows) -> None:
-    """`metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled speeds; the identity among speeds that are held."""
+    """Write `metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled
+    speeds; held speeds have the identity.
+    """
     n, first_free = len(of.moving), len(of.given)
     with w.procedure("metric", "state L c") as (state, L, c):
         cleared(w, L, n * n)
@@ -244,15 +250,17 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
 
 
 def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
-    """Return the scale of a speed, as in `equations/scaling.speed_scale`, from an entry on the diagonal of
-    the mass matrix.
+    """Return the scale of a speed, as `equations/scaling.speed_scale`, from an entry on the diagonal of the
+    mass matrix.
     """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 
 
 def _write_factored(w: MachineWriter, of: Rows) -> None:
-    """`factored(state, L, c, B, d, weights)`: the matrix of the rows, turned as by `rotated`, and the scales of the rows."""
+    """Write `factored(state, L, c, B, d, weights)`: the matrix of the rows, rotated as by `rotated`, and the
+    scales of the rows.
+    """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
     with w.procedure("factored", "state L c B d weights") as (state, L, c, B, d, weights):

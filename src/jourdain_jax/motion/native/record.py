@@ -39,7 +39,9 @@ class Slot(NamedTuple):
 
 
 class _Rooms(NamedTuple):
-    """Memory of a block: its lanes and their numbers in the batch, of each how many times are saved, its cotangents, and how many slots there are."""
+    """Memory of a block: for each of its lanes the index in the batch, the number of saved times, its
+    cotangents, and the number of slots.
+    """
 
     state: Value
     who: Value
@@ -111,7 +113,7 @@ def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
 
 
 def _write_more_room(w: MachineWriter) -> None:
-    """Write `more_room(old, bytes)`: twice as many bytes, beginning with the old ones; null if there are
+    """Write `more_room(old, bytes)`: allocate twice as many bytes, and copy the old ones; null if there are
     none.
     """
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
@@ -124,7 +126,9 @@ def _write_more_room(w: MachineWriter) -> None:
 
 
 def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
-    """As many slots as a third of the memory has for each thread: the record, of up to twice as many, is there beside half of itself while it grows."""
+    """Return the number of slots that fit into a third of each thread's memory. While the record grows to
+    twice its size, the old one still exists.
+    """
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)
     # memory for 64 at first, then for twice as many, and so on
@@ -146,7 +150,9 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
-    """As many slots as a thread has memory for; the numbers of threads stand side by side."""
+    """Return the number of slots that fit into a thread's memory. The numbers of neighbouring threads are
+    interleaved.
+    """
     here, (thread, threads) = w.room(slot.all), w.thread()
     record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
     slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
@@ -242,7 +248,7 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
 
 
 def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:
-    """Where no memory is left: NaN for this block and for all lanes that are left."""
+    """Store NaN for this block and for all remaining lanes, since no memory is left."""
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 
     def lost(number: Value) -> None:

@@ -30,7 +30,7 @@ def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
 
 
 def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
-    """Assign the table and the knots of the sample with this number, of so many, to a place."""
+    """Assign the table and the knots of sample `number`, of `count` samples, to a lane."""
     size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:
@@ -49,7 +49,9 @@ def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
 
 
 def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> None:
-    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
+    """Write `sampled_inputs(state, t, values)`: the values of all sampled inputs of each lane at the time t
+    since the start, then df/dt.
+    """
     with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
         lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
         w.store(t, times)
@@ -78,9 +80,7 @@ def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> Non
 
 
 def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
-    """Return the values at the time t since the start of all inputs that are given by samples, then their
-    slopes.
-    """
+    """Return the values of all sampled inputs at the time t since the start, then their slopes."""
     count = len(form.sampled) * (1 + with_slopes)
     values = w.room(count)
     w.run("sampled_inputs", state, t, values)

@@ -15,7 +15,7 @@ Numbers = tuple[PerLane, ...]  # one each
 
 
 def constant_rows(form: Form) -> dict[int, float]:
-    """Return the rows that are equal at the start of every motion, with their numbers."""
+    """Return the rows that are equal at the start of every motion, with their indices."""
     rows = form.rows
     said = {"code": float(RUNNING), "event": -1.0, "pivot": math.inf}
     begun = dict.fromkeys(range(form.integrated, form.returned), 0.0) | {
@@ -25,7 +25,8 @@ def constant_rows(form: Form) -> dict[int, float]:
 
 
 class Start(NamedTuple):
-    """The input of a loop: a motion; the state and the known numbers are followed by their tangents (`Form`).
+    """The input of a loop: one motion. The state and the known numbers are followed by their tangents
+    (`Form`).
     """
 
     of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
@@ -38,8 +39,8 @@ class Start(NamedTuple):
     plain: tuple[Array, ...] = ()  # `known` without lanes where all share it, for kernels of a GPU
 
     def numbers(self) -> Numbers:
-        """Return the rows at the start, after the state, that are not `constant_rows`; without lanes where
-        all share them.
+        """Return the rows at the start that are not `constant_rows`, after the state; without lanes where all
+        share them.
         """
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
@@ -63,8 +64,7 @@ class Found(NamedTuple):
 
     @staticmethod
     def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
-        """Put a motion together from its states, its rows at the end, and the number of goals that were
-        reached.
+        """Combine a motion from its states, its rows at the end, and the number of goals that were reached.
         """
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
@@ -87,10 +87,10 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`:
-        what of the start has.
+        """Return the results of `vmap` with lanes removed from parts that do not need them, and marks of the
+        parts that keep them; `given`: the parts of the start that have lanes.
 
-        A tangent has lanes where anything has that it depends on: all directions share the values of one
+        A tangent has lanes if anything on which it depends has. All directions share the values of one
         motion.
         """
         parts = range(len(self.y))

@@ -58,7 +58,9 @@ class Trial(NamedTuple):
 
 
 def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
+    """Write `step(state, k)`: one step, tried by all lanes that are under way; `k`: room for the rates of its
+    stages, or for Taylor coefficients.
+    """
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form, state)
         if isinstance(method, TaylorSteps):
@@ -75,7 +77,7 @@ def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable
 
 
 def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number) -> Trial:
-    """Return a step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
+    """Return a step of a Runge-Kutta method, which ends at the next saved time at the latest."""
     aim = aimed(w, p, p["goal"], p["h"], p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     y1, error = w.room(form.integrated), w.room(form.y)
@@ -109,8 +111,8 @@ def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Call
 
 
 def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k: Number) -> Trial:
-    """Return a step by Taylor series, which goes over the times to save at; puts the coefficients into `k`,
-    and after them the slope at the end of the step.
+    """Return a step by Taylor series, which may pass saved times. Put the coefficients into `k`, followed by
+    the rates at the end of the step.
     """
     count = form.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
@@ -153,7 +155,7 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
-    """Update the lanes after a tried step; `k`: derivatives at the stages, at the start first."""
+    """Update the lanes after a tried step; `k`: derivatives at the stages, with that at the start first."""
     y, count = p.pointer, form.integrated
     if form.goes_on:
         p["left"] = w.number(0.0)
@@ -188,11 +190,11 @@ class Rank(NamedTuple):
 
 
 def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number) -> tuple[Number, Number, Rank | None]:
-    """Return the smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing
-    rank.
+    """Return the smallest magnitude of a pivot, whether any pivot changed its sign, and the distance of rows
+    from losing rank.
 
-    Puts the slopes of all stages into `k`, and into `y1` the state of the next stage, computed once, until it
-    is that at the end of the step.
+    The rates of all stages are stored in `k`. The state of each stage is stored in `y1`, which at last holds
+    the state at the end of the step.
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()
@@ -220,7 +222,7 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
 
 def unseen(w: StepWriter, form: Form) -> tuple:
     """Return the initial values for monitoring pivots and directions: first directions, extremes of pivots,
-    whether a row turned round.
+    and whether a row turned round.
     """
     low, high = ([w.number(x)] * form.pivots for x in (math.inf, -math.inf))
     return [w.number(0.0)] * form.turning, low, high, w.literal(0, w.truth)
@@ -243,7 +245,7 @@ def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
-    """Return the squared part of each row normal to its predecessors, and its squared size."""
+    """Return the squared part of each row normal to the rows before it, and its squared size."""
     found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
     return list(zip(found[::2], found[1::2], strict=True))
 
@@ -255,7 +257,7 @@ def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
 
 
 def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Number, y: Number) -> None:
-    """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
+    """Project the state `y` of a stage back onto the rows, in lanes that are `near` a loss of rank."""
 
     def put() -> None:
         on_rows = w.room(form.integrated)
@@ -267,7 +269,9 @@ def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Num
 
 
 def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number]) -> Number:
-    """Return whether the part of a row's slope along its first one has fallen below its least share; entries of directions alone."""
+    """Return whether a row has turned round: the part of its slope along its first slope has fallen below the
+    permitted share. Only entries of directions count.
+    """
     along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
     width = max(form.speeds, 1)
     rows = [range(k, k + width) for k in range(0, form.turning, width)]
@@ -279,7 +283,8 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
 def weighted(
     w: StepWriter, weights: Number, k: Number, form: Form, row: int | Number, every: bool = False
 ) -> Number:
-    """Return `sum_j w_j k_j` of one number of the state; `every`: with terms whose weight is zero."""
+    """Return `sum_j w_j k_j` of one number of the state; `every`: whether terms of weight zero are included.
+    """
     first, *others = [j for j in range(len(weights)) if every or w.may_count(weights, j)]
     total = w.load(k, row + first * form.integrated) * weights[first]
     for j in others:
@@ -288,7 +293,9 @@ def weighted(
 
 
 def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: Number, rank: Rank | None = None) -> None:
-    """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
+    """Project `y1` back onto the rows. The error becomes at least as large as this displacement, apart from
+    noise.
+    """
     free = w.room(form.y)
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)

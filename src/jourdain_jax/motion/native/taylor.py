@@ -38,7 +38,7 @@ Coefficients = list[Value]
 
 
 def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
-    """Return why a series of the outputs cannot be written, in words; empty where it can."""
+    """Return in words why a series of the outputs cannot be written; empty if it can."""
     for node in graph.reachable(outputs):
         op = graph.op[node]
         if op in ("const", "input"):
@@ -53,8 +53,8 @@ def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
 class Series:
     """Coefficients of all numbers of a graph along the solution with these rates, as nodes of the same graph.
 
-    **Arguments:** `known`, the nodes of what does not vary; `states` and `rates`, those of the state's numbers and of their rates; `order`, of the last
-    coefficient of the state; `clock`, the node of the time.
+    **Arguments:** `known`, the nodes of constant values; `states` and `rates`, those of the state and of its
+    rates; `order`, of the last coefficient of the state; `clock`, the node of the time.
     """
 
     def __init__(self, graph: Graph, known: Iterable[int], states: Sequence[int], rates: Sequence[int], order: int, clock: int) -> None:
@@ -71,7 +71,7 @@ class Series:
                 series.append(graph.div(self._at(rate, k), graph.const(k + 1)))
 
     def _at(self, node: int, k: int) -> int:
-        """Return the coefficient of a node; coefficients beyond the known ones of given values are zero."""
+        """Return the coefficient of a node. For given values, coefficients beyond the known ones are zero."""
         return self.of[node][k] if k < len(self.of[node]) else self.graph.zero
 
     def _with_derivatives(self, nodes: Sequence[int], given: set[int]) -> list[int]:
@@ -129,7 +129,9 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """Return the numbers j in the order in which both factors of a_j b_{k-j} are known."""
+    """Return the given indices j, sorted so that the products a_j b_{k-j} whose factors become known last
+    come last.
+    """
     return sorted(js, key=lambda j: max(j, k - j))
 
 
@@ -138,10 +140,11 @@ Terms = list[tuple[tuple[int, ...], int]]  # a sum of products: factors that var
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
     """Return nodes for equal numbers, up to round-off, with fewer products of varying values, each of which
-    is a sum in every coefficient; `moving`: inputs that vary.
+    is a sum in every coefficient; `moving`: varying inputs.
 
-    Sums and products are taken apart into terms. Then what saves most products is shared, one after the other: x y where several terms hold it, and
-    x y + x z = x (y + z) in one sum. Accelerations of a disc with s, c = sin, cos of its lean take 12, and after that 7, with p = v w/c and q = c u:
+    Sums and products are expanded into terms. Then the sharing that saves most products is applied
+    repeatedly: x y where several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a
+    disc with s, c = sin, cos of its lean take 12 products, and after that 7, with p = v w/c and q = c u:
 
         v (2 s w/c - 5/3 c u),  s (g + c u^2) + 6/5 c u w,  -2 v w/c      ->      2 s p - 5/3 v q,  g s + q (s u + 6/5 w),  -2 p
     """
@@ -226,7 +229,7 @@ class TaylorSteps:
 
     @property
     def needed(self) -> int:
-        """Rows of a state that a step keeps: the coefficients, and the slope at its end."""
+        """Return the rows of a state that a step keeps: the coefficients, and the rates at its end."""
         return self.order + 2
 
     @property
@@ -243,8 +246,8 @@ class Monitored(NamedTuple):
 
 
 def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
-    """Return the Taylor series of every integrated number, tangents too, at the time t, and the monitored
-    quantities there.
+    """Return the Taylor series of every integrated number, including tangents, at the time t, and the
+    monitored quantities there.
     """
     y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
@@ -291,7 +294,7 @@ def _judged(w: MachineWriter, form: Form, values: Sequence[Value]) -> Monitored:
 
 
 def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
-    """Return how long a step may be; zero where a coefficient is not a number."""
+    """Return the permitted length of a step; zero where a coefficient is not a number."""
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
     order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h

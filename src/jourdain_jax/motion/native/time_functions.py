@@ -29,7 +29,7 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
 
 @lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
-    """Return the program with these functions in place of inputs, or the reason why there is none; their
+    """Return the program with these functions in place of inputs, or the reason why there is none. Their
     numbers come last among the `fixed` ones.
     """
     numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
@@ -79,7 +79,7 @@ def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
 
 
 def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[list[int], int]:
-    """Return the nodes of the numbers of a function, and that of its value at time t."""
+    """Return the nodes of the numbers of a function, and the node of its value at time t."""
     given = [
         [graph.input(f"{name} {k} {i}", True) for i in range(math.prod(shape))]
         for k, shape in enumerate(function.shapes)
@@ -90,7 +90,9 @@ def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[l
 
 
 def may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
-    """Return whether a function of time jumps; with `varies`, at a time that depends on one of these numbers."""
+    """Return whether a function of time jumps. With `varies`, count only jumps at times that depend on one of
+    these numbers.
+    """
     graph = Graph(keeps_rules=True)
     try:
         numbers, value = _on_graph(graph, function, graph.input("t", True), "")

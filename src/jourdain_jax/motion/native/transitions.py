@@ -100,7 +100,7 @@ def reset_program(form: Form) -> Reset:
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:
-    """Write `reset(state, tau, y, event, after)`: the state after an event from the state `y`; rows as in
+    """Write `reset(state, tau, y, event, after)`: the state after an event at the state `y`; rows as in
     `Form.rows_of_transition`.
     """
     reset = reset_program(form)
@@ -110,8 +110,8 @@ def write_reset(w: MachineWriter, form: Form) -> None:
 
 
 def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
-    """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`: `g`: of the state, then of the times;
-    after the numbers `asked` for comes the time.
+    """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`; `g`: cotangents of the state, then of the
+    times. The time follows the requested numbers.
     """
     reset, each = reset_program(form), form.y
     graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
@@ -152,12 +152,12 @@ def is_side(w: StepWriter, form: Form, event: Number) -> Number:
 
 
 def is_noted(w: StepWriter, form: Form, left: Number) -> Number:
-    """Return whether what a try `left` is a transition that is noted: those of relations are not."""
+    """Return whether a tried transition (`left`) is noted; those of relations are not."""
     return w.differs(left, 0.0) & ~is_side(w, form, w.magnitude(left) - 1.0)
 
 
 def slowest(w: StepWriter, p: Lanes) -> Number:
-    """Return by how much a number changes in the whole motion that counts as one that rests."""
+    """Return the largest change over the whole motion with which a number counts as resting."""
     return w.larger(RESTS * p["atol"], w.eps)
 
 
@@ -181,9 +181,8 @@ class Happened(NamedTuple):
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
     """Store the state after an event in `y1`; record the event, and the state before.
 
-    `stuck` becomes the code of a motion that does not go on: where the event's value rises afterwards, but so
-    slowly that round-off
-    hides it; where a mode is negative; where a relation would turn back at once.
+    `stuck` becomes the code of a motion that cannot continue: the event's value rises afterwards so slowly
+    that round-off hides it, a mode is negative, or a relation would turn back at once.
     """
     event, t, flat, quiet, switches, noise, found = happened
     side = is_side(w, form, event)
@@ -236,10 +235,11 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
 
 
 def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:
-    """Turn cotangents after a transition into those before it, in lanes that have `left` a phase by one, and
-    restore the modes.
+    """Turn cotangents after a transition into those before it, and restore the modes, in lanes where the
+    transition ended a phase (`left`).
 
-    `left`: as the rows of this name; `g_t`: cotangents of its time and of the tangents of that.
+    `left`: the rows with this name; `g_t`: cotangents of the transition's time and of the tangents of that
+    time.
     """
     count, of = form.integrated, form.rows_of_transition
     mark, t, z, before = w.load(left), w.load(left, 1), w.at(left, 2), w.at(left, 2 + count)

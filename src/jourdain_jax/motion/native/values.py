@@ -54,9 +54,8 @@ def called(
     """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the
     arguments.
 
-    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. Where rows of
-    a start
-    are `constant`, the next argument holds all others, as vectors of the state, and numbers.
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. If some rows
+    of a start are `constant`, one more argument holds all the others: vectors of the state, then numbers.
     """
 
     @cache
@@ -108,7 +107,7 @@ def _results(*arguments, shapes: Callable, operands: Operands, **_) -> list:
 
 
 def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
-    """Return the call with one axis of lanes more, the first one; operands that have none stay without."""
+    """Return the call with one more axis of lanes, the first one; operands without lanes stay without."""
     count, every = lanes_of(values, axes), []
     for x, axis, rank in zip(values, axes, operands.ranks, strict=True):
         has_lanes = x.ndim - (axis is not None) > rank
@@ -123,7 +122,9 @@ def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
 def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
-    """Return what a function makes of operands of a call, and the context of a call that is given that."""
+    """Return the operand that a function makes from operands of a call, and the context for a call with this
+    operand.
+    """
     avals = [
         ctx.avals_in[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False)
         for x in jax.eval_shape(make, *ctx.avals_in)
@@ -196,15 +197,16 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
 
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Return values of nodes, with free zeros, as a function of the values of the variables."""
+    """Return values of nodes as a function of the values of the variables. Zeros by structure cost nothing.
+    """
     graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
 
     @cache
     def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
-        """Return the derivative as a function of x, v or g, and w in a row; None if it is too large, or there
-        is no machine code.
+        """Return the derivative as a function of x, v or g, and w in a row; None if it is too large or if
+        there is no machine code.
         """
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
@@ -261,7 +263,8 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
     """Return values of nodes as a function of the values of the variables: by XLA, and by machine code.
 
-    Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
+    Machine code returns only the nonzero numbers, since the whole matrix of 32 trailers would not fit on its
+    stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
@@ -347,8 +350,8 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
-    """Return the entries of a scene's parameters that have a node; `nodes`: of each leaf, entry by entry, -1
-    for none.
+    """Return the entries of a scene's parameters that have a node; `nodes`: those of each leaf, entry by
+    entry, -1 for none.
     """
     found = []
     for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
@@ -360,8 +363,8 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 
 def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
-    """Return whether parameters are right, and the bodies and contacts that they make; as `parameter_faults`
-    and `faults_at`.
+    """Return whether parameters, and the bodies and contacts that depend on them, are valid, as
+    `parameter_faults` and `faults_at` define it.
     """
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs, others]
     parameters = [n for leaf in program.parameters for n in leaf if n >= 0]

@@ -20,7 +20,9 @@ OverTimes = Float[Array, "*lanes times"]
 
 
 class Energies(eqx.Module):
-    """Energies along a motion, in J. `balance` is constant for a right motion: T + V, less the work done where some is tracked."""
+    """Energies along a motion, in J. `balance` is constant for a correct motion: T + V, minus the work done
+    if it is integrated.
+    """
 
     kinetic: OverTimes
     potential: OverTimes
@@ -30,8 +32,8 @@ class Energies(eqx.Module):
     @property
     @with_nan_as_a_mark
     def balance(self) -> OverTimes:
-        """T + V - W + D; W is the work of forces without potential and of constraints that do work, D the
-        energy lost in events.
+        """Return T - W + V + D: W is the work of forces without potential and of constraints that do work, D
+        the energy lost in events.
         """
         return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (0.0 if self.work is None else self.work)
 
@@ -75,10 +77,11 @@ def diagnose(trajectory: Record) -> Diagnostics:
     """Return drifts, residuals, conditioning and contact extremes of one `trajectory` (for a batch:
     `jax.vmap` or `rollout.lane(i)`).
 
-    Times that were not reached do not count. ValueError for anything else than a trajectory.
+    Times that were not reached do not count. Raises ValueError for anything but a trajectory.
     """
     if not hasattr(trajectory, "scene"):
-        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for a rollout give one lane: `rollout.lane(0)`")
+        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
+            "a rollout give one lane: `rollout.lane(0)`")
     checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
 
@@ -113,7 +116,7 @@ def lost_of(trajectory: Record) -> OverTimes | None:
 
 
 def _lacks_work(trajectory: Record) -> bool:
-    """Return whether work was done that is not tracked, so that T + V is not constant."""
+    """Return whether work was done that was not integrated, so that T + V is not constant."""
     return trajectory.work is None and needs_work(trajectory.scene, structure_of(trajectory.scene))
 
 
@@ -137,11 +140,12 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
     if low != high:
-        warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
+        warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the "
+            "motion beyond may not be unique")
     elif high < usual:
         warned.append(
-            f"rows have rank {high} on the whole motion, but {usual} at generic states: a singular configuration, or another assembly of the scene; "
-            "state a `domain` around the motion to decide"
+            f"rows have rank {high} on the whole motion, but {usual} at generic states: a singular "
+            "configuration, or another assembly of the scene; state a `domain` around the motion to decide"
         )
     elif smallest < np.sqrt(eps_of(trajectory.q)):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
@@ -149,20 +153,23 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         # residual of a row, relative to the state
         if float(residual) > 1e-4 * (1.0 + float(_largest(state))):
             warned.append(
-                f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller tolerances, or look for rows that contradict each other"
+                f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller "
+                "tolerances, or look for rows that contradict each other"
             )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size and not _lacks_work(trajectory):
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
         warned.append(
-            f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`, or let `verify` look at potentials and rows"
+            f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`, "
+            "or let `verify` look at potentials and rows"
         )
     pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
     # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
-            f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no digit of the accelerations is sure in "
-            f"{trajectory.q.dtype}; leave `reduction` at its default, or take float64"
+            f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no "
+            f"digit of the accelerations is sure in {trajectory.q.dtype}; leave `reduction` at its default, "
+            "or take float64"
         )
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
@@ -170,8 +177,9 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     # of a step: a clock that resolves less rounds times visibly
     if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
-            f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
-            "rounded times; count time from zero, or take float64"
+            f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, "
+            "poses and inputs that depend on time are given rounded times; count time from zero, or take "
+            "float64"
         )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))

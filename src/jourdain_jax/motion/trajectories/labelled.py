@@ -45,8 +45,9 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
     def add(name: str, axes: tuple, values, about: dict) -> None:
         if name in found or name == "lane":
             raise ValueError(
-                f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; coordinates, speeds and parameters need names of "
-                f"their own, different from {', '.join(('time', 'lane', *OF_LANES))}: rename it in the scene, or use `to_pandas()`"
+                f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; "
+                "coordinates, speeds and parameters need names of their own, different from "
+                f"{', '.join(('time', 'lane', *OF_LANES))}: rename it in the scene, or use `to_pandas()`"
             )
         found[name] = (axes, values, about)
 
@@ -93,5 +94,6 @@ def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
     for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
         known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-    check_names(given or {}, valid, f"`units` names `{{}}`, which is not a coordinate or speed of `{type(scene).__name__}`")
+    check_names(given or {}, valid, "`units` names `{}`, which is not a coordinate or speed of "
+        f"`{type(scene).__name__}`")
     return known | dict(given or {})

@@ -103,9 +103,11 @@ class Record(eqx.Module):
 
 @with_usual_promotion
 def map_over_times(f, record: Record, by_inputs: bool = False):
-    """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key).
+    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a
+    named function or a module, since it is a cache key.
 
-    `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
+    `by_inputs`: whether f needs the rates of the inputs, since rows depend on varying ones. For a batch of
+    motions the axes of lanes come first.
     """
     first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))  # noqa: E731  of a batch, the first
     by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs  # accelerations depend on the rates of the inputs
@@ -134,8 +136,8 @@ _compiled = for_programs(_mapped)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
-    """Return `f` at one state; NaN for a time that was not reached, where f is run at the end of the motion
-    instead.
+    """Return `f` at one state. For a time that was not reached, f runs at the end of the motion instead, and
+    its result is replaced by NaN.
     """
     reached = jnp.all(jnp.isfinite(q))
     t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
@@ -160,7 +162,9 @@ _uncompiled = eval_numpy(_at_one_time)
 
 
 class BodyPoint(eqx.Module):
-    """The place (m, inertial frame) of the point of a body with coordinates `local` (m, body frame, from the mass centre)."""
+    """Return the position (m, inertial frame) of the point of a body with coordinates `local` (m, body frame,
+    from the mass centre).
+    """
 
     body: str = eqx.field(static=True)
     local: Vector3
@@ -184,8 +188,8 @@ class InputOf(eqx.Module):
 
 
 class AccelerationsBySvd(eqx.Module):
-    """Accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint rows, None:
-    as found for the scene.
+    """Return accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint rows,
+    None: those of the scene.
     """
 
     usual: UsualRows | None = None

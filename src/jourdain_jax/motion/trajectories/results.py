@@ -11,41 +11,51 @@ CODES = tuple(name.lower() for name, code in globals().items() if type(code) is 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
     EVENT: "stopped at an event",
-    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() or retry=True where forces are stiff, or look for a "
-    "singularity near the last time",
-    STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
-    NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or constraint is NaN there, or they are not determined (rows that lose "
-    "rank, no inertia along a free direction); examine the last state with `accelerations` and `verify`",
-    INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a body begins below the ground "
-    "of a contact with friction, or Coulomb's law has no solution for its contacts (an impact that gains energy, Painleve's paradox)",
-    SINGULAR_PARTITION: "the motion came near a configuration where the privileged speeds do not determine the others: try another choice of "
-    "`privileged`, or retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, unless the rows lose rank; or where the "
-    "scene's own `coordinate_rates` become infinite: use other speeds",
+    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() or "
+        "retry=True where forces are stiff, or look for a singularity near the last time",
+    STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be "
+        "met near the last time",
+    NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or constraint is NaN "
+        "there, or they are not determined (rows that lose rank, no inertia along a free direction); examine "
+        "the last state with `accelerations` and `verify`",
+    INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a "
+        "body begins below the ground of a contact with friction, or Coulomb's law has no solution for its "
+        "contacts (an impact that gains energy, Painleve's paradox)",
+    SINGULAR_PARTITION: "near the last time the privileged speeds do not determine the others, or the "
+        "scene's own `coordinate_rates` become infinite; choose other `privileged` or other speeds, or give "
+        "retry=True, or, unless the rows lose rank, `formulation=jj.Formulation('full')` with "
+        "`backend='dense'`",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
-    SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
-    STIFF: "stiff: ran out of steps, kept short by stability rather than accuracy, and an implicit solver did not reach the end either; "
-    "replace a stiff spring or damper by a constraint, or loosen the tolerances",
-    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection undid more than half of it, or a solver of "
-    "diffrax left them by more than its step errors explain: use shorter steps, or the default solver, or look for rows that lose rank",
-    BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and "
-    "`t1`; or time runs backward, which is impossible with friction",
-    ENERGY_LOST: "the energy, which should be constant, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
-    "missed a short feature of a load, or a load's potential does not belong to its force (`verify`)",
+    SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a "
+        "discontinuity or a stiff force near the last time",
+    STIFF: "stiff: ran out of steps, kept short by stability rather than accuracy, and an implicit solver "
+        "did not reach the end either; replace a stiff spring or damper by a constraint, or loosen the "
+        "tolerances",
+    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection undid "
+        "more than half of it, or a solver of diffrax left them by more than its step errors explain: use "
+        "shorter steps, or the default solver, or look for rows that lose rank",
+    BAD_TIMES: "saved times lie outside the span or are not in order, the span is empty or not finite, or "
+        "time runs backward in spite of friction; give increasing `ts` between `t0` and `t1`",
+    ENERGY_LOST: "the energy, which should be constant, changed by more than the steps' tolerances explain: "
+        "the motion left its branch at a singular position, missed a short feature of a load, or a load's "
+        "potential does not belong to its force (`verify`)",
     CONTRADICTORY_ROWS: "redundant velocity constraints contradict each other at some saved time; omit one, "
-    "or correct the inputs and times that they follow",
+        "or correct the inputs and times that they follow",
     PROCESS_DIED: "processes died on it repeatedly, and a study of an earlier version skipped it",
-    UNRESOLVED: "the step size shrank to zero, and `rtol` is below the resolution of this precision, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
-    "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
-    TOO_MANY_TRANSITIONS: "more than `max_transitions` events at which the motion continues, or events within "
-    "round-off of each other, like the last bounces of a ball: switch to a mode in which it rests, or raise `max_transitions`",
-    IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; give the contact "
-    "impact='energetic', or a smaller restitution",
+    UNRESOLVED: "the step size shrank to zero, and `rtol` is below the resolution of this precision, 1.2e-7 "
+        "in float32 and 2.2e-16 in float64: loosen it to 1e-5 and 1e-13, or set "
+        "jax.config.update('jax_enable_x64', True)",
+    TOO_MANY_TRANSITIONS: "more than `max_transitions` events at which the motion continues, or events "
+        "within round-off of each other, like the last bounces of a ball: switch to a mode in which it "
+        "rests, or raise `max_transitions`",
+    IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; "
+        "give the contact impact='energetic', or a smaller restitution",
     PAINLEVE: "Coulomb's law has no solution at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
     CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no tried combination of modes satisfies Coulomb's law at each; "
     "or slip turns during an impact that is followed along its impulse: give the contact impact='moreau'",
-    LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where its contact is no point; give it "
-    "contacts that can bear it there, or stop the motion before, by an event",
+    LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where its contact is no point; give "
+        "it contacts that can bear it there, or stop the motion before, by an event",
     STICKS: "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a speed does at rest: "
     "no motion follows; give the contact `friction=` or the joint `jj.joint_friction`, which hold at rest, or let the load "
     "change within a short range, as by `jnp.tanh`",
@@ -56,12 +66,15 @@ MESSAGES = {
 AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",
-    FULL_STATE: "run again with the full state and dense matrices: the privileged speeds, or the scalar program, do not serve all along it",
+    FULL_STATE: "run again with the full state and dense matrices: the privileged speeds, or the scalar "
+        "program, fail on the way",
     IMPLICIT: "run again with an implicit solver: the motion is stiff",
-    FULL_STATE | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the motion is stiff, and the privileged speeds, or the "
-    "scalar program, do not serve all along it",
+    FULL_STATE | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the motion "
+        "is stiff, and the privileged speeds, or the scalar program, fail on the way",
 }
 
 
 class SimulationError(RuntimeError):
-    """A motion did not reach its end; raised on request only (`trajectory.raise_if_failed()`), with the reason and the time."""
+    """A motion did not reach its end. It is raised by `trajectory.raise_if_failed()` only, with the reason
+    and the time.
+    """

@@ -15,7 +15,7 @@ def sketch_of_lanes(record: Record) -> str:
     """Draw many motions, with a leading batch axis: the median, and the bands that hold half and 95 % of the
     samples under way.
 
-    Return "" for lanes that were saved at times of their own.
+    Return "" for lanes with different saved times.
     """
     levels = 0.025, 0.25, 0.5, 0.75, 0.975  # the ends of two bands, the median between them
     lanes = _spread(len(record.q), 1000)
@@ -30,12 +30,14 @@ def sketch_of_lanes(record: Record) -> str:
 
 
 def _spread(count: int, most: int = 120) -> np.ndarray:
-    """Return at most so many of the numbers 0 to count - 1, evenly chosen."""
+    """Return at most `most` of the indices 0 to count - 1, evenly spaced."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(most, count)).astype(int))
 
 
 def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
-    """Draw the coordinates; `levels` (levels, times, coordinates): the line in the middle, bands around it."""
+    """Draw the coordinates; `levels` (levels, times, coordinates): the line in the middle, with bands around
+    it.
+    """
     reached = np.flatnonzero(np.isfinite(levels).all(axis=(0, 2)))
     if reached.size < 2:
         return ""

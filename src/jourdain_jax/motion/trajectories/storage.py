@@ -54,10 +54,9 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
 
-    A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
-    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a
-    field that is not an array, number or text.
-    Read it with `load_trajectory` or `load_rollout`.
+    An existing file is replaced only when the new one is complete: an interruption leaves the old one. Inputs
+    are stored as samples at the saved times. Raises ValueError where the path is a folder, or the scene has a
+    field that is not an array, number or text. Read the file with `load_trajectory` or `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):
         raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
@@ -116,7 +115,8 @@ def _sampled(inputs: Inputs, ts):
 def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
-    ValueError where the file cannot be read, is of another format, holds a rollout, or belongs to another scene.
+    Raises ValueError where the file cannot be read, has another format, contains a rollout, or belongs to
+    another scene.
     """
     header, arrays, kind = _read(path, scene, "trajectory")
     lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
@@ -127,8 +127,8 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
 def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
     """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
 
-    `scene`: the scene's class, or any scene of that class; parameters come from the file. ValueError where the file cannot be read, is of another
-    format, holds one trajectory, or belongs to another scene.
+    `scene`: the scene's class, or any scene of that class; parameters come from the file. Raises ValueError
+    where the file cannot be read, has another format, contains one trajectory, or belongs to another scene.
     """
     header, arrays, kind = _read(path, scene, "rollout")
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
@@ -136,7 +136,8 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
-    """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
+    """Return trajectories from arrays with a leading axis of lanes, which may have failed. They are built
+    under `vmap`, where no value is refused."""
     samples = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
     longest = max(len(times) for times, _ in samples)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
@@ -162,8 +163,8 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     parameters, static = _stored_fields(scene)
     if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would replace what moved
         raise ValueError(
-            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written before the class had it: "
-            "pass the class as it was when the file was written"
+            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was "
+            "written before the class had it: pass the class as it was when the file was written"
         )
     then, now = header["units"], {name: about["unit"] for name, _, about in parameters_of(scene)}
     for name in sorted({*then, *now}):
@@ -197,16 +198,16 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
 
 
 def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Samples of the inputs in increasing time, also of a motion in reversed time, without times that were not reached."""
+    """Return samples of the inputs in increasing time, also for a motion in reversed time, without times that
+    were not reached."""
     reached = np.flatnonzero(np.isfinite(ts))
     times, first = np.unique(ts[reached], return_index=True)
     return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))
 
 
 def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
-    """Return the class of the scene; a ValueError if it is not the one in the file, or its parameters or
-    names have changed.
-    """
+    """Return the class of the scene. Raises ValueError if it is not the one in the file, or if its parameters
+    or names have changed."""
     kind = scene if isinstance(scene, type) else type(scene)
     if not issubclass(kind, Scene):
         raise ValueError(f"`scene` is {described(scene)}, expected the class of the simulated scene, or a scene of that class")
@@ -218,7 +219,7 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
-    """Header and arrays of a file of this kind, and the class of its scene."""
+    """Return header and arrays of a file of this kind, and the class of its scene."""
     check_kind(path, str | os.PathLike, "`path`", "the name of a file")
     what = f"{kind} file written by `save`"
     try:
@@ -245,9 +246,8 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
 
 
 def _unpacked(file) -> dict[str, np.ndarray]:
-    """Return the arrays of a zip archive by name, each as large as its content: claims beyond that are never
-    allocated.
-    """
+    """Return the arrays of a zip archive by name. Memory is allocated only for the actual content, whatever
+    size an entry claims."""
     found = {}
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
@@ -272,8 +272,7 @@ def _parameters(arrays: dict) -> dict:
 
 def _stored_fields(scene: Scene) -> tuple[dict, dict]:
     """Return fields that are arrays, including parameters, and plain numbers or texts, such as a number of
-    bodies.
-    """
+    bodies."""
     values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
     arrays = {field.name: value for field, value in values.items() if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")}
     return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}

@@ -32,9 +32,9 @@ from jourdain_jax.scene.printing import Printed
 class Trajectory(Record, Printed):
     """A motion over time. Times after an early end (event, failure) hold NaN.
 
-    `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
-    NaN. Automatic uses, such as a loss to be minimised, should take `motion.nan_if_failed()`, or check
-    `motion.succeeded`.
+    `t_end`, `q_end`, `u_end` are the last state that was reached; for a failed motion the state of the
+    failure, with derivatives of NaN. Use `motion.nan_if_failed()` in automatic computations such as a loss,
+    or check `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
@@ -50,10 +50,12 @@ class Trajectory(Record, Printed):
         if name in names_of_bodies(self.scene):
             raise UnknownNameError(
                 f"`{name}` is a body of `{type(self.scene).__name__}`, not a coordinate or speed; "
-                f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its pose and velocities at all times'
+                f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its '
+                'pose and velocities at all times'
             )
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
-        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; "
+            f"{nearest(name, valid)}")
 
     def __contains__(self, name: str) -> bool:
         return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
@@ -70,8 +72,8 @@ class Trajectory(Record, Printed):
 
     @property
     def end(self) -> State:
-        """The last state reached, projected onto the constraints; a batch for many motions. Another motion
-        can continue from it, at its time.
+        """Return the last state reached, projected onto the constraints; a batch for many motions. Another
+        motion can continue from it at its time.
 
         motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
         """
@@ -94,7 +96,8 @@ class Trajectory(Record, Printed):
         """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m,
         from the mass centre).
         """
-        local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
+        local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its "
+            "body frame, m")
         return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
@@ -167,13 +170,13 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def warnings(self) -> Labels:
-        """Reasons to doubt the motion, the most serious first; empty if there are none. The printed summary
-        shows them.
+        """Return reasons to doubt the motion, the most serious first; empty if there are none. The printed
+        summary shows them.
 
-        A failure; rows that gain or lose rank, or come near it, so that constraint forces and derived
-        quantities may not be unique; privileged speeds of a
-        reduction that do not determine the others in this precision; contacts that would have to pull.
-        Computed where it is requested; needs numbers: not under jit or vmap.
+        Reasons are a failure; rows that gain or lose rank, or come near it, so that constraint forces and
+        derived quantities may not be unique; privileged speeds of a reduction that do not determine the
+        others in this precision; contacts that would have to pull. They are computed on request and need
+        numbers: not under jit or vmap.
         """
         failure = () if int(self.result) <= results.EVENT else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
@@ -188,13 +191,13 @@ class Trajectory(Record, Printed):
         """Return known causes of a failure, as texts for messages.
 
         Parameters that are not finite or have the wrong sign, otherwise impossible values of bodies, contacts
-        and gravity; where steps became short, a load that
-        jumps or has a kink.
+        and gravity; if steps became short, a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
         if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
-            return (f"{load} jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`",) if load else ()
+            return (f"{load} jumps, or has a kink, at the last state: let it change within a short range, as "
+                "by `jnp.tanh`",) if load else ()
         if code == results.STICKS:
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
             return (load,) if load else ()
@@ -228,5 +231,6 @@ class Trajectory(Record, Printed):
         there.
         """
         if int(self.result) > results.EVENT:
-            raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
+            raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: "
+                f"{self.message}")
         return self

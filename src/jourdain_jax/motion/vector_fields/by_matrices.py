@@ -30,7 +30,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 class UsualLengths(eqx.Module):
-    """Usual lengths of the rows in scaled speeds, with their rank; and of geometric rows and quaternion norms in the coordinates."""
+    """Usual lengths of the rows in scaled speeds, with their rank; and those of geometric rows and quaternion
+    norms in the coordinates.
+    """
 
     rows: UsualRows
     closures: Float[Array, "closures"]
@@ -47,7 +49,9 @@ def usual_lengths(scene: Scene) -> UsualLengths:
 
 
 def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
-    """Return lengths of rows at states probed with numbers near the class's defaults; computed while the motion runs."""
+    """Return lengths of rows at states probed with numbers near the class's defaults. They are computed while
+    the motion runs.
+    """
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(12, known.random)
     t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
@@ -64,13 +68,15 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
 
 
 def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """Return the median over states, or the largest where half of them are zero; NaN does not count."""
+    """Return the median over states, or the largest value if half of them are zero; NaN does not count."""
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """Return the median over probed states; a thousand times as much where parameters are traced, so that only longer rates count as infinite."""
+    """Return the median over probed states. For traced parameters it is a thousand times that, so that only
+    far longer rates count as infinite.
+    """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
     lengths = jnp.nanmedian(jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0)
@@ -87,11 +93,13 @@ class ByMatrices(VectorField):
     cutoff: float | None = eqx.field(static=True)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     def now(self, inputs, t):
-        """Return the values of the inputs, with their own rates where rows depend on them."""
+        """Return the values of the inputs, and their rates where rows depend on them."""
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, at: Instant, u) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
-        """Return the motion with these speeds, its accelerations, and the eliminated rows that are nonlinear in the speeds."""
+        """Return the motion with these speeds, its accelerations, and the eliminated rows that are nonlinear
+        in the speeds.
+        """
         state = at.scene, at.t, at.y.q, u, at.inputs
         found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
         return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
@@ -187,7 +195,9 @@ class FullByMatrices(ByMatrices):
         return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, eliminated rows, and 1 where the rows decide on which branch the motion continues, -1 where round-off does."""
+        """Return `rates`, eliminated rows, and a number: 1 if the rows determine the branch of the motion, -1
+        if only round-off does.
+        """
         motion, found, directions = self.solved(at, at.y.v)
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
         watched = self.watched(at, motion, found, found.udot, branch.astype(at.y.q.dtype), directions)

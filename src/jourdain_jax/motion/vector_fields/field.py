@@ -38,14 +38,14 @@ _STATES = ("auto", "minimal", "full")
 class Formulation(eqx.Module):
     """The equations that `simulate` integrates. The default is chosen for the scene.
 
-    - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto" (default), the minimal one where the
-      privileged speeds are well conditioned over the scene's domain and the rows are linear or affine.
-    - `reduction`: how accelerations are found, a name or an object as in `accelerations` (default: the scene's scalar program where there is one).
-    - `stabilisation`: how start and state are kept on constraints that the integrated state does not
-      satisfy by
-      construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)` adds its
-      terms to
-      the constraints, for comparison; None does nothing.
+    - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto"
+      (default), the minimal one if the privileged speeds are well conditioned over the scene's domain and the
+      rows are linear or affine.
+    - `reduction`: the way to accelerations, a name or an object as in `accelerations` (default: the scene's
+      scalar program if there is one).
+    - `stabilisation`: the way to keep start and state on constraints that the integrated state does not
+      satisfy by construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)`
+      adds its terms to the constraints, for comparison; None does nothing.
 
     ValueError for anything else.
 
@@ -65,7 +65,8 @@ class Formulation(eqx.Module):
         check_name(self.state, _STATES, f"unknown state form `{self.state}`")
         stabilisation = self.stabilisation
         if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
-            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", `jj.Baumgarte(alpha, beta)` or None')
+            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", '
+                '`jj.Baumgarte(alpha, beta)` or None')
 
     @property
     def projects(self) -> bool:
@@ -93,8 +94,8 @@ def as_formulation(formulation) -> Formulation:
 
 
 def reason_for_matrices(structure: Structure, constant: bool) -> str:
-    """Return the reason why dense matrices are integrated for a scene with a scalar program; empty if the
-    program is used. `constant`: all inputs are.
+    """Return the reason why a scene with a scalar program is integrated by dense matrices; empty if the
+    program is used. `constant`: whether all inputs are constant.
     """
     if structure.rows_of_inputs and not constant:
         return "velocity rows with inputs that change with time need dense matrices"
@@ -115,13 +116,15 @@ class Integrated(eqx.Module):
 
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
-        """Return the state from these rows; `form`: with so many `coordinates` and, with them, `q_and_v`."""
+        """Return the state from these rows; `form` states how many of them are coordinates and speeds."""
         n, end = form.coordinates, form.q_and_v
         return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
 
 
 class Watched(NamedTuple):
-    """Rates; pivots that must keep their signs; directions of rows nonlinear in the speeds, which must not turn round; a sine, small near a loss of rank."""
+    """Rates; pivots that must keep their signs; directions of rows nonlinear in the speeds, which must not
+    turn round; a sine that is small near a loss of rank.
+    """
 
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
@@ -185,19 +188,23 @@ class VectorField(eqx.Module):
 
     @property
     def needs_pivot(self) -> bool:
-        """Whether a small pivot, or one that changes sign, ends a motion; a full state continues, with a
-        warning.
+        """Whether a motion ends where a pivot is small or changes its sign. With a full state it continues,
+        with a warning.
         """
         return True
 
     @property
     @abc.abstractmethod
     def has_pivots(self) -> bool:
-        """Whether steps in which some pivot changes its sign are tried again: in them the state, or a row that it is kept on, is lost."""
+        """Whether a step in which a pivot changes its sign is repeated. Within such a step the state, or a
+        row that constrains it, is lost.
+        """
 
     @property
     def near_rank_loss(self) -> bool:
-        """Whether `rates_and_pivots` says how far the rows, onto which steps are put back, are from losing rank."""
+        """Whether `rates_and_pivots` reports the distance from a loss of rank of the rows onto which steps
+        are projected.
+        """
         return False
 
     def fixed(self, scene: Scene) -> tuple:
@@ -214,8 +221,8 @@ class VectorField(eqx.Module):
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def stored(self, scene: Scene, t, q, inputs) -> Scalar:
-        """Return the energy stored in loads whose potential depends on inputs, J: with its change, the
-        integrated work is the work done.
+        """Return the energy (J) stored in loads whose potential depends on inputs. Integrated work plus the
+        change of this energy is the work done.
         """
         if not (self.with_work and self.of_inputs):
             return jnp.zeros((), q.dtype)
@@ -227,9 +234,10 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
-        """All speeds, and how well the privileged ones determine the others, with a sign that changes where they do not.
+        """Return all speeds, and a measure of how well the privileged ones determine the others. The measure
+        changes its sign where they do not determine them.
 
-        For the full state the second is that of its reduction, without a sign, and 1 where it has none.
+        For the full state the measure is that of its reduction, without a sign, or 1 if it has none.
         """
 
     def motion(self, at: Instant) -> Motion:
@@ -237,18 +245,24 @@ class VectorField(eqx.Module):
         return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
 
     def events(self, at: Instant) -> Float[Array, "events *lanes"]:
-        """Return values of the stop events, in the order of their names; lanes only where `lowers_events`."""
+        """Return values of the stop events, in the order of their names; for lanes only where
+        `lowers_events`.
+        """
         return event_values(at.scene, self.motion(at))
 
     def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
-        """As `event_resets` has them, of the speeds those that are integrated; lanes only where `lowers_events`."""
+        """Return the result of `event_resets` with the integrated speeds; for lanes only where
+        `lowers_events`.
+        """
         found = event_resets(at.scene, self.motion(at), self.of_inputs)
         every = range(len(at.scene.speed_names))
         left_out = [len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent]
         return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
-        """Contacts that switch at the start of a motion from (q, u): `switching.Begun` in one vector."""
+        """Return the switching contacts at the start of a motion from (q, u): `switching.Begun` as one
+        vector.
+        """
         return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
