@@ -60,7 +60,7 @@ FITS: dict[str, str] = {
     "run(values={'x': np.where(TS[4] == TS, np.inf, TS)}, sigma=1.0)": "infinite, the first at sample 4; give NaN",
     "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds only NaN",
     "jj.fit(cart, run(), 'mass', errors='hac')": "`errors` is 'hac', expected",
-    "jj.fit(cart, run(), 'mass', errors='runs')": "from how runs differ, but there are 1; give 5 or more",
+    "jj.fit(cart, run(), 'mass', errors='runs')": "from the differences between runs, but there are 1; give 5 or more",
     "jj.fit(cart, run(sigma={'x': None, 'x_rate': 1.0}), 'mass', loss=jj.huber())": "sigma of channel `x` is None, but a robust loss",
     "jj.fit(cart, [run(), run(sigma={'x': None, 'x_rate': 1.0})], 'mass')": "sigma of channel `x` is None in one run and given in another",
     "jj.log_likelihood(cart, run(sigma=None))": "sigma of channel `x` is None, but a likelihood needs",
@@ -135,7 +135,7 @@ SENSORS: dict[str, str] = {
     ),
     "jj.log_likelihood(cart, shown(gain=gain))": "`gyro.gain` is to be estimated, but a likelihood needs its value",
     "with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1))": "command of input `push` of run 0 of `Cart` ends at 1 s, before",
-    "with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0]))": "is sampled from 1700000000 to 1700000004 s, and the run is from 0 to 4 s, where it",
+    "with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0]))": "is sampled from 1700000000 to 1700000004 s, but the run is from 0 to 4 s, where the input",
     "jj.fit(cart, shown(), {'mass': jj.Estimate(per_run=True)})": "`free` asks for a `mass` of each run, but all runs share the scene",
     "jj.fit(cart, shown(), {'mass': jj.Estimate((1.0, 2.0))})": "first guess of `mass` has shape (2,), expected ()",
     "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.Sensor('x', gain=gain)}, inputs={'push': jj.Actuator(command, gain=gain)}))": (

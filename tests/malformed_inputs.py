@@ -317,7 +317,7 @@ STATES: dict[str, Case] = {
     "jj.sample_states(b, 0)": "`count` is 0, expected a whole number of states, at least 1",
     "jj.sample_states(b, 2.5)": "`count` is 2.5, expected a whole number of states",
     "jj.sample_states(b, 4, seed='x')": "`seed` is 'x', expected a whole number that is not negative",
-    "jj.derivative_exists(b, 0.0, two, two, 3, two)": "`direction` is an int, expected a change of every parameter, as a scene like `scene`: a",
+    "jj.derivative_exists(b, 0.0, two, two, 3, two)": "`direction` is an int, expected a",
     "jj.structure_of(Bead)": "`scene` is the class `Bead`",
     "jj.reductions(3)": "`scene` is an int, expected a scene: an instance of a subclass of `jj.Scene`",
     "jj.lower(3)": "`scene` is an int, expected a scene",
@@ -442,7 +442,7 @@ FILES: dict[str, Case] = {
     "jj.save(run, 3.5)": "`path` is a float, expected the name of a file",
     "jj.save(b, 'b.npz')": "`save` was given a Bead, expected a `Trajectory` from `jj.simulate`",
     "jj.save(lanes.lanes, 'lanes.npz')": (
-        "`save` takes one motion and was given a batch of shape (2,); save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
+        "`save` takes one motion, but was given a batch of shape (2,); for one axis of lanes, save `jj.Rollout(batch)`"
     ),
     "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; for a rollout give one "
     "lane: jj.animate(rollout.lane(0), 'lane-0.gif')",

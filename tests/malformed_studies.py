@@ -53,7 +53,7 @@ STUDIES: dict[str, str | tuple[str, str]] = {
     "by_radius.task(outputs={'a/b': jj.End('lean')})": "without `/`",
     "by_radius.task(outputs={'a\\\\b': jj.End('lean')})": "without `/`",
     "by_radius.task(outputs={'x': jj.End})": "expected an output",
-    "by_radius.task(outputs={'x': jj.Integral('lean')}, ts=[0.5, 1.0])": "`x` would leave out",
+    "by_radius.task(outputs={'x': jj.Integral('lean')}, ts=[0.5, 1.0])": "`x` would omit",
     "by_radius.run('x', outputs={'lane': jj.End('lean')})": "would name two arrays",
     "by_radius.run('x', outputs={'run': jj.End('lean')})": "would name two arrays",
     "by_radius.run('x', outputs={'radius': jj.End('lean')})": "would name two arrays",

@@ -70,7 +70,7 @@ def test_a_rollout_runs_fewer_lanes_at_once_where_its_model_has_little_memory(ca
 
 
 def test_too_little_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ValueError, match="`memory` allows 100 MB for each process that computes; this process holds"):
+    with pytest.raises(ValueError, match="`memory` allows 100 MB for each computing process, but this process holds"):
         run(tmp_path / "discs.zarr", memory="100MB")
     with pytest.raises(ValueError, match="a new process holds 240 MB before it begins"):
         run(tmp_path / "discs.zarr", memory="1GB", processes=4)

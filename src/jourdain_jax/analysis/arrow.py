@@ -185,8 +185,8 @@ def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[n
 
 
 def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the unknowns of a piece. Return the rows that express them by the shared unknowns and the
-    previous piece, and the remaining rows.
+    """Eliminate the unknowns of a piece. Return the rows that express these unknowns by the shared ones and
+    by those of the previous piece, and the remaining rows.
 
     `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """
@@ -231,8 +231,8 @@ def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cu
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """Make an arrow from the triangles of all runs; their first `local` columns belong to the runs' own
-    unknowns.
+    """Make an arrow from the triangles of all runs. The first `local` columns of a triangle belong to the
+    run's own unknowns.
     """
     members, runs, width, _ = triangles.shape
     rest = triangles[:, :, local:, local:]

@@ -28,8 +28,8 @@ SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
 def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Return, for each sample of a channel, the index of the previous sample that is not missing (its own
-    index if there is none), and the time since then, s.
+    """Return two arrays for a channel: the index of the previous sample that is not missing (the sample's own
+    index if there is none), and the time since that sample in s.
 
     The time is infinite for missing samples and where there is no predecessor. `weight` is zero where a
     sample is missing. Results have its shape.
@@ -55,8 +55,8 @@ def whitened(r, previous, rho):
 
 @dataclass(frozen=True)
 class Chains:
-    """The index of the previous sample for each sample in the residuals, for each member of runs of equal
-    structure.
+    """For each sample among the residuals, the index of the previous sample. There is one set for each member
+    of runs of equal structure.
     """
 
     before: Int[np.ndarray, "runs members samples"]
@@ -68,8 +68,8 @@ class Chains:
     def of(
         weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], unknown: list[slice]
     ) -> "Chains":
-        """Return the chains of samples of some channels, from weights (runs, members, times, *channel), times
-        (runs, times) and correlation times (runs,).
+        """Return the chains of samples of some channels. Shapes: weights (runs, members, times, *channel),
+        times (runs, times), correlation times (runs,).
         """
         parts, known, (runs, times) = [], [], ts.shape
         for name, where in channels.items():
@@ -93,7 +93,8 @@ class Chains:
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
-    """Return `log det(J'J) / 2` for unknowns divided by `size`; undetermined directions add a constant."""
+    """Return `log det(J'J) / 2` for unknowns divided by `size`. Each undetermined direction adds a constant.
+    """
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts
     members = len(size)
@@ -104,8 +105,8 @@ def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns
 
 
 def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the minimiser of f between a and b, for each member, by golden section: the interval shrinks to
-    7e-5.
+    """Return the minimiser of f between a and b, for each member, by golden section. The interval shrinks to
+    7e-5 of its length.
     """
     golden = (np.sqrt(5) - 1) / 2
     inner = [b - golden * (b - a), a + golden * (b - a)]
@@ -132,8 +133,8 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
 
 
 def log_density(r, weight, ts, tau) -> Scalar:
-    """Return `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`: the logarithm of the density of `r` in units of
-    sigma, without `log(sigma sqrt(2 pi))`, on JAX arrays.
+    """Return the logarithm of the density of `r` in units of sigma, without the term `log(sigma sqrt(2 pi))`:
+    `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`. It works on arrays of JAX.
 
     r, weight: (times, *channel); a weight of zero marks a missing sample.
     """

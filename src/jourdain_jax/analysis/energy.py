@@ -61,11 +61,10 @@ def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
 
 @of_known_numbers
 def energy_balance(scene: Scene) -> EnergyBalance:
-    """Find out whether T + V is conserved, and what changes it otherwise; powers as in eqs. (71)-(73).
+    """Find out whether T + V is conserved and, if not, what changes it. Powers are those of eqs. (71)-(73).
 
-    Judged at eight random admissible states with random inputs, where a power counts as zero below 1e-9 of
-    the largest power (1e-4 in
-    single precision). A DifferentiationModeError where numbers are traced.
+    Eight random admissible states with random inputs are examined. A power counts as zero below 1e-9 of the
+    largest power (1e-4 in single precision). Raises DifferentiationModeError where numbers are traced.
     """
     t, q, u = (jnp.asarray(x) for x in sample_states(scene, 8))
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))

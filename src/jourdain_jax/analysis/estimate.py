@@ -48,16 +48,16 @@ class Range:
     interval: float = 0.0  # h, s, of a memory
 
     def least_size(self, guess: float) -> float:
-        """Return the size of a change that counts as large for an unknown near zero: its typical change, or a
-        hundredth of the first guess or of the width of the range.
+        """Return the size of a change that counts as large for an unknown near zero: its typical change if
+        there is one, else a hundredth of the first guess or of the width of the range.
         """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
         return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
-        """Return another first guess for each `share` from 0 to 1. These cover the range between the bounds;
-        without bounds, a factor of five or a typical change to either side.
+        """Return another first guess for each `share` from 0 to 1. These guesses cover the range between the
+        bounds. Without bounds they cover a factor of five, or one typical change to either side.
         """
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
@@ -66,7 +66,7 @@ class Range:
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
-        """Return the part of the range at or above this number, which is zero or slightly more."""
+        """Return the part of the range that is not below this number, which is zero or slightly more."""
         return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
 
     def constrain(self, x: Numbers) -> Numbers:
@@ -120,8 +120,8 @@ def bounds(low: Number, high: Number) -> Range:
 
 
 def unbounded(scale: Number | None = None) -> Range:
-    """Let an unknown take any number, within the declared sign of a parameter. `scale`: a typical change, in
-    its unit; required if the first guess is zero.
+    """Let an unknown take any number; a parameter keeps its declared sign. `scale`: a typical change, in the
+    unit of the unknown. It is required if the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.
     """

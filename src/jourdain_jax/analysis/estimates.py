@@ -274,8 +274,9 @@ class Estimates(Printed):
 
     @property
     def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
-        """Return the covariance of the estimates in the order of `labels`, to first order; NaN where not
-        identifiable."""
+        """Return the covariance of the estimates in the order of `labels`, to first order; NaN for unknowns
+        that are not identifiable.
+        """
         return self.information.covariance
 
     @property
@@ -285,8 +286,9 @@ class Estimates(Printed):
 
     @property
     def reduced_chi_square(self) -> PerRepeat:
-        """Return the sum of squared residuals per degree of freedom, near 1 for a correct scene and correct
-        sigmas; NaN with as many unknowns as samples."""
+        """Return the sum of squared residuals per degree of freedom. It is near 1 for a correct scene and
+        correct sigmas, and NaN if there are as many unknowns as samples.
+        """
         return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
@@ -356,8 +358,9 @@ class Estimates(Printed):
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
         y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first
-        order (the delta method). A combination may have an interval although its parts cannot be told apart.
-        NaN where it depends on an undetermined direction, or on an unknown at its bound.
+        order (the delta method). A combination may have an interval even if its parts are not identifiable
+        one by one. The result is NaN if it depends on an undetermined direction, or on an unknown at its
+        bound.
 
         - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for
           `print`.
@@ -376,8 +379,8 @@ class Estimates(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """Return the parameters that follow from unknowns, by functions or possible inertias in `free`, in
-        the form of `derived`.
+        """Return the parameters that depend on unknowns through a function or through a possible inertia in
+        `free`, in the form of `derived`.
         """
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}

@@ -108,8 +108,8 @@ class Experiment(eqx.Module):
     def __check_init__(self):
         if not holds(lambda t0, ts: (t0 <= ts[0]) & (t0 < ts[-1]), self.t0, self.ts):
             raise ValueError(
-                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before "
-                f"the last ({self.ts[-1]} s); give an earlier `t0`"
+                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s) or is not "
+                f"before the last one ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the "
@@ -313,8 +313,8 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
     if isinstance(signal, Sampled) and not holds(overlaps, signal.ts, signal.values, run.ts, run.t0):
         first, last, begin, end = (f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1]))
         raise ValueError(
-            f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to "
-            f"{end} s, where it would be constant; take both from one clock, or give a number"
+            f"input `{name}` of {where} is sampled from {first} to {last} s, but the run is from {begin} to "
+            f"{end} s, where the input would be constant; take both from one clock, or give a number"
         )
 
 

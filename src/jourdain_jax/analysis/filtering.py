@@ -47,8 +47,8 @@ _NODES, _WEIGHTS = gauss_legendre(5)
 def filtered_log_likelihood(
     scene: Scene | BuiltFor, data: Data, *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
 ) -> Scalar:
-    """Return `log_likelihood` for a motion with process noise, by an extended Kalman filter: a rider or rough
-    ground disturbs the motion, not the sensor.
+    """Return the logarithm of the likelihood for a motion with process noise, by an extended Kalman filter.
+    Process noise disturbs the motion itself, as a rider or rough ground does.
 
     **Arguments**
     - `data`: one run or several. A start value is known, or a first guess with an
@@ -222,8 +222,8 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
 
 
 def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
-    """Return the scene's independent speeds, or those of a copy with another choice if they do not determine
-    the rest at a known start.
+    """Return the scene's independent speeds. If they do not determine the rest at a known start, return those
+    of a copy of the scene with another choice.
     """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)

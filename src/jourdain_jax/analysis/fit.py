@@ -50,7 +50,7 @@ class FitFields(OptionFields, total=False):
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     """Return the minimum from each `theta`. If there is none, or if residuals are far beyond their sigmas,
-    return the lower one of it and the minimum over growing spans.
+    fit over growing spans as well, and return the lower minimum.
 
     Over a short span a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
     begins at the end of the fit over the shorter span; unknowns that a short span does not determine stay
@@ -90,8 +90,8 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
 
 
 def with_memory(problem: Problem, found: Minimum) -> Minimum:
-    """Return the minimum with estimated correlation times of the noise: these and the unknowns are estimated
-    alternately, starting from white noise.
+    """Return the minimum with estimated correlation times of the noise. Correlation times and unknowns are
+    estimated alternately, starting from white noise.
     """
     if not problem.with_memory:
         return found
@@ -110,7 +110,7 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
 
 
 def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
-    """Return the minimum after moving unknowns off their bounds where that lowers it, and the statistics of
+    """Move unknowns off their bounds where that lowers the minimum. Return the minimum, and the statistics of
     the unknowns that stay at a bound.
     """
     for _ in range(20):
@@ -207,8 +207,8 @@ def fit_batch(
 
     Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and `by_name` as in `fit`.
 
-    **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
-    `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
+    **Returns** a `Fit` whose arrays have the leading axis. A repeat that fails, or has fewer samples than
+    unknowns, has `converged` False and does not affect the others. **Raises** as `fit`.
     """
     return _fit(_asked(scene, free, by_name, "fit_batch"), data, repeats=True)
 

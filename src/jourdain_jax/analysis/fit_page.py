@@ -116,7 +116,7 @@ Predictions = Sequence[dict[str, Prediction]]  # by run and channel
 def fit_page(
     fit: Estimates, fitted: Predictions, shares: Informed | None, held_out: Predictions, profiles: Mapping[str, Profile], units: Mapping[str, str]
 ) -> str:
-    """Return the page of a `Fit` of one experiment; `fitted` and `held_out`: predictions, `units`: of
+    """Return the page of a `Fit` of one experiment. `fitted`, `held_out`: predictions; `units`: units of
     channels.
     """
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]

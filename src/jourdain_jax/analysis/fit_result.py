@@ -116,15 +116,15 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return the distance of a mean square from 1 in standard deviations. Its cube root is nearly normal
-    (Wilson and Hilferty). `spread`: its standard deviation, near 1.
+    """Return the difference of a mean square from 1 in standard deviations, computed from its cube root,
+    which is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Return the size of the residuals of all channels with known sigmas, and that of each channel; under a
-    robust loss from medians.
+    """Return the size of the residuals of all channels with known sigmas, and the size for each of these
+    channels. Under a robust loss they come from medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
@@ -228,9 +228,9 @@ class Fit(Estimates):
         return warnings_of(self)
 
     def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
-        """Return profile likelihoods by name, of the unknowns in `names` (default: all that runs share): the
-        range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted again, "bounded",
-        "one-sided" or "flat". `data`: the runs of the fit.
+        """Return the profile likelihoods of the unknowns in `names` (default: all shared ones), by name. Each
+        gives the range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted again,
+        and whether it is "bounded", "one-sided" or "flat". `data`: the runs of the fit.
 
         This takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or
         errors="runs", the rise is scaled accordingly. Raises ValueError for a batch, a failed fit, and other

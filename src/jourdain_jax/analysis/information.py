@@ -43,8 +43,8 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Covariance in blocks, and undetermined directions (changes of theta / size). In a batch of fits all
-    arrays have a leading axis `members`.
+    """Covariance in blocks, and undetermined directions, as changes of theta divided by the sizes of its
+    entries. In a batch of fits all arrays have a leading axis `members`.
     """
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
@@ -160,8 +160,8 @@ def least_move(cutoff: float, largest):
 
 
 def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return orthonormal undetermined directions that leave held unknowns unchanged; `own`: V' of each run,
-    which may include determined directions.
+    """Return orthonormal undetermined directions that leave held unknowns unchanged. `own`: V' of each run,
+    which may also contain determined directions.
     """
     (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
     apart = np.zeros((len(runs), count, m))
@@ -173,8 +173,8 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
 
 
 def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Labels:
-    """Describe each undetermined direction in words. `directions`: orthonormal rows, changes of theta / size;
-    parts below `least_part` count as zero.
+    """Describe each undetermined direction in words. `directions`: orthonormal rows, each with changes of
+    theta divided by the sizes of its entries; parts below `least_part` count as zero.
 
     The basis is chosen (row-reduced form) so that each direction has one unknown of its own. Changes are
     relative, `d theta / theta`, where the unknown is not zero.
@@ -187,8 +187,8 @@ def hidden_combinations(directions, least_part, size, values, labels: Labels) ->
 
 
 def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels) -> str:
-    """Describe the direction in words. `power`: if an unknown occurs in a product of powers that stays
-    constant along all directions, its exponent.
+    """Describe the direction in words. `power`: the exponent of an unknown that occurs in a product of powers
+    which is constant along all directions, or None.
     """
     involved, close = np.flatnonzero(row), 0.01  # how far an exponent may be from a multiple of one half, and two changes from being equal
     if len(involved) == 1:
@@ -222,8 +222,8 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
 
 
 def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], shared: Float[np.ndarray, "*repeats shared"]):
-    """Return y and d y / d (shared unknowns), of one fit or of each fit of a batch. Raises ValueError where
-    the function does not return numbers.
+    """Return y and its derivatives with respect to the shared unknowns, of one fit or of each fit of a batch.
+    Raises ValueError where the function does not return numbers.
     """
 
     def of(shared):
@@ -250,8 +250,8 @@ def standard_errors(
     at_bound: Bool[np.ndarray, "*repeats shared"],
     cutoff: float,
 ) -> Float[np.ndarray, "*numbers"]:
-    """Return standard errors of numbers with these derivatives, which have a leading axis of repeats if the
-    information has.
+    """Return standard errors of numbers with these derivatives. Derivatives and results have a leading axis
+    of repeats if the information has one.
 
     They are NaN for numbers that depend on an undetermined direction or on an unknown at a bound.
     """

@@ -178,8 +178,8 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
-    """Return the program for a scene's instants, with these speeds constant or independent; `masses`: whether
-    it needs their mass matrix.
+    """Return the program that evaluates a scene at single instants, with these speeds constant or
+    independent. `masses`: whether the mass matrix of these speeds is needed.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
@@ -208,8 +208,8 @@ by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` if 
 
 
 def on_rows(scene: Scene) -> np.ndarray:
-    """Return the coordinates on which geometric rows and unit norms depend at some probed state. Other
-    coordinates in their graph cancel.
+    """Return the coordinates on which geometric rows and unit norms depend at some probed state. Coordinates
+    that cancel there are omitted, even if they occur in the graph.
     """
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 

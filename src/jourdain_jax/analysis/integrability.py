@@ -134,11 +134,11 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
 
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
     """Return the growth vector of the admissible velocities at generic states, from brackets of at most
-    `depth` fields, and whether it is closed: longer brackets add nothing, or all dimensions are reached. It
+    `depth` fields, and whether it is closed (longer brackets add nothing, or all dimensions are reached). It
     is empty for rows nonlinear in the speeds.
 
-    The larger result of two random states counts. A bracket is a new direction if it adds more than 1e-6
-    (1e-2 in single precision) of the terms of which it consists.
+    The larger of the results at two random states counts. A bracket is a new direction if its new part
+    exceeds 1e-6 (1e-2 in single precision) of the terms of which it consists.
     """
     structure = structure_of(scene)
     if not structure.affine:
@@ -180,8 +180,8 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
-    """Extend an orthonormal basis by those of the values that are independent of it, largest first. Return
-    the basis and their indices.
+    """Extend an orthonormal basis by the vectors among the values that are independent of it, largest first.
+    Return the basis and the indices of these vectors.
     """
     chosen: list[int] = []
     while len(chosen) < len(values):
@@ -235,8 +235,8 @@ def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> 
 
 
 class _Fields:
-    """The generators `X` as columns over q, or over (t, q) with `(1, X_0)` first if they depend on time, and
-    their derivatives.
+    """The generators `X` as columns over q, and their derivatives. Generators that depend on time are columns
+    over (t, q), with `(1, X_0)` first.
     """
 
     def __init__(self, scene: Scene, with_time: bool, u):

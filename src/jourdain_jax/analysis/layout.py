@@ -338,6 +338,7 @@ class Layout:
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:
-        """Return names and indices of the unknowns of a kind, in the vectors of shared unknowns and of a run.
+        """Return names of the unknowns of a kind, with their indices in the vectors of shared unknowns and of
+        a run.
         """
         return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)

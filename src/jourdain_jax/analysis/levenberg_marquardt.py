@@ -119,8 +119,8 @@ class Minimum(ByMember):
 
 
 def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and derivatives of the members with these
-    numbers; `what`: the name of the objective in the trace.
+    """Minimise from `theta`. `evaluate(theta, members)`: returns value and derivatives for the members at
+    these numbers; `what`: the name of the objective in the trace.
     """
     way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta))), what)
     full = np.ones(len(theta))

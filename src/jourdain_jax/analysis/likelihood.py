@@ -46,8 +46,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Labels:
-    """Return one sentence for each oddity of `checked` runs; traced numbers are not examined. `repeats`:
-    values have a leading axis, of which the first entry counts.
+    """Return one sentence for each oddity of `checked` runs. Traced numbers are not examined. `repeats`:
+    values have a leading axis, of which only the first entry is examined.
     """
     found: list[str] = []
     for index, run in enumerate(runs):
@@ -135,8 +135,8 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
-    """Return the channels whose value is unknown. Raises ValueError for a channel whose value is None in one
-    run and given in another.
+    """Return the channels whose value is None, which means that it is estimated. Raises ValueError for a
+    channel whose value is None in one run and given in another.
     """
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:

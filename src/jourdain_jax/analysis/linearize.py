@@ -115,8 +115,9 @@ class Linearization(Printed, eqx.Module):
         return Modes(values, shapes, left, condition, self.about[0], names)
 
     def sensitivities(self, mode: str, held: str | Labels = (), names: Labels | None = None) -> Sensitivities:
-        """Return derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every
-        parameter, as machine code: `small.sensitivities("weave")["c"]`.
+        """Return derivatives of a mode's eigenvalue with respect to every parameter:
+        `small.sensitivities("weave")["c"]`. Of a pair, the eigenvalue above the real axis is taken. Machine
+        code computes the derivatives.
 
         The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep
         their values, as many as there are freedoms among neighbouring steady motions; default: speeds in the
@@ -330,6 +331,6 @@ def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     raise ValueError(
         f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the "
         f"privileged speeds of `{type(scene).__name__}` "
-        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates, or give "
-        "`privileged` speeds that contain their rates"
+        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates whose "
+        "rates are privileged, or give `privileged` with the rates of these coordinates"
     )

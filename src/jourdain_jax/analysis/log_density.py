@@ -114,8 +114,8 @@ class LogDensity(eqx.Module):
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):
             off = int(np.argmin(np.isfinite(x)))
-            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound "
-                "of it; give a value inside")
+            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound; "
+                "give a value between the bounds")
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
     def scene_at(self, z: Point) -> Scene:

@@ -51,7 +51,7 @@ class _Standing(ByMember):
 
 class Piecewise(Problem):
     """The problem of whole runs, computed in pieces. `pieces`: the same problem with the states at the joints
-    as further unknowns.
+    as additional unknowns.
     """
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
@@ -213,7 +213,9 @@ class Piecewise(Problem):
         return max(where.stop for where in self.group_of[run].channels.values()), self.own + self.shared + 2
 
     def change(self, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
-        """Return the change of all residuals by a step that closes the gaps, |J d + g|, in units of sigma."""
+        """Return the size of the change of all residuals, |J d + g| in units of sigma, by a step d that also
+        closes the gaps.
+        """
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
         for (b, member), run in itertools.product(enumerate(members.tolist()), range(len(self.runs))):
@@ -230,8 +232,8 @@ class Piecewise(Problem):
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
-        """Return the largest factor by which small changes of the unknowns grow from the first joint on, in
-        sizes of states and unknowns.
+        """Return the largest factor by which small changes of the unknowns grow after the first joint,
+        measured in the sizes of states and unknowns.
         """
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
@@ -240,7 +242,9 @@ class Piecewise(Problem):
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """Return a context in which unknowns may be tried anywhere; afterwards the pieces are as before."""
+        """Return a context in which the objective may be evaluated at other unknowns. When it is left, the
+        pieces are as before.
+        """
         kept = self.at.of(np.arange(len(self.at.theta)))
         yield
         self.at = kept

@@ -187,8 +187,8 @@ class Problem:
         return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
 
     def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
-        """Return the minimum over all unknowns but one, which is held at this value, to one per cent of a
-        standard error.
+        """Return the minimum over all unknowns but one, which is held at this value. It is accurate to one
+        per cent of a standard error.
         """
         unknowns, control, fixed = self.unknowns, self.asked.control, self.unknowns.fixed.copy()
         begin = np.clip(theta, unknowns.low, unknowns.high)
@@ -357,8 +357,8 @@ class Problem:
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
-    """Return [J r] from [J g r], for pieces of a run that do not join yet: g is the first-order change of r
-    when they join.
+    """Return [J r] from [J g r] for pieces of a run that do not join yet. g is the first-order change of r
+    when they are joined.
     """
     if rows.shape[-1] == unknowns + 1:
         return rows

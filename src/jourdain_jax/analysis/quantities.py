@@ -121,7 +121,8 @@ class Instrument(eqx.Module):
 
 
 class Accelerometer(Instrument):
-    """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2, at rest upwards by g.
+    """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2. At
+    rest it is g upwards.
 
         imu = jj.Sensor(jj.Accelerometer("frame", (0.3, 0.0, 0.1)), bias=jj.Estimate((0.0, 0.0, 0.0)))
         jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2

@@ -31,10 +31,12 @@ class Report(Printed):
     """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)`
     shows a table.
 
-    Row by row and taken together: eqs. (5)-(9), Frobenius; privileged velocities (25)-(31); cyclic coordinates (42).
+    Integrability of rows, one by one and taken together: eqs. (5)-(9) and Frobenius' theorem. Privileged
+    velocities: (25)-(31). Cyclic coordinates: (42).
 
-    A cyclic coordinate is one whose rate is not privileged and on which no equation depends. A coordinate that the Lagrangian of a system without rows
-    does not contain, whose momentum is conserved, is ignorable here: no acceleration depends on it.
+    A cyclic coordinate is one whose rate is not privileged and on which no equation depends. An ignorable
+    coordinate is one on which no acceleration depends; in a system without rows this includes every
+    coordinate that the Lagrangian does not contain.
     """
 
     scene: str

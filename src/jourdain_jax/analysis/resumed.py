@@ -181,7 +181,7 @@ class Informed:
 
     def half(self, unknown: int) -> tuple[int, float, float]:
         """Return the run with most information on an unknown, and the shortest time span (first and last
-        sample) that holds half of that information.
+        sample) that holds half of this run's information.
         """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
@@ -193,8 +193,8 @@ class Informed:
 
 
 def informed(problem: Problem, found: Minimum, most: int) -> Informed:
-    """Return the shares of information for the first `most` unknowns that have a standard error, from the
-    sigmas alone, without factors for the loss or for estimated sigmas.
+    """Return the shares of information for the first `most` unknowns that have a standard error. They follow
+    from the sigmas alone, without factors for the loss or for estimated sigmas.
     """
     unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
     known = information(at.arrow, unknowns.sizes(theta), unknowns.estimated, unknowns.reached(theta), ~found.going, problem.asked.control.cutoff).only()
@@ -241,7 +241,7 @@ class Profile(Printed):
 
 def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
     """Return profiles of the named unknowns. `errors`: standard errors by name, for the first step;
-    `inflation`: the divisor of the rise.
+    `inflation`: the number by which the rise is divided.
     """
     unknowns, found = problem.unknowns, {}
     for name in names:

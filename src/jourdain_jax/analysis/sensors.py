@@ -47,11 +47,11 @@ Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
 
 def intervals(t0, ts: Times, node) -> int:
-    """Return the number of equal intervals from the start to the last sample: those of the samples if these
-    are equal; otherwise enough that none is longer than the samples' median interval.
+    """Return the number of equal intervals from the start to the last sample. Equally spaced samples keep
+    their own intervals; otherwise no interval is longer than the median interval of the samples.
 
-    For traced times only their number is known; then there are two intervals for each sample. For a piece of
-    a run the result counts intervals up to the next `node`, after which the grid continues.
+    For traced times only the number of samples is known; there are then two intervals for each sample. For a
+    piece of a run, intervals are counted up to the next `node`, after which the grid continues.
     """
     if is_traced((t0, ts)):
         return max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
@@ -63,8 +63,9 @@ def intervals(t0, ts: Times, node) -> int:
 
 
 def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
-    """Return `count` intervals up to the last sample. For a piece they extend by at most one more, so that
-    its next `node` is a time of the grid."""
+    """Return the grid of `count` intervals up to the last sample. For a piece it extends by at most one more
+    interval, so that the next `node` is one of its times.
+    """
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
     xp = array_module((t0, end))
@@ -95,8 +96,8 @@ def read(
     lag=None,
     begin: Float[Array, "entries"] | None = None,
 ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"]]:
-    """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s, six or more, at
-    equal intervals), and y there; `lag` None: no lag.
+    """Return the reading at `ts`, and y on the grid, of a quantity with these `values` at the times `grid`
+    (s; six or more, equally spaced). `lag`: None for no lag.
 
     Times before the grid count as its first time. `delay`, `lag` in s. `begin`: the initial output of the
     filter; None: it starts at rest.
@@ -146,8 +147,9 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
 
 
 def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
-    """Return the knots of a command that keeps each value until the next one. A change takes a thousandth of
-    the shortest interval, and its middle is at the stated time."""
+    """Return the knots of a command that keeps each value until the next one. Each change takes a thousandth
+    of the shortest interval; the middle of the change is at the stated time.
+    """
     half = 0.5e-3 * jnp.min(jnp.diff(ts))
     late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
     return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
@@ -377,8 +379,9 @@ class Drive(Response):
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
-    """Return the numbers of a sensor (first guesses for estimated ones), names of the estimated ones, and
-    names of all that have an effect."""
+    """Return the numbers of a sensor (first guesses for estimated ones), the names of the estimated ones, and
+    the names of all numbers that have an effect.
+    """
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}

@@ -103,7 +103,7 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
     if pieces is not None:
         if pieces > count:
             raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces of at least "
-                f"one interval; give at most {count}")
+                f"one interval each; give at most {count} pieces")
         return np.round(np.linspace(0, count, pieces + 1)).astype(int)
     at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
     after = np.clip(np.searchsorted(ts, at), 1, count)
@@ -119,8 +119,8 @@ def numbers_of_filters(run: Experiment) -> int:
 def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
     """Return, for each channel, the first sample that belongs to each piece, and one past the last sample.
 
-    A sample at a joint belongs to the later piece. With a delayed sensor it belongs to a later piece only if
-    that began at least the largest delay before it.
+    A sample at a joint belongs to the later piece. With a delayed sensor, a sample belongs to a later piece
+    only if that piece began at least the largest delay before the sample.
     """
     ts, found = np.asarray(run.ts, float), {}
     for name in run.values:

@@ -210,7 +210,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """Return the fraction of the largest singular value below which others count as zero. It is smaller if
-    the largest has grown along the motion and the others have not.
+    """Return the fraction of the largest singular value below which other singular values count as zero. The
+    fraction is smaller if the largest has grown along the motion and the others have not.
     """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

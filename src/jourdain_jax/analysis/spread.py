@@ -83,8 +83,8 @@ class Side(NamedTuple):
 
 
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
-    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1) until F has
-    risen by `end`, from a distance `first` on.
+    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1), from a distance
+    `first` on, until F has risen by `end`.
 
     All other unknowns start from their values at the previous point. The end is found by the secant method
     for the square root of the rise, which is nearly linear.
@@ -172,8 +172,8 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
 
 
 def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
-    """Return the intervals of the first member that are too narrow, by name. They are too narrow where the
-    squares rise less than `errors`, the standard errors of all free unknowns, predict.
+    """Return the intervals of the first member that are too narrow, by name. An interval is too narrow if the
+    squares rise less than predicted by `errors`, the standard errors of all free unknowns.
 
     The ends of the intervals of shared unknowns are tested where an interval reaches a bound, or where an
     unknown may leave its bound.
@@ -228,9 +228,9 @@ class NoiseLevels:
 
 
 def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
-    """Return sigmas and their statistics at theta. `told_by`: returns the information of an arrow; `of_loss`:
-    returns the factor by which a loss multiplies variances, from the residuals of one member and the number
-    of unknowns that they determined.
+    """Return sigmas and their statistics at theta. `told_by`: returns the information of an arrow. `of_loss`:
+    returns the factor by which a loss multiplies variances; its arguments are the residuals of one member and
+    the number of unknowns that they determined.
     """
     members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
     known = told_by(at.arrow)

@@ -169,15 +169,15 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     They have none where the change makes dependent rows independent: `(1 - A A+) dA (1 - A+ A)` is not zero.
 
     **Arguments**
-    - `direction`: the change of every parameter, as a scene like `scene` (zeros for constant ones); `dq`: the
-      change of the coordinates.
+    - `direction`: an object of the scene's class whose fields hold the change of each parameter (zero for
+      constant ones); `dq`: the change of the coordinates.
     - `inputs`: values of the scene's inputs (default: zero).
 
     It needs numbers and does not run under jit or vmap.
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
-        raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a "
-            f"scene like `scene`: a `{type(scene).__name__}`")
+        raise ValueError(f"`direction` is {described(direction)}, expected a `{type(scene).__name__}` whose "
+            "fields hold the change of each parameter")
     A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene))
     if A.size == 0:
         return True
@@ -200,7 +200,7 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
 
 def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int) -> list[Check]:
     """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
-    the coordinates, free in the speeds, and relative in the parameters.
+    the coordinates, arbitrary in the speeds, and relative to the values in the parameters.
 
     Returns None where no reduction applies.
     """

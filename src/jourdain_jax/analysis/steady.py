@@ -64,8 +64,8 @@ def steady(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> SteadyMotion:
-    """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, with motion only in coordinates that
-    do not matter.
+    """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`. Only coordinates without influence on
+    accelerations move.
 
         steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
 

@@ -35,8 +35,8 @@ def perturbed_names(scene: Scene) -> Labels:
 
 
 def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]]:
-    """Return S and B of `dq = E ds`, `E = S + B q`: the identity for plain coordinates, half the product with
-    a turn for quaternions.
+    """Return S and B of `dq = E ds` with `E = S + B q`. For plain coordinates E is the identity; for a
+    quaternion `E ds` is half its product with the small rotation ds.
 
     For a unit quaternion the inverse of `x -> q x` is its transpose: `ds = (S + 4 B q)' dq`.
     """
@@ -75,7 +75,7 @@ def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "i
 
 
 def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
-    """Return the smallest singular value of the dependent part of rows, each of unit length; no derivative.
+    """Return the smallest singular value of the dependent part of rows of unit length. It has no derivative.
     """
     xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
     if xp is np and not np.all(np.isfinite(block)):

@@ -72,7 +72,8 @@ class Unknowns:
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
-        """Return the first guess, and others on a Latin hypercube over the ranges. They are always the same.
+        """Return the first guess, and others on a Latin hypercube over the ranges. Every call returns the
+        same ones.
         """
         theta = np.tile(self.guess, (count, 1))
         if count == 1:
@@ -110,13 +111,13 @@ def unknowns_of(
     scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | "
         "Callable | None] | Iterable[str]", apart: bool = False
 ) -> Unknowns:
-    """Return the unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
+    """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
 
     A parameter that is a function of the scene in `free` is no unknown: it follows from the others (`ties`).
     The unknowns of a single run count as shared unless `apart`.
 
-    Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
-    and where nothing is free.
+    Raises ValueError for unknown names, for guesses outside their bounds, for a parameter with a value per
+    run, for an estimate that runs share but state differently, and where nothing is free.
     """
     parameters = {name: about for name, _, about in parameters_of(scene)}
     shared: list[tuple[str, Kind, _Entry]] = []
@@ -176,8 +177,8 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """Return a range that ends at zero, since the scene has no motion below it; if it has none at zero
-    either, the range ends slightly above. Raises ValueError for a guess below zero.
+    """Return a range that begins at zero, since the scene has no motion below zero. If it has none at zero
+    either, the range begins slightly above. Raises ValueError for a guess below zero.
     """
     if np.any(entry.guess < 0):
         raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared "

@@ -60,13 +60,13 @@ def verify(
     applies (no inertia along a free direction), there are no gradients to check, and the verification fails.
 
     **Arguments**
-    - `state`: on the constraints, from `start` or `consistent`, or named values as for `start` (default: the scene's example, or a random state of its
-      domain, where it has none); generic, for a symmetric one hides errors.
+    - `state`: a state on the constraints, from `start` or `consistent`, or named values as for `start`.
+      Default: the scene's example, otherwise a random state of its domain. Symmetric states may hide errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
-    - `seed`: of that state, and of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the
-      speeds, relative in the parameters; the Gibbs-Appell reduction is omitted from them. Parameters that
-      split rows which are dependent have no
-      derivative there and are omitted, with a note (`derivative_exists`).
+    - `seed`: of the random state and of the random directions for derivatives. Directions are admissible in
+      the coordinates, arbitrary in the speeds and relative in the parameters. The Gibbs-Appell reduction is
+      not differentiated. Parameters that would make dependent rows independent have no derivative and are
+      omitted, with a note (`derivative_exists`).
 
     **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a
     DifferentiationModeError where numbers are traced.

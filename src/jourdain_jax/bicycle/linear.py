@@ -30,8 +30,8 @@ def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
 
 
 def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
-    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Runs under jit and
-    vmap.
+    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. It works under jit
+    and vmap.
     """
     return _matrices({name: jnp.asarray(value) for name, value in values.items()})
 

@@ -53,8 +53,8 @@ class MeasuredBicycle:
 
     @property
     def prior(self) -> dict[str, Normal]:
-        """Distributions of the measured parameters for `jj.Study(bicycle.scene, vary=bicycle.prior)`:
-        independent, without parameters that have no sigma.
+        """Independent distributions of the measured parameters, for `jj.Study(bicycle.scene,
+        vary=bicycle.prior)`. Parameters without a sigma are omitted.
         """
         return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
 

@@ -22,7 +22,7 @@ PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
     """Return the conditions that make a bicycle impossible, each as a sentence, with marks of the values that
-    violate it (NaN does).
+    violate it. NaN counts as a violation.
 
     **Arguments:** `values`: number, or array of samples of one common shape, for every name of
     `PARAMETER_NAMES`. **Returns:** sentence -> True where the values break it.

@@ -179,8 +179,8 @@ def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
 
 
 def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return two polynomials in x (defined in the module's head): zero where two eigenvalues sum to zero, and
-    zero where two coincide.
+    """Return two polynomials in x (defined in the module's head). The first is zero where two eigenvalues sum
+    to zero, the second where two eigenvalues coincide.
     """
     b4, b3, b2, b1, b0 = _coefficients(matrices)
     x = jnp.array([1.0, 0.0], b0.dtype)

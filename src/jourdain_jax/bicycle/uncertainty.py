@@ -42,8 +42,8 @@ class Interval(eqx.Module):
 
 
 def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
-    """Draw `count` bicycles from normal distributions with the measured values and their covariance, or
-    independent with their sigmas if there is none.
+    """Draw `count` bicycles from a normal distribution with the measured values and their covariance. If
+    there is no covariance, parameters are independent, with their sigmas.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())

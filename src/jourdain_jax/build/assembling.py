@@ -38,7 +38,8 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
     """Return configurations near q on the rows. `look(q[k], k)` returns residuals and slopes of the rows at
     the states with indices k; slopes are the nonzero entries of a sparse matrix.
 
-    `generic` states that find no place inside the domain start again elsewhere, up to `tries` times.
+    Configurations of `generic` states that end outside the domain are tried again from elsewhere, up to
+    `tries` times.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
     # where configurations lie anywhere in the domain: on the rows a row may be of no length at all

@@ -300,10 +300,10 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return fault -> whether the scene has it, at this state or (`elsewhere`) with the coordinates of
-    `others`.
+    """Return for each fault whether the scene has it, at this state or, for faults of the kind `elsewhere`,
+    with the coordinates of `others`.
 
-    Also under jit and vmap. NaN is no fault.
+    It works under jit and vmap. NaN is no fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)

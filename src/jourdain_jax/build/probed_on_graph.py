@@ -152,7 +152,8 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     """Return whether these velocity rows are combinations of the others wherever positions satisfy the
     geometric rows, at generic parameters.
 
-    `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side.
+    The rows satisfy `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` if the residual of least squares is at most the
+    round-off of either side.
     """
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced

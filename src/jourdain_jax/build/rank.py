@@ -100,8 +100,8 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Return the coefficients of the rows `rest` in row s, each in its typical length, at states of full
-    rank; infinite where they do not determine it.
+    """Return the coefficients that express row s by the rows `rest` at states of full rank, with rows in
+    units of their typical lengths. They are infinite where `rest` does not determine row s.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)

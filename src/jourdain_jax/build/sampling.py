@@ -20,7 +20,7 @@ NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
 class NoStateFoundError(ValueError):
-    """No state in a scene's domain lies on its geometric rows with rows that are numbers."""
+    """Raised where no state in a scene's domain satisfies the geometric rows and has rows without NaN."""
 
 
 @of_known_numbers
@@ -28,8 +28,8 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     """Return at most `count` random admissible states (t, q, u) from the scene's domain, on the constraints,
     each with a leading axis of states.
 
-    `seed`: of the generator. Raises ValueError where no state satisfies the geometric rows, or rows are
-    numbers at none; DifferentiationModeError where the scene's parameters are traced.
+    `seed`: of the generator. Raises ValueError where no state satisfies the geometric rows, or where rows are
+    NaN at all such states; DifferentiationModeError where the scene's parameters are traced.
     """
     scene = as_scene(scene)
     checked_whole(count, "`count`", 1, expected="of states, at least 1")
@@ -107,8 +107,8 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the "
             f"geometric rows by {np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer "
             "to an assembled configuration, or an `example` on the rows, or check the geometric rows against "
-            "each other (traced parameters were replaced by numbers near their defaults, or near one without "
-            f"a default: give defaults near the values in use){nowhere}"
+            "each other (traced parameters were replaced by numbers near their defaults, or near 1 if there "
+            f"is no default: give defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
     # with fewer than 8 random states inside the domain, those nearest to it are used as well

@@ -102,8 +102,9 @@ class Structure:
 
     @property
     def rows_may_contradict(self) -> bool:
-        """Return whether constraints are redundant and prescribe motion even at rest. Then the omitted ones
-        do not automatically follow from the others."""
+        """Return whether constraints are redundant and prescribe motion even at rest. The omitted constraints
+        then do not necessarily follow from the others.
+        """
         return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
 
     @property
@@ -368,8 +369,8 @@ class Reference:
     share one program. So the arguments of a call determine what it runs, not the order of calls. Parameters
     that are already traced are replaced by the class's defaults.
 
-    `varied`: names of parameters that differ between lanes (None: all); numbers near them replace these, so
-    that coincidences do not count.
+    `varied`: names of parameters that differ between lanes (None: all). They are replaced by numbers nearby,
+    so that coincidences do not count.
     """
 
     def __init__(self, scene: Scene, varied: Iterable[str] | None = None):

@@ -103,8 +103,8 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """Return the derivative for a batch. Each argument has its batch axis where stated; tangents have it
-    first.
+    """Return the derivative for a batch. Each argument has its batch axis at the stated place; tangents have
+    it first.
     """
     transposed = own.transposed
 
@@ -177,8 +177,8 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """A linear map, in both modes: x has the form of `leaves`, its value that of `found`, with numbers at the
-    `places`.
+    """A linear map for forward and reverse mode. Its argument has the form of `leaves`, its value the form of
+    `found`, with numbers at the `places`.
     """
 
     rates: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves and of their tangents: tangents of numbers
@@ -330,8 +330,8 @@ def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -
 
 
 def with_rules(run: Callable, rules: Rules) -> Callable:
-    """Return `run`, which JAX cannot differentiate, with derivatives by rules, in both modes and to the
-    second order.
+    """Return `run`, which JAX cannot differentiate, with derivatives by rules, for forward and reverse mode
+    and to the second order.
 
     It takes trees of arrays and of other objects, and returns trees of arrays.
     """

@@ -48,8 +48,8 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 
 
 def parts_of_scan(equation) -> tuple[int, int]:
-    """Return the numbers of constant and of carried inputs of a scan. These have equal axes inside and
-    outside its body, all others one less.
+    """Return the numbers of constant and of carried inputs of a scan. These inputs have the same axes inside
+    the body as outside; all others have one axis less inside.
 
     The names of these parameters differ between versions of JAX.
     """

@@ -49,11 +49,12 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
 
 
 def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = MappingProxyType({})) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package, given its globals, for names that its source imports under a condition.
+    """Return `__getattr__` and `__dir__` of a package with these globals. On first use they import the names
+    that the source imports under a condition only.
 
-    `gone`: names that there were once -> what serves now.
+    `gone`: former names -> their replacements.
 
-    A name is looked up once: from then on it is a global of the package as any other.
+    A name is looked up once; from then on it is an ordinary global of the package.
     """
     conditions = [statement for statement in ast.parse(Path(package["__file__"]).read_text("utf-8")).body if isinstance(statement, ast.If)]
     imports = [line for condition in conditions for line in condition.body if isinstance(line, ast.ImportFrom)]

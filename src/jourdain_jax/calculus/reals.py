@@ -100,8 +100,7 @@ def _of_jax(x) -> Array:
         # without a type, JAX compiles a program for each shape of NumPy's arrays
         return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if isinstance(x, np.ndarray) and x.dtype.kind == "f" else None)
     except OverflowError:
-        raise ValueError("an integer is larger than all floating-point numbers, expected real "
-            "numbers") from None
+        raise ValueError("an integer is too large for a floating-point number; give a smaller one") from None
 
 
 def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is "
@@ -170,7 +169,7 @@ def checked_whole(value, what: str, low: int, high: int | None = None, *, expect
 
 
 def holds(condition: Callable, *numbers) -> bool:
-    """Return whether a condition holds for all numbers; it counts as holding for traced ones."""
+    """Return whether a condition holds for all numbers. Traced numbers count as satisfying it."""
     return is_traced(*numbers) or bool(np.all(condition(*map(np.asarray, numbers))))
 
 
@@ -202,7 +201,9 @@ def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None
 
 
 def check_kind(value, kind, what: str, expected: str) -> None:
-    """Raise a ValueError that describes a `value` which is no instance of this `kind`, a class or a union of classes."""
+    """Raise a ValueError that describes the `value`, unless it is an instance of `kind`, a class or a union
+    of classes.
+    """
     if not isinstance(value, kind):
         raise ValueError(f"{what} is {described(value)}, expected {expected}")
 

@@ -109,7 +109,7 @@ class Search(eqx.Module):
 
 def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
     """Search for x near `guess`, between `low` and `high`, at which no residual exceeds the `tolerance`;
-    otherwise end at the smallest residual. J is per size of an unknown.
+    otherwise end at the smallest residual. J has derivatives with respect to x in units of `size`.
 
     `rows`: x -> f and J. `size`: the unit of the steps of each unknown; zero for a held one. Rows should be
     of order one where unknowns change by their size.
@@ -244,8 +244,8 @@ def nearest_root(
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
     1 + |x|, infinite where they are NaN.
 
-    `solve`: from G and g to the shortest d with G d = g. No step exceeds `longest` in an entry or leaves the
-    bounds `within`.
+    `solve`: returns the shortest d with G d = g, from G and g. No step exceeds `longest` in an entry or
+    leaves the bounds `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):

@@ -59,7 +59,7 @@ def quotient(x, y):
 
 
 def root(x):
-    """Return the square root of a. Its derivative is 1/(2 sqrt(a)); as a bound on errors, twice this holds
+    """Return the square root of a. Its derivative is 1/(2 sqrt(a)); twice this derivative bounds the error
     even if a is smaller than its own error.
     """
     a, ea = halves(x)

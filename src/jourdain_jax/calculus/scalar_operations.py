@@ -61,8 +61,8 @@ def _smaller(g, n, a, b, da, db):
 
 
 def _halved_where_equal(g, a, b, otherwise, da, db):
-    """Return half of either derivative where both are equal, as JAX does: max(x, 0) - max(-x, 0) is smooth at
-    x = 0.
+    """Return half of each derivative where both arguments are equal, as JAX does: max(x, 0) - max(-x, 0) is
+    smooth at x = 0.
     """
     return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
 

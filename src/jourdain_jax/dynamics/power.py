@@ -75,8 +75,8 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 
 
 def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Scalar:
-    """Return the integrand of the work, in W: the power, in which forces of the loads `of_inputs` replace
-    their potentials.
+    """Return the integrand of the work, in W: the power of the loads. For the loads `of_inputs`, forces count
+    in place of potentials.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. Their stored energy
     (`stored_by_inputs`) is added to the integral.

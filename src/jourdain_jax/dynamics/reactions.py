@@ -135,12 +135,12 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     needs to roll without slip.
 
     The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the
-    multiplier of the height row. With `height="coordinates"` it comes from Newton's equations (row S1),
-    forces and moments, of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)` and its
-    moment, over all contacts of these bodies. If these do not determine it (four wheels on a plane), it has
-    minimum norm and is marked as not determined. So is a share where moments remain that no contact can exert
-    (a guide keeps a robot level). Forces on speeds (`generalized_force`) are assumed to have no resultant
-    force or moment on these bodies.
+    multiplier of the height row. With `height="coordinates"` it follows from the balance of forces and
+    moments (row S1) of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)`, and the same
+    for moments; the sum on the left is over all contacts of these bodies. If the balance does not determine
+    it (four wheels on a plane), the normal force has minimum norm and is marked as not determined. It is also
+    marked if a moment remains that no contact can exert, such as that of a guide that keeps a robot level.
+    Forces on speeds (`generalized_force`) are assumed to have no resultant force or moment on these bodies.
     """
     motion = motion_at(scene, t, q, u, inputs)
     contacts = contacts_of(scene, motion.pose())

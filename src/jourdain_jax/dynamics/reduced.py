@@ -114,7 +114,7 @@ def dependence(scene: Scene) -> Dependence:
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
     """Return, for each entry and coordinate, whether the entry changes with it at any state. Values have
-    shape (states, 1 + coordinates, entries); the first are without displacement.
+    shape (states, 1 + coordinates, entries); index 0 of the second axis is without displacement.
     """
     size = np.max(np.abs(values), initial=np.finfo(values.dtype).tiny)
     limit = DEPENDS if values.dtype == np.float64 else 1e-4

@@ -39,7 +39,7 @@ def eval_numpy(f: Callable) -> Callable:
 
 def eager_if_concrete(f: Callable) -> Callable:
     """Run `f` uncompiled if its arguments are numbers, so that a first call at a prompt takes a tenth of the
-    time. Traced values run it as usual.
+    time. If they are traced, run it as usual.
 
     Inside `f` the scene's numbers are traced. Decisions that depend on them (rank, privileged speeds) must
     therefore be arguments.
@@ -61,7 +61,7 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
     """Run `f`, a function of trees of arrays of one lane, on NumPy for arrays whose first axis is that of
     lanes.
 
-    All lanes share the first `shared` arguments; None: they share all, and there are no lanes.
+    All lanes share the first `shared` arguments (None: they share all, and there are no lanes).
     """
 
     @lru_cache(maxsize=64)

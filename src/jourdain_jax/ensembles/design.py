@@ -110,8 +110,8 @@ class Design(Printed):
         if kind == GRID:
             count = math.prod(len(levels.levels) for levels in self.variables.values())
             if count > MOST_CROSSED:
-                raise ValueError(f"these levels cross to {count} samples, expected at most {MOST_CROSSED}; "
-                    "give fewer, or distributions")
+                raise ValueError(f"these levels form {count} samples, expected at most {MOST_CROSSED}; give "
+                    "fewer, or distributions")
         else:
             object.__setattr__(self, "variables", {name: np.asarray(column, float) for name, column in self.variables.items()})
             lengths = {name: len(column) for name, column in self.variables.items()}

@@ -118,8 +118,8 @@ def _rows(array, index):
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
-    """Return the task and its chunk, with blocks of the size used in its folder, or else of a size that keeps
-    a process below `allowed` bytes.
+    """Return the task, and the number of lanes of its chunks. Blocks have the size used in the folder or, in
+    a new folder, a size that keeps a process below `allowed` bytes.
 
     `here`: whether this process computes. Raises ValueError where blocks or chunks would need more.
     """
@@ -166,8 +166,8 @@ def _constants(task: Task) -> dict[str, tuple]:
 
 
 def _chunk(task: Task, chunk: int | None) -> int:
-    """Return the lanes of a chunk: whole blocks and whole strides of saved lanes, by default about a
-    thousandth of all.
+    """Return the number of lanes of a chunk: whole blocks and whole strides of saved lanes, by default about
+    a thousandth of all lanes.
     """
     unit = np.lcm(task.block, task.stride)
     if chunk is None:
@@ -210,8 +210,8 @@ def attributes(task: Task) -> dict:
 
 
 def _as_text(x) -> object:
-    """Return the options as text, except numbers, without memory addresses of functions, which differ in
-    every process.
+    """Return an option as text; numbers stay numbers. Memory addresses of functions, which differ in every
+    process, are omitted.
     """
     return np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
 
@@ -222,7 +222,7 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     if other:
         was, now = store.attributes, json.loads(json.dumps(attributes(task)))
         what = ", ".join(_difference(name, was, now) for name in other)
-        raise ValueError(f"`{store.path}` holds another study; different are: {what}; give a new folder, or "
+        raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new folder, or "
             "the arguments of that study")
     if chunk is not None and chunk != store.chunk:
         raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is "
@@ -234,8 +234,8 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
-    """Name a part of a study that differs; for a scene, its options or its start, with the names of what
-    differs.
+    """Name a part of a study that differs. For the scene, its options or its start, also name the entries
+    that differ.
     """
     kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part)
     if kept is None:

@@ -180,8 +180,8 @@ class Statistics:
         return counts[first:last], edges[first : last + 1]
 
     def quantile(self, name: str, level: float) -> tuple[float, float]:
-        """Return two bounds of the quantile `level` (0 to 1) of the output `name`, which is number ceil(level
-        n) of the n sorted values.
+        """Return two bounds of the quantile `level` (0 to 1) of the output `name`. The quantile is number
+        ceil(level n) of the n sorted values.
         """
         counts, edges = self.histogram(name)
         i, total = self.names.index(name), counts.sum()

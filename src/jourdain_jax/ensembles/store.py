@@ -42,7 +42,7 @@ _MANIFEST, _GRID = "run/manifest.json", "run/grid.json"
 @dataclass(frozen=True)
 class Column:
     """One array of a study: its type, its axes after the first (name, length), its value for missing entries,
-    and attributes. `every`: it has one lane in this many.
+    and its attributes. `every`: it holds one lane in this many.
     """
 
     dtype: str
@@ -68,8 +68,9 @@ class Receipt:
         return self.last - self.first, self.tally.failed.size
 
     def packed(self) -> bytes:
-        """Return bytes: a first line, a line of JSON that describes the rest, the arrays, and the CRC-32C of
-        all of it."""
+        """Return the receipt as bytes: a first line, a line of JSON that describes the arrays, the arrays,
+        and the CRC-32C of all these.
+        """
         arrays = vars(self.tally) | {"cells": self.tally.cells.astype(np.int32)}
         listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
         head = vars(self) | {"checksums": dict(self.checksums), "arrays": listed}

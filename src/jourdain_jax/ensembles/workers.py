@@ -55,8 +55,8 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
 
 def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
-    """Compute and store a chunk in this process, one at a time. Chunks that a process stored before it died
-    are not computed again.
+    """Compute and store a chunk; this process computes one at a time. Chunks that a process stored before it
+    died are not computed again.
     """
     with _one_at_a_time:
         which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns

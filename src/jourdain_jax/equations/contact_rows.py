@@ -31,7 +31,7 @@ class ContactRows(eqx.Module):
 
 
 class SwitchingRow(NamedTuple):
-    """What a contact with friction, or a row that holds up to a force, brings into the law."""
+    """The part of a contact with friction, or of a row that holds up to a force, in the laws of contact."""
 
     friction: Coulomb
     slip: Float[Array, "2"]  # m/s or rad/s
@@ -62,14 +62,14 @@ def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
 
 
 def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
-    """Return the gaps of contacts that switch, m; zero of rows that hold up to a force."""
+    """Return the gaps of contacts that switch, in m. Rows that hold up to a force have zero gaps."""
     contacts = contacts_of(scene, pose)
     names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
     return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
 
 
 def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
-    """Rates of the gaps, and slip along both tangents, of all contacts that switch, m/s."""
+    """Return the rates of the gaps, and the slip along both tangents, of all contacts that switch, in m/s."""
     rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
     slips = [row.slip for row in switching_rows(scene, motion).values()]
     return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
@@ -91,8 +91,8 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
-    """The forces of the ground on the bodies as loads: normal ones, and along both tangents; those of rows
-    that hold up to a force act on the speeds, as A' L.
+    """Return the forces of the ground on the bodies as loads: normal forces, and forces along both tangents.
+    Those of rows that hold up to a force act on the speeds, as A' L.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

@@ -37,8 +37,8 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """Return the map that satisfies rows by the least change in the metric `M` (None: that of the
-    coordinates), of `free` entries only; with the identity as metric if `M` is singular.
+    """Return the map that satisfies rows by the least change of the `free` entries in the metric `M`. Without
+    `M` the metric is that of the coordinates; if `M` is singular, it is the identity.
 
     `typical`: lengths of the rows, in scaled speeds if there is a metric, relative to which a row counts as
     vanishing (default: only zero rows do). Rows count as dependent below `cutoff` (default: `rank_cutoff`).

@@ -79,8 +79,8 @@ def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None 
 
 
 def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
-    """Return the lower Cholesky factor, and whether M is positive definite; the factor of the identity if it
-    is not.
+    """Return the lower Cholesky factor, and whether M is positive definite. If it is not, the factor is the
+    identity.
     """
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
     # a pivot at round-off means a singular matrix, whatever its sign came out as
@@ -101,9 +101,9 @@ class Privileged(Reduction):
     """Appell's equations in privileged velocities: the speeds `independent` are free, and the rows determine
     the others.
 
-    `zdot = B ydot + b` with `B = -A_z^-1 A_y`; with C from `udot = C yddot + c`, `C' (M (C yddot + c) + h -
-    Q) = 0`. Rows may be dependent everywhere (A_z of full column rank). It does not apply where A_z is
-    singular.
+    `zdot = B ydot + b` with `B = -A_z^-1 A_y`. With C from `udot = C yddot + c`, `C' (M (C yddot + c) + h -
+    Q) = 0`. Rows may be redundant if they are so at every state; A_z is then tall, with full column rank. The
+    reduction does not apply where A_z loses rank.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)
@@ -125,7 +125,7 @@ def appell(M, f, C, c, pivot):
 class Partition(eqx.Module):
     """Independent and dependent speeds, y and z: `A u = b` solved as `u = C y + c` (eqs. (25)-(31)).
 
-    `B = -A_z^-1 A_y`; A_z may be tall, where rows are dependent everywhere.
+    `B = -A_z^-1 A_y`. A_z is tall where rows are redundant at every state.
     """
 
     A: Float[Array, "rows speeds"]

@@ -140,8 +140,8 @@ class _Reader:
         joints = tuple(self._joint(element, childclass, name, k) for k, element in enumerate(part.children("joint", "freejoint")))
         if any(joint.kind == "free" for joint in joints):
             if parent is not None or len(joints) > 1:
-                raise self.file.fault(f"{what} has a free joint and {'a parent' if parent else 'others'}; "
-                    "expected a free joint alone, on a body of the world")
+                raise self.file.fault(f"{what} has a free joint and {'a parent' if parent else 'other joints'}; "
+                    "a free joint must be the only joint of a body that is directly in `worldbody`")
             start = (*zip("xyz", position, strict=True), *zip(_ATTITUDE, matrices_to_quaternions(turn[None])[0], strict=True))
             self.start |= {f"{identifier(joints[0].name)}_{part}": float(x) for part, x in start}  # the stated pose
             position, turn = np.zeros(3), np.eye(3)
@@ -204,7 +204,7 @@ class _Reader:
         if number == 0:
             return None
         if kind not in SIZES:
-            self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give body an '
+            self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give the body an '
                 '`inertial`, or the geom mass="0"')
             return None
         position, turn, size = self._solid(given, kind, frame)

@@ -36,10 +36,10 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
 
 
 def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()) -> list[Sample]:
-    """Return the first random states at which all expressions are finite. Their speeds are the nearest ones
-    at which the `rows`, which are affine in them, vanish.
+    """Return the first random states at which all expressions are finite. Their speeds are those nearest to
+    random ones at which the `rows`, which are affine in the speeds, vanish.
 
-    Constants with given numbers have these. Raises ValueError, with the name of a list, if there are too few
+    Constants with given numbers keep them. Raises ValueError, with the name of a list, if there are too few
     such states.
     """
     named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()}

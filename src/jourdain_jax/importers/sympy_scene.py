@@ -222,7 +222,7 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
     """Raise ValueError for a function of time that can be neither a coordinate nor an input: no kinematic
-    equation contains it, and it is a rate or poses depend on it.
+    equation contains it, but it appears as a rate, or poses depend on it.
     """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds

@@ -64,8 +64,8 @@ class Link:
 
 @dataclass(frozen=True)
 class Follower:
-    """A joint whose coordinate follows that of another, or stays constant: `q - reference = sum of c_k
-    (q_leader - its reference)^k`.
+    """A joint whose coordinate q follows the coordinate of another joint, or stays constant: `q - reference =
+    sum of c_k (q_leader - its reference)^k`.
     """
 
     joint: str
@@ -75,7 +75,7 @@ class Follower:
 
 @dataclass(frozen=True)
 class Closure:
-    """A point of a link that is held at a point of another link, as in the stated pose; with `turn`, the
+    """A point of a link that is held at a point of another link, as in the stated pose. With `turn`, the
     links do not rotate relative to each other either.
     """
 

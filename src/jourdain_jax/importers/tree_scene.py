@@ -84,7 +84,7 @@ class TreeScene(Scene):
         return found
 
     def visuals(self, pose):
-        """Return shapes of the file; those of links without a body are fixed in the inertial frame."""
+        """Return the shapes in the file. Shapes of links without a body are fixed in the inertial frame."""
         frames = self._frames(pose.q)
         found: dict[str, list[Visual]] = {}
         for link in self._tree.links:
@@ -171,7 +171,8 @@ def _about(axis, angle) -> Matrix3:
 
 
 def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
-    """Return two unit vectors in a plane: x and y if its normal is z, y and z if it is x, z and x if it is y.
+    """Return two unit vectors in a plane. They are x and y if its normal is z, y and z if it is x, z and x if
+    it is y.
     """
     k = int(np.argmax(np.abs(normal)))
     if np.isclose(normal[k], 1.0):

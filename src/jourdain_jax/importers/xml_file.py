@@ -77,8 +77,8 @@ class XmlFile:
             holder[k : k + 1] = list(inner)
 
     def _check(self, element: Element, what: str, kind: str) -> None:
-        """Raise ValueError for anything in an element outside the table, unless it is to be ignored; `what`:
-        the element, in words.
+        """Raise ValueError for anything in an element that the table does not contain, unless it is to be
+        ignored. `what`: the element, in words.
         """
         holds = self.table[kind]
         self.check_attributes(kind, element.attrib, what)
@@ -120,7 +120,7 @@ class XmlFile:
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
-        """Raise ValueError for something that is not read, unless `ignore` contains its `key`; `valid`: names
+        """Raise ValueError for something that is not read, unless `ignore` contains its `key`. `valid`: names
         to suggest.
         """
         if key not in self.ignore:
@@ -186,8 +186,8 @@ class Part:
         return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
 
     def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
-        """Return the numbers in an attribute, `count` of them (None: any number); `default` if it is missing.
-        Raises ValueError if there is no default either.
+        """Return the numbers in an attribute, `count` of them (None: any number). If the attribute is
+        missing, return `default`; raise ValueError if there is none.
         """
         text, what = self.given.get(word), f"{word} of {self.what}"
         if text is None:
@@ -216,8 +216,8 @@ class Part:
         return self.file.fault(f"{word} of {self.what} is {what}")
 
     def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
-        """Return the mass properties of an element; None if they are zero. Raises ValueError for other masses
-        that are not positive, except zero masses that no joint moves.
+        """Return the mass properties of an element; None if they are zero. Raises ValueError for masses that
+        are not positive. A zero mass is accepted where no joint moves it.
         """
         if mass == 0 and not np.any(inertia):
             return None

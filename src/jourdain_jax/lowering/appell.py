@@ -191,7 +191,7 @@ class AppellOnGraph:
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
     def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[NodeList, NodeList, NodeList]:
-        """Return dependent speeds and rates at the true coordinates; those of held ones are recomputed."""
+        """Return dependent speeds and rates at the true coordinates; recompute those of held coordinates."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))

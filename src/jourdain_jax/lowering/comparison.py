@@ -37,8 +37,8 @@ def agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
-    """Return the sizes by which errors of rates (first axis) at probes are judged: the usual size of each
-    rate, in its own unit.
+    """Return the sizes relative to which errors of rates (first axis) at probes are judged: the usual size of
+    each rate, in its own unit.
     """
     usual = largest(rates, 1, keepdims=True)
     # 0.01 of these, relative to the largest rate at a probe, whose round-off elimination spreads over all

@@ -13,8 +13,8 @@ MOST_TERMS = (8, 60)  # of normal forms that are tried
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Replace `responses` by normal forms. At later states of the motion these are functions of those at
-    earlier ones. `forms`: returns normal forms with a limited number of terms.
+    """Replace `responses` by normal forms. At later states of the motion these are functions of the responses
+    at earlier ones. `forms`: returns normal forms with a limited number of terms.
     """
     g, at = traced.graph, traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]

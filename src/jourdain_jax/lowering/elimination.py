@@ -43,7 +43,7 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
 
 
 def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:
-    """Solve a system; `right[row]` holds the right-hand sides of that row. If there are more rows than
+    """Solve a system. `right[row]` holds the right-hand sides of that row. If there are more rows than
     unknowns, they must be consistent.
 
     `far`: probes at full turns of all angles. They are made only when a pivot must be judged there.
@@ -74,8 +74,8 @@ def quotient(graph: Graph, a: int, b: int) -> int:
 
 
 def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
-    """Return `M^-1 right` for a symmetric positive definite M, as L D L'; `right` and the solution consist of
-    columns. The pivots are D.
+    """Return `M^-1 right` for a symmetric positive definite M, by its factors L D L'. `right` and the
+    solution consist of columns; the pivots are D.
     """
     count = len(M)
     S, columns = [list(row) for row in M], [list(column) for column in right]

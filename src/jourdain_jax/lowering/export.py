@@ -193,7 +193,8 @@ def expressions(lowered) -> dict:
 def latex(lowered) -> str:
     """Return the equations for an `align` environment, long numbers with six digits; needs SymPy.
 
-    A speed that is the rate of a coordinate appears as its derivative, and needs no equation.
+    A speed that is the rate of a coordinate appears as the derivative of that coordinate, and needs no
+    equation.
     """
     import sympy
 

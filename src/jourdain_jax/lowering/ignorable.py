@@ -16,9 +16,9 @@ FEW = 6  # probes that show most coordinates to count
 
 
 def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
-    """Return coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe. The
-    derivative may be below the round-off of the values, as for the heading of the last of many trailers. Only
-    operations that the identity test evaluates exactly are considered.
+    """Return the coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe.
+    The derivative may be below the round-off of the values, as for the heading of the last of many trailers.
+    Only operations that the identity test evaluates exactly are considered.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
@@ -51,8 +51,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def surely_changed(groups) -> np.ndarray:
-        """Return groups that certainly influence the results, as a few probes show for all groups at once. In
-        a long chain these are nearly all.
+        """Return groups of coordinates that certainly influence the results. A few probes find them for all
+        groups at once; in a long chain nearly all groups are among them.
         """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):

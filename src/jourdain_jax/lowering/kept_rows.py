@@ -15,7 +15,7 @@ from jourdain_jax.program.polynomial import NormalForms
 
 
 class KeptRows:
-    """The treatment of constraints. `massless`: whether M may be singular; `probes`, and if necessary `far`:
+    """The treatment of constraints. `massless`: whether M may be singular. `probes`, and if necessary `far`:
     states at which pivots of privileged speeds are judged.
     """
 

@@ -45,8 +45,8 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     """Return the lowered equations of the scene's class, or the reason why there are none. They are built
     once per class, shapes and privileged speeds.
 
-    `every_speed`: whether all speeds stay in the state, with multipliers for the rows; by default only if no
-    privileged speeds are valid everywhere.
+    `every_speed`: whether all speeds stay in the state, with multipliers for the rows. By default they do so
+    only if no privileged speeds are valid everywhere.
     """
     structure = structure_of(scene)
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
@@ -65,8 +65,9 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     print(jj.lower(disc))                     operations after each step, what was dropped and why
     print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
 
-    `every_speed`: True keeps all speeds in the state and the rows by multipliers; False eliminates dependent
-    speeds. The default is False if some privileged speeds are valid everywhere in the scene's domain.
+    `every_speed`: True keeps all speeds in the state, with multipliers for the rows; False eliminates
+    dependent speeds. By default dependent speeds are eliminated if some privileged speeds are valid
+    everywhere in the scene's domain.
     """
     scene = as_scene(scene)
     found = lowered(scene, every_speed)
@@ -113,13 +114,13 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
-        raise NotLowered("its constraints are redundant for every order of elimination") from None
+        raise NotLowered("in whatever order its constraints are eliminated, a pivot is zero") from None
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Return configurations on the geometric constraints, random and symmetric ones, with random speeds.
-    Parameters are up to a tenth larger than their values, so that coincidences do not count. Where the scene
-    would then be undefined or moments of inertia impossible, they are smaller or closer to their values.
+    Parameters are up to a tenth larger than given, so that coincidences do not count. Where the scene would
+    then be undefined or moments of inertia impossible, they are smaller or closer to the given values.
     """
     generator = np.random.default_rng(1)
     # 56 probes at most
@@ -253,8 +254,8 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
 
 
 def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
-    """Return divisors in the rates of coordinates, as in w/sin q, except those that a `where` keeps away from
-    zero.
+    """Return the divisors in the rates of coordinates, such as sin q in w/sin q. Divisors that a `where`
+    keeps away from zero are omitted.
     """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
@@ -315,7 +316,8 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
     to zero.
 
     These are parameters declared `non_negative` and those with a default of zero. If privileged speeds are
-    used anyway, all parameters that are not declared `positive` are included, since that costs nothing.
+    used in any case, all parameters that are not declared `positive` are set to zero, since that costs
+    nothing.
     """
     if structure.massless:
         return True

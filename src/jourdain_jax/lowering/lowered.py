@@ -43,7 +43,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
-    """Rates of the minimal state (q, y), or of the full one (y = u), of one class of scenes, as a scalar
+    """Rates of the minimal state (q, y), or of the full one (y = u), of a class of scenes. They are a scalar
     program whose inputs include the parameters.
 
     Compared by identity, so that it can be a static argument of compiled functions.
@@ -202,12 +202,14 @@ class Lowered:
         return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
     def energies_at(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
-        """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
+        """Return the kinetic and potential energy, J, without derivatives. `fixed`, `q`, `y`, `inputs`: as in
+        `rates`.
+        """
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
-        """Project coordinates and integrated speeds onto the constraints; `affine`: constraints are affine in
-        the speeds, so that one step is exact for these.
+        """Project coordinates and integrated speeds onto the constraints. `affine`: constraints are affine in
+        the speeds, for which one step is then exact.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
@@ -223,8 +225,8 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers whose signs are monitored during every step, in the rates and, if it
-        `has_events`, in the events.
+        """Return the numbers whose signs are monitored during every step: those of the rates and, if it
+        `has_events`, those of the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
 
@@ -243,8 +245,8 @@ class Lowered:
 
     @property
     def calls(self) -> Labels:
-        """Return the reason for each call of JAX in the rates and stop events: a part of a load or event
-        without a scalar form.
+        """Return the reason for each call of JAX in the rates and stop events. A call stands for a part of a
+        load or event without a scalar form.
         """
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
 

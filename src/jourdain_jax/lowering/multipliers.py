@@ -40,7 +40,7 @@ class Accelerations(NamedTuple):
 def accelerations_by_multipliers(
     graph: Graph, M: Columns, f: NodeList, A: Columns, drift: NodeList, probes: Probes, forms: NormalForms, *, affine: bool
 ) -> Accelerations:
-    """Return the accelerations under all constraints; `probes` give the typical sizes of entries; `affine`:
+    """Return the accelerations under all constraints. `probes` give the typical sizes of entries; `affine`:
     whether constraints are affine in the speeds.
     """
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f

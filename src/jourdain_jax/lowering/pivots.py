@@ -238,8 +238,8 @@ class Pivots:
     # rows combined
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """Combine all rows that contain a column into one for that column. Return the `single` entry at that
-        place instead if it is as good.
+        """Combine all rows that contain a column into one for that column. If the `single` entry at that
+        place is as good, return that entry instead.
         """
         graph, A, regular = self.graph, self.A, self._regular
         found = []

@@ -24,8 +24,8 @@ WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
-    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if its own
-    number is the negative of the key.
+    """Return for each number whose sign decides relations these relations. Each has a factor: 1, or -1 if its
+    own number is the negative of the key.
     """
     found: dict[int, list[tuple[int, int]]] = {}
     for n in graph.reachable(list(nodes)):
@@ -80,7 +80,8 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
 
 
 def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the numbers whose signs are monitored: those of the rates, and those of stop events only.
+    """Return the numbers whose signs are monitored, in two parts: those of the rates, and those that occur in
+    stop events only.
 
     Numbers that depend on `modes` are omitted, since modes have their own events.
     """
@@ -107,15 +108,15 @@ def _differ(values, above, below, least) -> bool:
 
 
 def _may_dip(values, above, below, least) -> bool:
-    """Return whether a value may fall and rise again at a relation: on one side of it, the value is not the
-    smaller of its two branches.
+    """Return whether a value may fall and rise again at a relation. It may if, on one side of the relation,
+    the value is not the smaller of its two branches.
     """
     return not np.all(values <= np.minimum(above, below) + least)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
-    """Return the numbers whose branches continue beyond their zeros: both branches are finite where the
-    outputs are.
+    """Return the numbers whose branches may be continued beyond their zeros, since both branches are finite
+    where the outputs are.
     """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
@@ -140,8 +141,8 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(number: int, probes: Probes) -> Callable[[float], tuple[Probes, Probes]] | None:
-    """Return a function of a distance that returns states on either side of zeros of a number; None if the
-    number has no zero between probes.
+    """Return a function that returns states at a given distance on either side of zeros of a number; None if
+    the number has no zero between probes.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)

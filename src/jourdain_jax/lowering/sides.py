@@ -60,8 +60,8 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
-        """Add a reset: the state and the modes `after` an event, sides by the numbers at the new state, and
-        the gain in energy.
+        """Add a reset: the state and the modes `after` an event, the sides (from the numbers at the new
+        state), and the gain in energy.
         """
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # each after those that it is made of
             (moved,) = graph.substituted([x[k]], after)
@@ -93,8 +93,8 @@ def _where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
 
 
 def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -> int:
-    """Return the value of a relation for this `sign` of its own number; if the relation is a whole number,
-    for this `side`.
+    """Return the value of a relation for this `sign` of its own number. If the relation is a whole number,
+    return it for this `side`.
     """
     if op in COMPARED:
         return graph.call(op, sign, graph.zero)

@@ -102,7 +102,7 @@ class ChaplyginSleigh(Scene):
 
 
 def _level(mass, inertia, x, y, orientation) -> RigidBody:
-    """Return a body that stays level, of whose moments of inertia only the one about z matters."""
+    """Return a body that stays level. Of its moments of inertia only the one about z matters."""
     return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
 
 

@@ -33,13 +33,14 @@ class _OnSheets(Scene):
 
 
 class RosenbergParticle(_OnSheets):
-    """Rosenberg's particle: free but for the row `zdot = y xdot`, the smallest nonholonomic system that bends a path.
+    """Rosenberg's particle: free except for the row `zdot = y xdot`. It is the smallest nonholonomic system
+    whose free motion is not straight.
 
         ydot = const,   xdot sqrt(1 + y^2) = const
 
     Source: R. M. Rosenberg, Analytical Dynamics of Discrete Systems (1977), ch. 15.
 
-    Lengths in units of the length that makes the row `zdot = y xdot`.
+    The unit of length is chosen so that the row has no factor.
     """
 
     conventions = "Right-handed inertial frame without gravity; y counts in metres in the row zdot = y xdot."
@@ -61,7 +62,7 @@ class HeisenbergParticle(_OnSheets):
     The variational ("vakonomic") reading of the same row would give helices: the sharpest test of which principle an engine follows.
     Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.8.
 
-    Lengths in units of the length that makes the row `zdot = y xdot - x ydot`.
+    The unit of length is chosen so that the row has no factor.
     """
 
     conventions = "Right-handed inertial frame without gravity; x, y count in metres in the row zdot = y xdot - x ydot."

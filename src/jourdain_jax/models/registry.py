@@ -39,7 +39,7 @@ MODELS = _Models()
 
 
 def model(name: str, **parameters) -> Scene:
-    """Return a model by name, with changed parameters by name. Raises ValueError with the valid names for an
+    """Return a model by name, with some parameters changed. Raises ValueError with the valid names for an
     unknown one.
     """
     kind = known_model(name)
@@ -50,7 +50,7 @@ def model(name: str, **parameters) -> Scene:
 
 
 def known_model(name: str) -> type[Scene]:
-    """Return the class of a model. Raises ValueError with the nearest name if there is none."""
+    """Return the class of a model. Raises ValueError, with the nearest name, if there is none."""
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"unknown model `{name}`; {nearest(name, MODELS)}")
     return MODELS[name]

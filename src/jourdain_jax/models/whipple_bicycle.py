@@ -30,7 +30,8 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class WhippleBicycle(Scene):
-    """The full nonlinear Whipple bicycle: four rigid bodies on two knife-edge wheels that roll without slip.
+    """The full nonlinear Whipple bicycle: four rigid bodies whose two wheels are knife edges that roll
+    without slip.
 
     x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
 
@@ -102,8 +103,8 @@ class WhippleBicycle(Scene):
         return cls(**values)
 
     def upright(self, speed) -> dict[str, Scalar]:
-        """Return speeds of running straight and upright at `speed` (m/s), the steady motion of the linear
-        model; all else is zero.
+        """Return the speeds of running straight and upright at `speed` (m/s), the steady motion of the linear
+        model. All else is zero.
         """
         speed = jnp.asarray(speed, real_type())
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
@@ -152,9 +153,10 @@ class WhippleBicycle(Scene):
         }
 
     def mode_names(self, eigenvalues: np.ndarray) -> Labels:
-        """Return names of the four modes. Weave is the complex pair; if all eigenvalues are real, it is the
-        two of one sign that meet at a higher speed (when riding forward, those that grow). Of the others
-        castering is the faster one, capsize the slower. Another number of modes has no names.
+        """Return names of the four modes. Weave is the complex pair; if all eigenvalues are real, weave
+        consists of the two with equal sign that meet at a higher speed (when riding forward, the two that
+        grow). Of the other two, castering is the faster mode and capsize the slower. Another number of modes
+        has no names.
         """
         if len(eigenvalues) != 4:
             return ()
@@ -175,7 +177,8 @@ def _vector(x, z) -> Vector3:
 
 
 def _inertia(xx, yy, zz, xz) -> Matrix3:
-    """Return inertia in the engine's axes: the product changes its sign by the half turn about x."""
+    """Return inertia in the engine's axes. The product of inertia changes its sign by the half turn about x.
+    """
     zero = jnp.zeros_like(xx)
     return jnp.stack([xx, zero, -xz, zero, yy, zero, -xz, zero, zz]).reshape(3, 3)
 

@@ -20,8 +20,8 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes, none if all is plausible. `print` shows a
-    table.
+    """Findings of `check`: subject -> sentences on likely mistakes; a plausible subject has none. `print`
+    shows a table.
     """
 
     scene: str

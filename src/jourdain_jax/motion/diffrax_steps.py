@@ -176,8 +176,8 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):
-    """Return the lowest value of all stop events. If several happened in one step, diffrax would take the
-    first in their list, not in time.
+    """Return the lowest value of all stop events. If diffrax had several events and more than one happened in
+    a step, it would take the first in their list, not in time.
     """
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     return jnp.min(integrands.events(t * direction, y, args))

@@ -1,13 +1,12 @@
 """Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
 
-Functions of time are looked at again in every call, their numbers kept apart from what is done with them.
-A function is traced where it is handed over. What it closes over (arrays, traced numbers) and the plain numbers in its sums, products, quotients and
-comparisons become arguments of a program, so that they have derivatives; what is left, the operations, is compared by value. So a new function that does
-the same with other numbers compiles nothing, and a function whose globals have changed is another program.
+A function of time is traced in every call to which it is given. What it closes over (arrays, traced numbers) and the plain numbers in its sums, products,
+quotients and comparisons become arguments of a program, so that they have derivatives. The remaining operations are compared by value. A new function that
+does the same with other numbers therefore compiles nothing, and a function whose globals have changed is another program.
 
 A step sees an input at a few times only, so that a short feature between them would be lost at any tolerance. `Sampled` inputs are straight lines between
-knots: where steps end at the knots, each step has a smooth input, and nothing is lost. A knot at which the input hardly bends may be passed over: those
-at which steps end are chosen so that the straight lines between them are nowhere off by more than
+knots. Where steps end at the knots, each step has a smooth input, and nothing is lost. Knots at which the input hardly bends may be passed: the others are
+chosen so that the straight lines between them are nowhere off by more than
 
     max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
 
@@ -45,7 +44,7 @@ _TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # finite d
 
 
 class TimeProgram:
-    """The operations of a function of time, without its numbers; equal if the operations are."""
+    """The operations of a function of time, without its numbers; equal if the operations are equal."""
 
     def __init__(self, closed: ClosedJaxpr, real):
         taken: list[tuple[Var, Literal]] = []
@@ -111,10 +110,10 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time at its present captured values (None unless it is a number), and its shape.
+    """Return a function of time with its captured values (None unless its value is a number), and its shape.
 
-    It is traced again if the function is a new one, or if values that it reads (`scene/identity.py`) have
-    changed."""
+    A new function, or one that reads (`scene/identity.py`) other values than before, is traced again.
+    """
     try:
         kept = _trace(function)
     except TypeError:  # it cannot be hashed
@@ -235,7 +234,7 @@ class Inputs(eqx.Module):
 def in_phases(
     inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
 ) -> Inputs:
-    """Return inputs whose modes change after each transition; one that did not happen is at infinity."""
+    """Return inputs whose modes change after each transition; those that did not happen are at infinity."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
@@ -327,8 +326,8 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Return times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders`
-    at which steps must end, without the saved times `ts`; then at least one infinite time. None: no samples.
+    """Return times since `t0` of the knots at which steps must end, of all samples in `holders`, in the order
+    of the motion to `t1` and without the times `ts`; then at least one infinite time. None: no samples.
     """
     samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
     if not samples:
@@ -350,8 +349,9 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return the knots at which steps must end. Between these, straight lines approximate the samples to
-    `share` of the range of values."""
+    """Return the knots at which steps must end. Between them, straight lines differ from the samples by at
+    most `share` of the range of values.
+    """
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
@@ -373,7 +373,7 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
 
 
 class SeenFromWithin(eqx.Module):
-    """An input by samples, as seen within a step: at a knot it continues the step's own line."""
+    """A sampled input as seen within a step: at a knot it continues the line of this step."""
 
     sampled: Sampled
     middle: PerLane  # s, of the step; infinite if there is none
@@ -391,7 +391,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples as seen from within the step around this time (s; infinite: no step)."""
+    """Return `inputs` with samples as seen within the step around this time (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

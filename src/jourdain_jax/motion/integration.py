@@ -75,8 +75,8 @@ def _prepared(setup: Setup) -> Setup:
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup. If machine code integrates it, quantities other than the steps use machine code as
-    well, if possible.
+    """Return the setup. If machine code integrates it, quantities beside the steps use machine code as well,
+    if possible.
     """
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
@@ -85,8 +85,8 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
-    """Return the motions of all lanes: by a scalar program `own_steps.width` at a time, otherwise under
-    `vmap`.
+    """Return the motions of all lanes. A scalar program takes `own_steps.width` lanes at a time; otherwise
+    lanes run under `vmap`.
 
     `lane`: the varying part of the setup. On a GPU constant numbers have no lanes: kernels receive them once.
     """
@@ -127,8 +127,8 @@ def _plain(setup: Setup) -> Plain:
 
 
 def _in_contact(setup: Setup) -> Setup:
-    """Return the setup with switching contacts in the modes of the start. Bodies that touch the ground there
-    are projected onto it.
+    """Return the setup with switching contacts in the modes of the start. Bodies that touch the ground at the
+    start are projected onto it.
     """
     scene, t0, start = setup.scene, setup.t0, setup.start
     if not scene.switching.contacts:
@@ -259,7 +259,7 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
-    """Check parameters, bodies, contacts and the start: NaN if they are invalid, so that such a sample ends
+    """Check parameters, bodies, contacts and the start. Invalid ones become NaN, so that such a sample ends
     at once.
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
@@ -305,8 +305,8 @@ def conserves(setup: Setup) -> bool:
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
-    """Return T and V (J) at states, and both again with each coordinate and speed increased by the possible
-    error of a step.
+    """Return T and V (J) at states, and again with each coordinate and speed increased by the possible error
+    of a step.
     """
     field, scene, inputs, fixed, _ = args
     rtol, atol = setup.tolerances
@@ -328,7 +328,7 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
 
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
-    """Return whether some constraint is violated at some of these states; unreached ones are NaN, and do not
+    """Return whether some constraint is violated at some of these states. Unreached states are NaN and do not
     count.
 
     |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest

@@ -158,7 +158,8 @@ class Model(BuiltFor, Printed):
     @property
     def way(self) -> str:
         """Return the integrator of motions with constant inputs (machine code, XLA or dense matrices), and
-        the reason why no faster one applies."""
+        the reason why a faster one does not apply.
+        """
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as asked'}"
@@ -389,8 +390,8 @@ def _cutoff(structure: Structure) -> float | None:
 
 
 def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
-    """Return the default reduction. For the minimal state these are the privileged velocities; for the full
-    state that of a lowered program, or else the null space by QR.
+    """Return the default reduction. For the minimal state it uses the privileged velocities. For the full
+    state it is that of a lowered program, or else the null space by QR.
     """
     if independent is not None:
         return Privileged(independent)

@@ -186,7 +186,7 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
 
 
 def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
-    """Return the motion with a mode and an event for each relation (`lowering/sides.py`); functions of time
+    """Return the motion with a mode and an event for each relation (`lowering/sides.py`). Functions of time
     are part of its program.
     """
     field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
@@ -208,8 +208,8 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Return why no step monitors the relations in a scene's loads or stop events; empty if a step does, or
-    there are none.
+    """Return the reason why no step monitors the relations in a scene's loads or stop events. Return nothing
+    if steps monitor them, or if there are none.
     """
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
@@ -232,9 +232,9 @@ def reason_against_watching(setup: Setup) -> str:
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
-    """Return whether rates may jump without derivatives accounting for it: at a time that depends on the
-    state, on numbers of inputs or, if the `scene_varies`, on parameters. `watched`: whether steps end at
-    relations.
+    """Return whether rates may jump at a time whose derivatives are not taken into account. Such a time
+    depends on the state, on numbers of inputs or, if the `scene_varies`, on parameters. `watched`: whether
+    steps end at relations.
     """
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
@@ -253,7 +253,9 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
-    """Return the program, with functions of time among its inputs where it has any, and its relations."""
+    """Return the program and its relations. Functions of time among its inputs, if there are any, are part of
+    it.
+    """
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
@@ -262,11 +264,11 @@ def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowe
 def width(program: Lowered) -> int:
     """Return the number of lanes of a lowered scene that run in lockstep.
 
-    A step of a batch lasts until its slowest lane has ended, and its data should stay in a core's fastest
-    cache. So few lanes at a time are best, if a step of few lanes costs little beside its arithmetic. On a
-    CPU this holds if XLA compiles the whole loop over steps into one function, as it does for loops that use
-    little memory (see `jourdain_jax`). Otherwise every operation is started separately, and many lanes must
-    share that cost.
+    A step of a batch lasts until its slowest lane has ended, and the data of the step should stay in a core's
+    fastest cache. Few lanes at a time are therefore best, if a step of few lanes costs little beside its
+    arithmetic. On a CPU it does if XLA compiles the whole loop over steps into one function, as it does for
+    loops that use little memory (see `jourdain_jax`). Otherwise every operation is started separately, and
+    many lanes must share that cost.
     """
     # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
     return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

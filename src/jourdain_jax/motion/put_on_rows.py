@@ -234,8 +234,8 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
-    """Return coordinates of the states `elsewhere`, on the geometric rows; NaN where none are found in the
-    domain.
+    """Return coordinates for the states `elsewhere`, on the geometric rows; NaN for states without a solution
+    in the domain.
 
     `native`: whether machine code may project them.
     """
@@ -255,13 +255,13 @@ def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordin
 
 @eval_numpy
 def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return fault -> whether a scene of known numbers has it, at this state or elsewhere."""
+    """Return for each fault whether a scene of known numbers has it, at this state or elsewhere."""
     return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
 def left_of(g: Float[Array, "closures"]) -> Scalar:
-    """Return the largest significant residual of the geometric constraints: infinite for NaN, zero for
-    round-off.
+    """Return the largest significant residual of the geometric constraints. NaN counts as infinite, round-off
+    as zero.
     """
     left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
     return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
@@ -287,7 +287,9 @@ class _Put(NamedTuple):
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
-    """Return coordinates from the first guess that leads to the rows; q itself counts as the first guess."""
+    """Return coordinates from the first of several guesses that leads to the rows. The first of these guesses
+    is q itself.
+    """
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)

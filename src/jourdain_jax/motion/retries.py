@@ -47,7 +47,7 @@ def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup,
 def lanes_retried(
     run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
 ):
-    """Run failed lanes again as single motions are. Return all lanes, and for each kind of retry the
+    """Run failed lanes again in the way of single motions. Return all lanes, and for each kind of retry the
     `RERUN_FIELDS` of its lanes.
 
     `run`: the motions of lanes with these indices and options; `form`: their integrated state; `begun`: their

@@ -109,8 +109,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """Warn if one of the differentiated `motions` crossed relations at which rates jump; unknown crossings
-    cause no warning.
+    """Warn if one of the differentiated `motions` crossed relations at which rates jump. If crossings are
+    unknown, there is no warning.
     """
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):

@@ -38,8 +38,8 @@ class Passed(eqx.Module):
     def times(
         self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
     ) -> Float[Array, "transitions"]:
-        """Return the times of transitions, rounded consistently: a transition before a goal, measured from
-        the start, is also before the corresponding saved time in `ts`.
+        """Return the times of transitions, rounded consistently: a transition before a goal (measured from
+        the start) is also before the saved time in `ts` that belongs to the goal.
 
         Adding the `origin` to a time since the start may round it onto the wrong side.
         """
@@ -129,8 +129,8 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":
-        """Return the setup with times that any loop accepts: no time lies beyond the end by round-off, and
-        inconsistent times are replaced by those of a short span.
+        """Return the setup with times that any loop accepts. No time lies beyond the end by round-off, and
+        inconsistent times are replaced by times of a short span.
         """
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
@@ -166,7 +166,9 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as given: without derivatives, and without lanes where a batch shares them."""
+    """Numbers of a motion as given: without derivatives, and without lanes where all samples of a batch share
+    them.
+    """
 
     times: dict  # as of a `Setup`
     known: tuple  # `native_motion.known_of`

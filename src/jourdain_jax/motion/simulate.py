@@ -162,8 +162,8 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
-    """Return the start on its constraints; or a `State` unchanged, with the sizes by which the integrating
-    program projects it.
+    """Return the start on its constraints. A `State` stays unchanged; the integrating program projects it, by
+    the sizes that are returned with it.
     """
     if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None

@@ -139,8 +139,8 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
-    """Return marks of the coordinates and speeds that constraints determine, for given values and guesses as
-    in `Guess`, and whether given values may contradict each other.
+    """Return marks of the coordinates and speeds that constraints determine, and whether given values may
+    contradict each other. Given values and guesses are as in `Guess`.
 
     Omitted privileged speeds stay zero, unless a dependent speed is given. Coordinates that are neither given
     nor guessed must lie in the domain, unless the rows are affine and determine them uniquely.

@@ -65,8 +65,8 @@ def _halves(w: Writer, a: Value) -> DoubleDouble:
 
 
 def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return q and d of the quotient q - d of two numbers, each of which is in two parts. A zero quotient
-    keeps its sign.
+    """Return q and d, where q - d is the quotient of two numbers, each of which is in two parts. A zero
+    quotient keeps its sign.
     """
     inverse = 1.0 / b[0]
     q = a[0] * inverse
@@ -121,8 +121,8 @@ def tangent(w: Writer, x: Value) -> Value:
 
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
-    """Return the quick values, replaced in lanes with large angles. Values for large angles come from
-    separate functions, which most calls skip.
+    """Return the quick values, replaced in lanes with large angles. Separate functions, which most calls
+    skip, compute the values for large angles.
     """
     far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
@@ -163,8 +163,8 @@ def _reduced(w: Writer, x: Value) -> Triple:
 
 
 def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDouble, DoubleDouble, Value]:
-    """Return (r, s), (m, c) and k. After k quarter turns are removed, the angle has the sine r - s and the
-    cosine m + c. A zero sine keeps its sign.
+    """Return (r, s), (m, c) and k. The angle without k quarter turns has the sine r - s and the cosine m + c.
+    A zero sine keeps its sign.
     """
     square = r * r
     half = 0.5 * square
@@ -254,7 +254,7 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
 
 
 def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
-    """Return x with the opposite sign in the third and fourth quadrant, which have the numbers 2 and 3."""
+    """Return x with the opposite sign in the third and fourth quadrants, whose numbers are 2 and 3."""
     sign = w.binary("shl", quadrant & 2, 62)
     return w.converted("bitcast", w.binary("xor", w.converted("bitcast", x, w.whole), sign), w.real)
 
@@ -329,8 +329,8 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> Triple:
-    """Return whether |x| is above 1/2, and a number in two parts: the arc whose sine is |x| or, above 1/2,
-    sqrt((1 - |x|)/2).
+    """Return whether |x| is above 1/2, and a number in two parts. The number is the arc whose sine is |x| or,
+    above 1/2, sqrt((1 - |x|)/2).
     """
     a = w.magnitude(x)
     large = a > 0.5

@@ -108,7 +108,7 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes except the last 1 or 3, as the host computed it for a GPU.
+    """Return the product of the sizes of all axes except the last 1 or 3. For a GPU the host has computed it.
     """
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
@@ -298,8 +298,8 @@ def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane)
 
 
 def write_rows(w: Writer, given: int, returned: int) -> None:
-    """Write a handler from rows of `given` numbers to rows of `returned` ones, with lanes side by side, by
-    the module's `row(given, returned)`.
+    """Write a handler that maps rows of `given` numbers to rows of `returned` ones. It calls the module's
+    `row(given, returned)` for several lanes side by side.
 
     Lanes beyond the last row compute that row again.
     """

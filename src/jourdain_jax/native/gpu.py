@@ -126,8 +126,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the order of an array's axes in memory, the fastest first. The axes of `lanes`, which are its
-    first ones, come before all others.
+    """Return the order of an array's axes in memory, the fastest first. Its first `lanes` axes, those of
+    lanes, are faster than all others.
     """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 

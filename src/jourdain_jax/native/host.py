@@ -168,8 +168,8 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """Return the result of `make`: from the file of this name if it is intact, otherwise made and stored. A
-    failing disk is no error.
+    """Return the result of `make`: from the file of this name if that is intact, otherwise made anew and
+    stored. A failing disk is no error.
 
     `made_by`: further conditions for equality, namely versions of the tools, as text.
     """

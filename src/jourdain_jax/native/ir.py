@@ -306,7 +306,8 @@ class Writer:
         return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
 
     def together(self, a: Value) -> Value:
-        """Return whether a value is true in any thread of a warp, which waits here; on a CPU, the value."""
+        """Return whether a value is true in any thread of a warp, whose threads wait here. On a CPU, return
+        the value."""
         return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
 
     def thread(self) -> tuple[Value, Value]:
@@ -347,13 +348,13 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, so that it needs no register; on a GPU, the value."""
+        """Return a value reloaded from memory, so that it needs no register; on a GPU, the value itself."""
         if self.device:
             return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Return pointers to rows of memory, in own registers; LLVM reaches rows near them by offsets."""
+        """Return pointers to rows of memory, each in its own register; LLVM uses offsets for nearby rows."""
         assert not self.device
         found, place = [], self.room(type="ptr")
         for row in rows:

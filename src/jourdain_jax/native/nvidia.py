@@ -85,7 +85,8 @@ def _checked(code: int) -> None:
 
 
 def _said(function: str, *what, found=ctypes.c_int) -> int:
-    """Return the number that the driver stores where the first argument of a function points."""
+    """Return the number that the driver stores at the place to which the first argument of a function points.
+    """
     number = found()
     _checked(getattr(driver(), function)(ctypes.byref(number), *what))
     return number.value
@@ -156,8 +157,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for these `lanes`: as many as registers allow with local memory in the first
-    cache, unless that is too few.
+    """Return the number of warps for these `lanes`. It is as large as registers allow while local memory
+    stays in the first cache, unless that is too few.
     """
     # attributes of a device: 82 its registers, 81 what of its cache can be shared memory, 16 its multiprocessors
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))

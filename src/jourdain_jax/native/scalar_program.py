@@ -89,7 +89,7 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
 
 
 def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
-    """Return values of the outputs, from inputs and from nodes computed before; `by_llvm`: whether LLVM
+    """Return values of the outputs, from inputs and from nodes computed before. `by_llvm`: whether LLVM
     allocates the registers.
     """
     return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]

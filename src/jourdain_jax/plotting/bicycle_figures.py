@@ -15,8 +15,8 @@ _CEILING = 12.0  # 1/s; castering goes far below what matters
 
 
 def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
-    """Draw real and imaginary parts against forward speed. Bands are the 2.5 and 97.5 % quantiles of the
-    samples, also of the speeds; the stable range is green.
+    """Draw real and imaginary parts against forward speed. Bands lie between the 2.5 and 97.5 % quantiles of
+    the samples; the speeds of stability have such bands as well. The stable range is green.
     """
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")

@@ -59,7 +59,7 @@ def _plane(origin, axes, low, high) -> dict:
 
 
 def floor_under(low, high) -> float:
-    """Return the height (m) of a floor under the box from `low` to `high`: z = 0 if bodies stand on it,
+    """Return the height (m) of a floor under the box from `low` to `high`. It is z = 0 if bodies stand on it,
     otherwise below them.
     """
     side = float(max(high - low))

@@ -66,8 +66,8 @@ class Drawn:
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
-    """Return the drawing of a motion at `most` saved times at most, evenly spaced. Raises ValueError if it
-    reached none of them.
+    """Return the drawing of a motion, with at most `most` of its saved times, evenly spaced. Raises
+    ValueError if it reached none of them.
     """
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
@@ -131,7 +131,7 @@ def _at(tree, index):
 
 def _corners_of(visual: Visual) -> np.ndarray:
     """Return points (points, 3) in the frame of the body, m, whose box holds the shape at the first time. For
-    a line they are its own, with a leading axis of times.
+    a line these are its own points, with a leading axis of times.
     """
     if visual.kind == "line":
         return np.asarray(visual.size)
@@ -147,7 +147,7 @@ def _corners_of(visual: Visual) -> np.ndarray:
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
-    """Return the shapes of a `body` at one time, which rolls on `shapes`; `dot` (m): radius of a body without
+    """Return the shapes of a `body` that rolls on `shapes`, at one time. `dot` (m): radius of a body without
     size.
     """
     if isinstance(body, Particle):

@@ -171,8 +171,8 @@ def _moves(body: DrawnBody) -> bool:
 
 
 def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
-    """Return points (points, 3), m, relative to the middle of the bodies at each time, whose box holds the
-    bodies at that time.
+    """Return points (points, 3), m, relative to the middle of the bodies at each time. Their box holds the
+    bodies at every time.
     """
     points = []
     for one in drawn:
@@ -183,7 +183,7 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
-    """Return name, point and scaled force of every contact at all times, of all motions, and the force that
+    """Return name, point and scaled force of every contact of all motions at all times, and the force that
     the longest arrow represents.
 
     If a few forces are far larger than the others (a fall, a nearly singular configuration), all of them have

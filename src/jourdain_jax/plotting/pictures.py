@@ -88,7 +88,7 @@ def draw_still(
     paths: Sequence[tuple[str, Sequence]] | None = None,
     view: str | tuple = "space",
 ) -> None:
-    """Draw a motion as one picture: its bodies, solid, at a few times, earlier ones paler, and the paths of points.
+    """Draw a motion as one picture: its bodies at a few times, earlier ones paler, and the paths of points.
 
     - `at`: times in s (the nearest saved ones are drawn), or their number, evenly spaced from the start to
       the end.

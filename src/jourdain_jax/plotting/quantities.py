@@ -203,8 +203,8 @@ def _scene(motion: Trajectory | Rollout):
 
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """Draw a line; for a rollout the bands, widest and palest first, and the median, with `y` as returned by
-    `_values`.
+    """Draw a line. For a rollout, draw the bands, widest and palest first, and the median. `y`: as returned
+    by `_values`.
     """
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second

@@ -87,8 +87,8 @@ def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
 
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:
-    """Return faces divided into parts with edges of at most about `longest`, so that nearer objects hide
-    farther ones correctly, and the face to which each part belongs.
+    """Divide faces into parts with edges of at most about `longest`, so that nearer objects hide farther ones
+    correctly. Return the parts and, for each part, the face to which it belongs.
     """
     edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)  # from the last corner to the first, from there to the second, ...
     rows, columns = np.clip(np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20).astype(int)

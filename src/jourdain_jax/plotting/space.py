@@ -78,7 +78,7 @@ def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, 
 
 
 def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarray, "2 3"]) -> None:
-    """Draw bodies with their shadows and paths (times, 3), replacing the present content; `box`: the visible
+    """Draw bodies with their shadows and paths (times, 3) in place of the present content. `box`: the visible
     region, from its lowest corner to its highest.
     """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -109,8 +109,8 @@ def towards(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
 
 
 def legend(figure, drawn: Drawn, paths: int = 0) -> None:
-    """Draw names of the bodies in a row above the picture; if there are many, only the first, the second and
-    the last.
+    """Draw names of the bodies in a row above the picture. If there are many, draw only the first, the second
+    and the last.
     """
     plt, colours = pyplot(), {name: body.colour for name, body in drawn.bodies.items() if name}
     names = list(colours) if len(colours) <= 4 else [*list(colours)[:2], list(colours)[-1]]

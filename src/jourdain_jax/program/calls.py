@@ -125,7 +125,7 @@ _SEVERAL = tuple, list  # a union of types is made again wherever it stands
 
 def description(x) -> Hashable:
     """Return a key of a jaxpr, or of a parameter of an operation. Two traces of one function have equal keys,
-    unless the function creates others.
+    unless the function creates other functions.
     """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))

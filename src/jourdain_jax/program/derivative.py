@@ -118,8 +118,7 @@ def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> li
 
 
 def _derivative(graph: Graph, node: int, dots: list):
-    """Return the rate of a node from the rates of its arguments. For an array and for a call it is a tuple of
-    rates.
+    """Return the rate of a node from the rates of its arguments. The rate of an array or a call is a tuple.
     """
     op, args = graph.op[node], graph.args[node]
     if all(d == graph.zero for d in dots):
@@ -136,7 +135,7 @@ def _derivative(graph: Graph, node: int, dots: list):
 
 
 def _of_call(graph: Graph, node: int, dots: list) -> tuple:
-    """Return `d y_i = sum_j J_ij d x_j`, with another call for the columns of J of the varying operands."""
+    """Return `d y_i = sum_j J_ij d x_j`. Another call computes the columns of J for the varying operands."""
     operands, call = graph.args[node], graph.value[node]
     entries = [graph.entries_of(a) for a in operands]
     numbers = [np.issubdtype(graph.value[a][-1], np.floating) for a in operands]
@@ -159,9 +158,9 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
 
 
 def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
-    """Return a function of the values of `variables` (all on which the outputs depend) that returns those of
-    `outputs`, as arrays of one shape in the precision of the variable with index `like`, and then those of
-    the nodes `monitored`, without derivatives.
+    """Return a function of the values of `variables`, on which all outputs depend. It returns the values of
+    `outputs`, as arrays of one shape in the precision of the variable with index `like`, and then the values
+    of the nodes `monitored`, without derivatives.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
@@ -210,7 +209,7 @@ def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -
 
 
 def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
-    """Return row, column and node of the structurally nonzero entries; None if JAX's own derivative is
+    """Return row, column and node of each structurally nonzero entry. Return None if JAX's own derivative is
     better.
     """
     operations = graph.operations(outputs)

@@ -43,8 +43,8 @@ class Probes:
         return int(signs.pop()) if len(signs) == 1 else 0
 
     def in_the_middle(self, node: int) -> int:
-        """Return the node as a function of parameters only. Inputs have the numbers of the probe at which the
-        node's magnitude is the median; without such a probe the result is 1.
+        """Return the node as a function of parameters only. Inputs have their numbers at the probe at which
+        the magnitude of the node is the median. If there is no such probe, the result is 1.
         """
         graph, size = self.graph, np.abs(self([node])[0])
         known = np.flatnonzero(np.isfinite(size) & (size > 0))

@@ -36,8 +36,7 @@ class Graph:
     name of an input, or the description of a call.
 
     Products of matrices with more than `most_multiplications` are not expanded; with `keeps_rules`, neither
-    are functions with their own derivative.
-    """
+    are functions with their own derivative."""
 
     def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
         self.most_multiplications, self.keeps_rules = most_multiplications, keeps_rules
@@ -77,7 +76,8 @@ class Graph:
         return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is not a number
 
     def input(self, name: str, varies: bool) -> int:
-        """Return a named input: a parameter, or (`varies`) time, coordinate, speed or input of the scene."""
+        """Return a named input: a parameter or, with `varies`, time, a coordinate, a speed or an input of the
+        scene."""
         return self._node("input", (), name, varies)
 
     def is_const(self, node: int) -> bool:
@@ -120,7 +120,7 @@ class Graph:
         return self._node("add", (a, b) if a < b else (b, a))
 
     def _without_wave(self, a: int, b: int) -> int | None:
-        """Return x of a = sin(w)^2 x, b = cos(w)^2 x or the reverse; None for products of another form."""
+        """Return x of the pair a = sin(w)^2 x, b = cos(w)^2 x in either order; None for other products."""
         factors = self._factors(a), self._factors(b)
         if len(factors[0]) != len(factors[1]):
             return None
@@ -250,7 +250,8 @@ class Graph:
     # arrays and calls
 
     def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
-        """Combine scalars into an array. If they are all entries of an array, in order, return that."""
+        """Combine scalars into an array. If they are all the entries of an existing array, in order, return
+        that array."""
         entries = tuple(entries)
         whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
         if whole is not None and self.value[whole][1:] == (shape, dtype) and entries == tuple(self.entries(whole).ravel().tolist()):
@@ -328,8 +329,7 @@ class Graph:
 
     def needed(self, outputs: Iterable[int], known) -> NodeList:
         """Return, in order, the nodes that must be computed for the outputs when the nodes in `known` are
-        given.
-        """
+        given."""
         args = self.args
         seen = {node for node in outputs if node not in known}
         stack = list(seen)
@@ -375,7 +375,8 @@ class Graph:
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:
-        """Return how many more operations node a needs than node b, counting only unshared ones."""
+        """Return how many more operations node a needs than node b; operations that both share do not count.
+        """
         if a == b:
             return 0
         needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]

@@ -62,8 +62,8 @@ class IdentityProbes:
         return found
 
     def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
-        """Return probes at which some inputs, and the bounds of their round-off, are replaced; all others
-        stay.
+        """Return probes at which some inputs, and the bounds of their round-off, are replaced. All other
+        inputs keep their values.
         """
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
@@ -80,8 +80,8 @@ class IdentityProbes:
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """Return the probes with indices `at`, once for each group of names. The inputs of that group have
-        their values from another probe.
+        """Return the probes with indices `at`, once for each group of names. In each copy, the inputs of one
+        group have their values from another probe.
         """
 
         def in_turn(name, x):
@@ -106,7 +106,7 @@ def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return whether no probe distinguishes the values, for each pair of rows at each of the probes."""
+    """Return, for each pair of rows, whether no probe distinguishes their values."""
     bound = SURE * (a.error + b.error)
     said = np.isfinite(bound) & regular
     a, b = np.asarray(a), np.asarray(b)
@@ -115,8 +115,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return the replacements of one node by another that, each alone, change none of the `nodes`; `probes`:
-    generic ones.
+    """Return the replacements of one node by another that do not change any of the `nodes`, each replacement
+    taken alone. `probes`: generic ones.
     """
     graph, here = probes.graph, probes(nodes)
 

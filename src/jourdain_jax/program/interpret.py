@@ -103,8 +103,9 @@ def refuse(equation) -> None:
 
 
 def own_rule(name: str, params) -> str:
-    """Name the function if its derivative is its own and unknown to the graph; empty if not. Functions of
-    this package do not count, since their rules agree with their values.
+    """Return the name of the function if it has a custom derivative that the graph does not know; empty if
+    not. Functions of this package do not count, since their custom derivatives equal those of their
+    operations.
 
     JAX's own functions do count: `softplus` and `sinc` compute with branches, which give wrong derivatives
     where two branches meet.
@@ -188,7 +189,7 @@ def _is_rounded(dtype: np.dtype) -> bool:
 
 
 def _kind(dtype: np.dtype) -> str:
-    """Return the kind of a type as NumPy has it, including bfloat16 and similar floating-point types."""
+    """Return the kind of a type in NumPy's terms, also for bfloat16 and similar floating-point types."""
     return "f" if jnp.issubdtype(dtype, jnp.floating) else dtype.kind
 
 

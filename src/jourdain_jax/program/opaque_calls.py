@@ -153,8 +153,8 @@ def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
 
 
 def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
-    """Mark the steps that depend on opaque parts within the same call as opaque, and find the steps that form
-    one call.
+    """Mark steps as opaque that depend on opaque parts within the same call, and find the steps that form one
+    call.
     """
     maker = {v: step for step in steps for v in step.outputs}
     number = {id(step): k for k, step in enumerate(steps)}

@@ -132,7 +132,7 @@ class NormalForms:
         return p
 
     def _rooted(self, p: Polynomial) -> tuple[NodeList, Polynomial] | None:
-        """Return atoms to extract from the root, and the rest; None if there are none."""
+        """Return the atoms to take out of the root, and the rest; None if there are none."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
@@ -208,7 +208,7 @@ class NormalForms:
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
         """Return the terms of a monomial, with squares replaced and pairs x, 1/x cancelled. The result is
-        cached: the square of an atom is known before the atom is used.
+        cached. The square of an atom is known before the atom is used.
         """
         found = self._reductions.get(monomial)
         if found is None:

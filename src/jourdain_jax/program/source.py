@@ -35,8 +35,8 @@ C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
-    """Return lines that name values used more than once, and the expressions of the outputs. `names`: of
-    inputs and of nodes already known.
+    """Return lines that name values used more than once, and the expressions of the outputs. `names`: names
+    of inputs and of nodes already known.
     """
     nodes = _needed(graph, outputs, names)
     uses = Counter([*outputs, *(a for node in nodes for a in graph.args[node])])
@@ -59,8 +59,8 @@ def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dic
     reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
         raise ValueError(
-            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; print the scene without that "
-            "load, or write it in scalar operations"
+            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; write the load or event that "
+            "contains them in scalar operations, or print the scene without it"
         )
     return nodes
 

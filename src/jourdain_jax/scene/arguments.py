@@ -70,7 +70,8 @@ def as_scene(scene) -> Scene:
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """Return the scene; ValueError if a contact or row may slip, which the function `what` does not support.
+    """Return the scene. Raises ValueError if a contact or row may slip, which the function `what` does not
+    support.
     """
     scene = as_scene(scene)
     if scene.switching.contacts:
@@ -83,8 +84,8 @@ def as_rolling(scene, what: str) -> Scene:
 
 
 def of_known_numbers(function: F) -> F:
-    """Return the function of a scene or motion so that it runs on numbers also inside `jit`, `vmap` and
-    derivatives.
+    """Return a wrapper of a function of a scene or motion that runs it on numbers, also inside `jit`, `vmap`
+    and derivatives.
 
     Raises DifferentiationModeError with its name where an argument is traced.
     """
@@ -184,8 +185,8 @@ _NOTE = "Lines of jourdain_jax between yours are omitted from this traceback; JA
 
 
 def shown_from_users_lines(function: F) -> F:
-    """Return the function. If one of the user's lines is in the traceback of an error (a method of a scene,
-    an input, an event), the error shows it. JAX's usual modes of promotion apply.
+    """Return a wrapper of the function. If a user's line is in the traceback of an error (in a method of a
+    scene, an input or an event), the error shows that line. JAX's usual modes of promotion apply.
     """
 
     @wraps(function)

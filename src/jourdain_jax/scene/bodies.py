@@ -20,7 +20,7 @@ class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
     Raises ValueError for other shapes. Its velocity is the derivative of the position. If the mass depends on
-    time or coordinates, `m a` holds with its momentary value; state the thrust of ejected mass as a load.
+    time or coordinates, `m a` has its momentary value; state the thrust of ejected mass as a load.
     """
 
     mass: Scalar  # kg

@@ -41,8 +41,8 @@ def rod(a: Vector, b: Vector, length: Number) -> Scalar:
     """Return the geometric constraint of a massless rod of the given `length` (m) between two points `a`, `b`
     (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
 
-    To first order this is the excess length; its multiplier is the thrust (positive, N) in the rod. It is
-    smooth even if the points meet. Eq. (5).
+    To first order the value is the excess length. Its multiplier is the thrust (positive, N) in the rod. It
+    is smooth even if the points meet. Eq. (5).
     """
     apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
     length = checked_positive(length, "length of a rod", advice="give it in m; to keep two points together "

@@ -32,7 +32,7 @@ class Ball(eqx.Module):
 
 
 class Wheel(eqx.Module):
-    """A wheel with a tyre of circular section: a torus; a thin disc where the tyre is None."""
+    """A wheel with a tyre of circular section (a torus), or a thin disc if the tyre is None."""
 
     centre: Vector3  # m, inertial frame
     axle: Vector3  # unit vector
@@ -45,7 +45,7 @@ class Wheel(eqx.Module):
         return self.radius if self.tyre is None else self.radius - self.tyre
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point if n points up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the
+        """Return the lowest point where n points up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the
         axle k.
         """
         up = n - (n @ self.axle) * self.axle
@@ -61,8 +61,8 @@ class Ellipsoid(eqx.Module):
     semi_axes: Vector3  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point if n points up: `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, S the squares of
-        the semi-axes.
+        """Return the lowest point where n points up: `c - R S n'/sqrt(n'.S n')` with `n' = R' n` and S, the
+        squares of the semi-axes.
         """
         local = n @ self.orientation
         weighted = self.semi_axes**2 * local
@@ -92,8 +92,8 @@ def touch(shape: Shape, ground: Ground) -> Touch:
 
 
 def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
-    """Return the point of the tyre's inner circle that is nearest to the sphere: nearest to its centre, or
-    farthest from it when inside.
+    """Return the point of the tyre's inner circle that is nearest to the sphere. It is nearest to the centre
+    of the sphere or, inside the sphere, farthest from it.
     """
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle
@@ -102,8 +102,8 @@ def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
 
 
 def _of_core(core: Vector3, distance: Scalar, ground: Cylinder | Sphere) -> Touch:
-    """Return the point at `distance` (m) from the core towards the ground; NaN if it does not fit into a
-    hollow ground.
+    """Return the point at `distance` (m) from the core towards the ground; NaN if the body does not fit into
+    a hollow ground.
     """
     if ground.side == "inside":
         distance = jnp.where(distance < ground.radius, distance, jnp.nan)
@@ -129,8 +129,8 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
 
 
 def _guess(shape: Shape, ground: Ground) -> Float[Array, "4"]:
-    """Return a first guess of the contact: the point of the body towards the ground, the nearby point of the
-    surface, and the gap.
+    """Return a first guess of the contact: the point of the body that faces the ground, the nearby point of
+    the surface, and the gap.
     """
     x = point = shape.lowest(normal_at(ground, shape.centre))
     for _ in range(3):  # steps along the gradient before Newton's method for the contact itself

@@ -108,8 +108,8 @@ class Contact(eqx.Module):
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
     def lean(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero where it lies flat; None for other
-        shapes.
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, which is zero where it lies flat; None for
+        other shapes.
         """
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 

@@ -20,7 +20,7 @@ from jourdain_jax.scene.names import check_names
 
 
 class HeldRow(eqx.Module):
-    """A velocity row, `w` in m/s or rad/s, that holds up to the forces of `friction`, N or N m."""
+    """A velocity row, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m."""
 
     w: Scalar
     friction: Coulomb
@@ -47,14 +47,14 @@ class JointFriction(Load):
 
 
 def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
-    """Return Coulomb friction on speeds by name, `joint_friction(motion, hinge_rate=0.3)`: a speed at rest
-    stays at rest while that needs no more than this force, and otherwise moves against it.
+    """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`. A speed at rest
+    stays at rest while that takes no more than this force; otherwise the force acts against the speed.
 
     - `friction`: speed -> force F in N or N m, a number or a function of the motion, or
       `jj.Coulomb(sliding, static)` with two forces.
 
-    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` tells when it
-    holds and slips. ValueError for an unknown speed.
+    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` tells whether
+    it holds or slips. Raises ValueError for an unknown speed.
 
     **Examples**
 
@@ -66,7 +66,7 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the rows that hold up to a force, of what `velocity_constraints` and `loads` return."""
+    """Return the rows that hold up to a force, from the results of `velocity_constraints` and `loads`."""
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}

@@ -44,7 +44,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
     """Decorate a function of a scene (and of further keys) to run once per class and values, on concrete
     parameters, even during tracing.
 
-    `of_traced`: a function that runs instead, every time, for scenes with traced parameters.
+    `of_traced`: a function that runs in its place, every time, for scenes with traced parameters.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -105,8 +105,8 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Return a context in which numbers of `scene` replace traced parameters of its class, where it has
-    numbers.
+    """Return a context in which numbers of `scene` replace traced parameters of its class, if they are known
+    in `scene`.
 
     Parameters that are `varied` (names; None: all) are replaced by generic numbers near those of the scene.
     """
@@ -122,7 +122,7 @@ def with_reference_parameters(scene):
     class's defaults, or one.
 
     Generic numbers are used so that a default of zero (a tilt, a rate) does not hide a term, and two equal
-    defaults do not count as the same length.
+    defaults do not count as one length.
     """
     leaves, treedef = jax.tree.flatten(scene)
     unknown = [is_traced_type(type(x)) for x in leaves]
@@ -169,8 +169,8 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return numbers that differ from the given ones by the fractions `change` (of equal shape, after any
-    leading axes), with `zero` in place of each zero.
+    """Return numbers that differ from the given ones by the fractions `change`, which have the same shape
+    after any leading axes. Each zero is replaced by `zero`.
 
     A tensor of inertia becomes that of the body stretched, sheared and rotated, since separately changed
     entries may belong to no body:
@@ -190,8 +190,8 @@ def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _is_inertia(x: np.ndarray) -> bool:
-    """Return whether numbers can be a tensor of inertia, and are not a rotation matrix. A per cent is
-    tolerated, the accuracy of published moments.
+    """Return whether numbers can be a tensor of inertia and are not a rotation matrix. The tolerance is one
+    per cent, the accuracy of published moments.
     """
     if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
         return False

@@ -67,7 +67,7 @@ def modes(**values) -> Modes:
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a scene at which the motion continues, returned by `events` in place of a plain value.
+    """An event of a scene at which the motion continues. `events` returns it in place of a plain value.
 
     - `value`: the event happens where it falls through zero.
     - `to`: mode -> its value afterwards, by name.

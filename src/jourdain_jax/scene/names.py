@@ -37,7 +37,7 @@ def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: ty
 
 
 def as_names(names: "str | Iterable[str]") -> Labels:
-    """Return names as a tuple; in a text they are separated by spaces, as in `jj.coordinates`."""
+    """Return names as a tuple. In a text, names are separated by spaces, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
         raise ValueError(f"`{names}` was given, expected names in one text or several")
     return tuple(names.split() if isinstance(names, str) else names)

@@ -106,8 +106,8 @@ def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """Return present values of the names that a function reads; None if one has state or it is no function,
-    so that its trace cannot be stored.
+    """Return present values of the names that a function reads. Return None if one of them has state, or if
+    it is no function: its trace cannot be stored.
     """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
@@ -143,8 +143,8 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def _attribute(x, name: str):
-    """Return an attribute, or None if reading it fails: an object's own `__getattr__` may raise any error,
-    and so does a variable that is not yet set.
+    """Return an attribute, or None if reading it fails. An object's own `__getattr__` may raise any error,
+    and so may a variable that is not yet set.
     """
     try:
         return getattr(x, name, None)
@@ -185,8 +185,8 @@ class _Same:
 
 
 def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
-    """Return the key of a name's value; for a value with state its identity, or, if `where` is given, raise
-    StatefulError.
+    """Return the key of a name's value. A value with state has its identity as key; if `where` is given,
+    raise StatefulError instead.
     """
     try:
         return key(x)
@@ -203,8 +203,8 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
 
 
 def key(x: Any) -> Hashable:
-    """Return a key of a value without state: its type and value; for functions, modules and classes their
-    identity.
+    """Return a key of a value without state: its type and value. The key of a function, module or class is
+    its identity.
 
     **Raises** StatefulError for values that may change: arrays, containers, objects.
     """

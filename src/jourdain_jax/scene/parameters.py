@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, as_real, described, has_unit, know
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array. Other values stay unchanged here; they are refused later,
-    when the name of the field is known.
+    """Return a parameter as a floating-point array. Values that cannot be converted stay unchanged; they are
+    refused later, when the name of the field is known.
     """
     try:
         return as_real(value)
@@ -23,8 +23,8 @@ def _as_leaf(value):
 
 
 def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = "") -> Any:
-    """Declare a field of a scene as a physical parameter: converted to a floating-point array, and therefore
-    a differentiable leaf.
+    """Declare a field of a scene as a physical parameter. It is converted to a floating-point array, and
+    derivatives with respect to it exist.
 
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
     - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
@@ -42,8 +42,8 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
 
 
 def parameter_faults(scene) -> dict[str, Flag]:
-    """Return parameter name -> whether it is not finite or has the wrong sign; also under jit and vmap, where
-    nothing can be raised.
+    """Return for each parameter whether it is not finite or has the wrong sign. It works under jit and vmap,
+    where nothing can be raised.
     """
     faults = {}
     for name, value, metadata in parameters_of(scene):
@@ -78,8 +78,8 @@ def check_parameters(scene) -> None:
 
 
 def stacked_parameters(scene) -> str:
-    """Name the parameters of a scene that have one axis more than their defaults, as a batch of scenes has;
-    empty if there are none.
+    """Return the names of parameters of a scene that have one axis more than their defaults, as in a batch of
+    scenes; empty if there are none.
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}

@@ -16,11 +16,12 @@ from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, la
 
 
 def inertia_from_log_cholesky(numbers) -> Matrix3:
-    """Return an inertia matrix (3, 3) about the mass centre in kg m^2, possible for all values of the
-    numbers.
+    """Return an inertia matrix (3, 3) about the mass centre, in kg m^2. It is physically possible whatever
+    the numbers are.
 
-    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13) in sqrt(kg) m, of which d are logarithms; for a body
-    that is symmetric about its x-z plane, (d1, d2, d3, s13): Ixy = Iyz = 0.
+    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13): d are the logarithms of the diagonal entries of a
+    triangular factor, s its other entries; the entries are in sqrt(kg) m. For a body that is symmetric about
+    its x-z plane, where Ixy = Iyz = 0: (d1, d2, d3, s13).
 
         class Frame(jj.Scene):
             inertia: jax.Array = jj.parameter(jj.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit

@@ -248,8 +248,8 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
 
 
 def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str]:
-    """Return the omitted parts of a partly given quaternion as zero, without which its attitude would be
-    ambiguous.
+    """Return the omitted parts of a partly given quaternion as zero, since its attitude would be ambiguous
+    otherwise.
     """
     named = [name for name in parts if name in given]
     if len(named) in (0, 4):
@@ -259,9 +259,9 @@ def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str
     if np.any(abs(known_numbers(square) - 1) > 1e-4):  # parts may be typed with a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
-            f"of the quaternion `{group}` only {told} is given, with squares that sum to "
-            f"{float(square):.4g}, not an attitude; give all four parts, {group}=(w, x, y, z), or parts "
-            "whose squares sum to 1, with zero for the others"
+            f"of the quaternion `{group}` only {told} is given; its squares sum to {float(square):.4g}, so "
+            f"it is not an attitude; give all four parts, {group}=(w, x, y, z), or parts whose squares sum "
+            "to 1, with zero for the others"
         )
     return [name for name in parts if name not in named]
 

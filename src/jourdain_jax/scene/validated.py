@@ -101,7 +101,7 @@ def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of the scene's own velocity rows, without those that hold up to a force."""
+    """Return values of the scene's own velocity rows. Rows that hold up to a force are omitted."""
     given = _dictionary(scene, "velocity_constraints", (motion,), '{"edge": value}')
     always = {name: value for name, value in given.items() if not isinstance(value, HeldRow)}
     _declared(scene, given.keys() - always, "velocity_constraints", "holds=")

@@ -47,8 +47,8 @@ SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE
 
 
 class Sensitivities(Printed, eqx.Module):
-    """Derivatives of one eigenvalue by every parameter, including the change of the steady motion;
-    `found["c"]`.
+    """Derivatives of one eigenvalue with respect to every parameter; `found["c"]` is one of them. They
+    include the effect of the change of the steady motion.
     """
 
     mode: str = eqx.field(static=True)
@@ -71,8 +71,8 @@ class Sensitivities(Printed, eqx.Module):
 
 @of_known_numbers
 def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels) -> Sensitivities:
-    """Return derivatives of the eigenvalue s of small motions about a steady state by all parameters, from
-    two reverse passes.
+    """Return derivatives of the eigenvalue s of small motions about a steady state with respect to all
+    parameters, by two reverse passes.
     """
     scene, state, f = small
     equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f))
@@ -119,8 +119,8 @@ def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
         if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
             chosen.append(k)
     if not len(chosen) == count >= len(named):
-        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` "
-            f"that distinguish them ({', '.join(named)} do not)")
+        raise ValueError(f"the steady motions near this one have {count} freedoms; name {count} quantities "
+            f"in `held` that distinguish them ({', '.join(named)} do not)")
     return chosen
 
 
@@ -156,8 +156,8 @@ class CriticalPoint(Printed, eqx.Module):
 
 
 class _Program:
-    """R, the residual of `F (a b) = (a b) S`, C a and C b, with their derivatives, as functions of all
-    numbers, a, b, and S (by rows).
+    """Three quantities with their derivatives: R, the residual of `F (a b) = (a b) S`; C a; and C b. They are
+    functions of all numbers, a, b, and S (by rows).
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[tuple[int, ...], ...]) -> None:
@@ -221,8 +221,8 @@ class Special(eqx.Module):
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return rows L with L X = c. They fix given values, the size and phase of a and b relative to a
-        nearby point, and w where it is zero.
+        """Return rows L with L X = c. They fix the given values, the size and phase of a and b (relative to a
+        nearby point), and w where it is zero.
         """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
@@ -310,12 +310,15 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
         jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(0.08)
 
     **Arguments**
-    - `scene`: of the class of the family's; its parameters may be traced, and be others: the point is followed from the family's to them.
-    - `motions`: the family, with the inputs that it was followed with.
-    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. Of several the one nearest to the family's guess is meant.
+    - `scene`: of the same class as the family's scene. Its parameters may be traced, and may differ from the
+      family's: the point is followed from those parameters to these.
+    - `motions`: the family, with its inputs.
+    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. If there are
+      several such points, the one nearest to the family's guess is taken.
 
-    **Returns** a `CriticalPoint`, by the implicit function theorem: runs under `jit` and `vmap` and is differentiable twice. Where the point does not exist
-    for these parameters, or is no smooth function of them, its numbers and their derivatives are NaN, and `code` is not 0.
+    **Returns** a `CriticalPoint`. It is twice differentiable, by the implicit function theorem, and works
+    under `jit` and `vmap`. Where the point does not exist for these parameters, or is no smooth function of
+    them, its numbers and their derivatives are NaN, and `code` is not 0.
 
     **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class; float32.
     """

@@ -36,8 +36,8 @@ class Point:
 def solved(
     equations: Motions, z: Vector, rows: Float[np.ndarray, "fixed unknowns"], targets: Float[np.ndarray, "fixed"], most: int = 8, longest: float = np.inf
 ) -> tuple[Vector, Look, int] | None:
-    """Return z with R = 0 and `rows z = targets`, the equations there and the number of corrections; None
-    where Newton's method does not converge.
+    """Return z with R = 0 and `rows z = targets`, the equations there, and the number of corrections. Return
+    None if Newton's method does not converge.
     """
     for k in range(most):
         look = equations(z)
@@ -67,10 +67,10 @@ def along(equations: Motions, point: Point, s: float, guess: Vector | None = Non
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
-    """Return the points of a curve from its start on, and the reason why it ends: a target, its own start, or
-    no further point.
+    """Return the points of a curve from its start on, and the reason why it ends: it meets a target or its
+    own start, or no further point is found.
 
-    A step is halved where the curve turns sharply, where it takes many corrections, or where eigenvalues move
+    A step is halved if the curve turns sharply there, if many corrections are needed, or if eigenvalues move
     so far that they cannot be matched.
     """
     points, step, easy = [start], LONGEST / 10, 3
@@ -105,7 +105,7 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Return why a curve ends before a point, namely that a parameter has the wrong sign there; None where
+    """Return the reason why a curve ends before a point: a parameter has the wrong sign there. Return None if
     all signs are right.
     """
     values = equations.values(point.z)
@@ -142,8 +142,9 @@ def located(equations: Motions, here: Point, there: Point, test: Callable[[Point
     """Return the point between two neighbours at which a smooth `test` changes its sign; None where the curve
     is lost or undefined.
 
-    The interval is repeatedly divided, not in the middle, and a short one is interpolated linearly. At a
-    branch point itself the equations lose rank, and by symmetry such a point often lies in the middle.
+    The interval is divided repeatedly, at places other than its middle; a short interval is interpolated
+    linearly. At a branch point itself the equations lose rank, and by symmetry branch points often lie in the
+    middle.
     """
     share, short = 0.4, 1e-6  # a piece that short differs from its chord by the square of its length
     (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there

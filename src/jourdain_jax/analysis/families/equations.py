@@ -132,8 +132,8 @@ class SteadyEquations(Motions):
         return self.with_held(v[self.rows], J, z, (F, C))
 
     def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
-        """Return the directions of (q, y), in columns and SI units, along which steady motions continue at
-        equal parameters.
+        """Return the directions of (q, y) along which there are further steady motions with the same
+        parameters, as columns in SI units.
         """
         count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
         return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
@@ -145,8 +145,9 @@ class SteadyEquations(Motions):
         """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros that belong
         to motion along the family or to held quantities.
 
-        Steady motions continue along T; these directions have zero eigenvalues by structure and are removed
-        as a subspace. With P orthonormal and across T, the others are the eigenvalues of P' A P.
+        There are further steady motions along the directions T. Their zero eigenvalues are removed as a
+        subspace: the other eigenvalues are those of P' A P, where the columns of P are orthonormal and
+        perpendicular to T.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
         F, C = look.small
@@ -169,7 +170,7 @@ def numbered(scene: Scene) -> Scene:
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Return the sizes of some coordinates, by their domain, and of all speeds. They are the units of the
+    """Return the sizes of some coordinates (from their domain) and of all speeds. They are the units of the
     unknowns.
     """
     low, high = coordinate_bounds(scene)

@@ -59,8 +59,8 @@ class Family(Printed):
     """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
     periodic motion are those at the start of a period.
 
-    Eigenvalues keep their columns along the curve. Zeros due to motion along the family or to held quantities
-    are omitted. For periodic motions, all multipliers take the place of eigenvalues.
+    Each eigenvalue keeps its column along the curve. Zeros due to motion along the family or to held
+    quantities are omitted. For periodic motions, all multipliers take the place of eigenvalues.
     """
 
     equations: Motions
@@ -100,13 +100,13 @@ class Family(Printed):
 
     @property
     def changes(self) -> tuple[FamilyPoint, ...]:
-        """Points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two meet; for
-        multipliers, points at which one passes 1 or -1, or a pair the unit circle.
+        """Points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two eigenvalues
+        meet. For multipliers: points at which one passes 1 or -1, or a pair passes the unit circle.
         """
         return tuple(point for point in self.special if point.modes)
 
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
-        """Return every point of the curve with this value of one coordinate, speed or parameter:
+        """Return every point of the curve at which a coordinate, speed or parameter has this value:
         `family.at(lean=0.4)`.
         """
         if len(named) != 1:
@@ -173,7 +173,8 @@ def family(
     inputs: Numbers | dict | None = None,
     max_points: int = 4000,
 ) -> Family:
-    """Follow the family of steady motions through the one near a guess, `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0` with one freedom left, or of periodic ones.
+    """Follow the family of steady motions through the motion near a guess, or a family of periodic motions.
+    Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`, with one freedom left.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
         print(turns)                                  # folds, branch points, changes of stability, why the curve ends

@@ -158,8 +158,8 @@ def periodic(
 
 
 class _Shooting(eqx.Module):
-    """R and its derivatives as functions of the states at which pieces begin, shape (pieces, states), and of
-    the period.
+    """R and its derivatives as functions of the period and of the states at which pieces begin, shape
+    (pieces, states).
     """
 
     scene: Scene
@@ -260,8 +260,8 @@ class _Shooting(eqx.Module):
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
-        """Return the eigenvalues of the product M_n .. M_1, whose factors come from df_k/dz_k and f_k,
-        largest first. If the period is unknown, the eigenvalue of motion along the orbit is omitted.
+        """Return the eigenvalues of the product M_n .. M_1, largest first. Its factors come from df_k/dz_k
+        and f_k. If the period is unknown, the eigenvalue of motion along the orbit is omitted.
         """
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
@@ -312,8 +312,8 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R, its derivatives and the multipliers of one scene as functions of z: the unknowns of a periodic
-    motion, and a varying parameter.
+    """R, its derivatives and the multipliers of one scene as functions of z, which holds the unknowns of a
+    periodic motion and one varying parameter.
     """
 
     what, modes = "periodic motions", "multipliers"

@@ -40,8 +40,8 @@ class Test:
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Return the place where a test nearly vanishes without changing its sign, from a parabola through its
-    values f at three neighbours (the second at zero); None where it changes its sign.
+    """Return the place where a test nearly vanishes without changing its sign; None if it changes its sign.
+    The place is found by a parabola through the values f at three neighbours, of which the second is at zero.
     """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
@@ -82,7 +82,7 @@ def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
     """Return unit tangents of the two curves that cross at a branch point: a and a' in its null space with l
     . R_zz a a = 0.
 
-    R_zz is a central difference of J. Of the left null vectors l only one gives a quadratic form that is not
+    R_zz is a central difference of J. Only one of the left null vectors l gives a quadratic form that is not
     zero.
     """
     look = equations(z)

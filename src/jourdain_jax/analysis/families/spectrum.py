@@ -19,7 +19,9 @@ def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states
 
 
 def matched(before: Modes, now: Modes) -> Modes:
-    """Return the eigenvalues in the columns of their predecessors: in the order of least movement."""
+    """Return the eigenvalues, each in the column of its predecessor, by the assignment with the least
+    movement.
+    """
     apart, place = np.abs(before[:, None] - now), np.arange(len(now))
     return now[optimize.linear_sum_assignment(apart - 1e-12 * (1 + largest(now)) * np.outer(place, place))[1]]
 

@@ -31,8 +31,8 @@ SLOTS = (
 
 
 class _Record(NamedTuple):
-    """The forward steps of a motion: their number, the window that is kept in memory, and a checkpoint for
-    `every` given number of windows.
+    """The forward steps of a motion: their number, the window that is kept in memory, and checkpoints, each
+    after `every` given number of windows.
     """
 
     going: Going

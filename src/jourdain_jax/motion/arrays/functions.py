@@ -48,7 +48,9 @@ class ArrayForm(Form):
 
 
 def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
-    """Return the values of `f` at the first part, then their tangents, in the order of the parts (None: zero)."""
+    """Return the values of `f` at the first part, then the tangents for the other parts in their order (None:
+    zero).
+    """
     if len(parts) == 1:
         return [f(*parts[0])]
     half = len(parts) // 2
@@ -192,7 +194,7 @@ class Functions:
         return jnp.concatenate([state, y[self.form.q_and_v :] - rise, modes])
 
     def _reset_at(self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]) -> tuple[list, list]:
-        """Return the state after an event with its tangents, and its time with its tangents.
+        """Return the state after an event and the time of the event, both with their tangents.
 
         `parts`: the state and the varying arrays, with tangents; `fixed`: the other arrays, by index;
         `modes`: those after the event.
@@ -340,7 +342,8 @@ class Functions:
         self._pull(partial(self._events, t), y, g, self.form.events, to_y, to_known)
 
     def pull_step(self, state: Pointer, t, h, y: Pointer, g: Pointer, added: Pointer) -> None:
-        """Pull cotangents back through an implicit step and its projection, in lanes that took it."""
+        """Pull cotangents back through an implicit step and its projection, in the lanes that took the step.
+        """
 
         def f(y, *shared):
             end = self._solved(t, h, y, *shared)[0].rows

@@ -53,8 +53,8 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
-    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed sign or a
-    row turned.
+    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its sign or
+    a row turned round.
     """
     at, pivots, halves, every = (
         w.room(form.integrated),

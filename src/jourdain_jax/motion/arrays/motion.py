@@ -110,7 +110,7 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """Run blocks of lanes one after another. Outside, the axis of lanes is the first; inside it is the last,
+    """Run blocks of lanes one after another. Outside, the axis of lanes is the first. Inside it is the last,
     except for known arrays.
     """
     given = jax.tree.map(
@@ -133,8 +133,8 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function (state, time t, shift d) -> state. The value of d is zero; a tangent of d moves the
-    state along its rates.
+    """Return a function (state, time t, shift d) -> state that moves the state along its rates by d. The
+    value of d is zero: it only carries derivatives.
     """
     known, others = eqx.partition(args, eqx.is_inexact_array)
 

@@ -29,7 +29,7 @@ class Rows(NamedTuple):
 
 @dataclass(eq=False)
 class Room:
-    """Holds rows, each as its own array or as (an array of several rows, the index in it)."""
+    """Holds rows, each as an array of its own or as a pair (an array of several rows, the index in it)."""
 
     rows: list
     number: int  # of the rooms that a writer has made
@@ -138,8 +138,8 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return the rooms into which the body stores, and the shapes of its results, found by a trace that
-        leaves the rooms unchanged.
+        """Return the rooms into which the body stores, and the shapes of its results. A trace finds them
+        without changing the rooms.
         """
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)
@@ -204,7 +204,7 @@ class ArrayWriter:
         return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
 
     def put_at(self, place: Pointer, rows: int, index: Array, value: Array, where: Array) -> None:
-        """Put a value into the row with each lane's own index, in lanes for which `where` is true. Indices
+        """Put a value into the row whose index each lane has, in lanes for which `where` is true. Indices
         beyond the last row are skipped.
         """
         every = Rows(0, rows)

@@ -229,9 +229,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
-    """Check times, and inputs for jumps between them, if all lanes have one known span.
+    """Check times, and inputs for jumps between the times, if all lanes have one known span.
 
-    Other spans are traced; there, a lane with an invalid time gets a result code.
+    Other spans are traced: a lane with an invalid time then gets a result code.
     """
     ts, t0, t1 = (span[name] for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):

@@ -48,7 +48,7 @@ class DiscreteGradient(FixedStepMethod):
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """Return the minimal `field` of the state. Raises ValueError where the energy of the `scene` is not
-        constant, or there is no minimal state; `asked`: the requested state.
+        constant, or there is no minimal state. `asked`: the requested state.
         """
         fault = _fault(scene, field, asked)
         if fault:

@@ -192,7 +192,9 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 
 def _projected(args, over: Interval, q0, q1) -> Speeds:
-    """Return speeds on the rows with the momentum at the end of the interval, up to a constraint impulse."""
+    """Return speeds on the rows that have the given momentum at the end of the interval, up to a constraint
+    impulse.
+    """
     _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)
     _, p1 = discrete_momenta(scene, over, q0, q1, inputs)

@@ -7,16 +7,14 @@ An event happens where its value falls through zero. A motion that starts with a
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
 
-if the value is positive after a first step, which is tried again at half its length where it is not, down to that noise (otherwise the search would find
-the zero at the start); then the event has happened at
-the start, as it has where the value is lower, or does not rise.
+if the value is positive after a first step. Where it is not, the step is tried again at half its length, down to that noise; otherwise the search would find
+the zero at the start. Then the event has happened at the start, as it has where the value is lower or does not rise.
 
 All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. NaN is not positive: such a value lies
 beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
 and t_a, is by the cubic through values and rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe,
-otherwise the middle). Where a trial finds another event, all that
-is after it no longer counts: so the event that is found has no other before it, as far as values were seen. A value of zero may be one that stays zero
-beyond the event: it is an end of the bracket like a negative one, which is then halved.
+otherwise the middle). Where a trial finds another event, all that is after it no longer counts, so that the event found has no other before it, as far as
+values were seen. A value of zero may stay zero beyond the event: it is an end of the bracket like a negative one, which is then halved.
 
 The times tried are constants to differentiation. Near the event, shifts of Newton's method follow,
 
@@ -71,13 +69,12 @@ def _each(w, condition, a: Values, b: Values) -> tuple:
 
 
 def reach_of_noise(w, span):
-    """Return the time in which a value rises by at most the amount by which round-off may make it negative at
-    a start."""
+    """Return the time in which a value rises by as much as round-off may make it negative at the start."""
     return w.eps**LEAVES * w.magnitude(span)
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> tuple[list, list]:
-    """Return the events that have happened at a start, and the values that rise from zero there but are not
+    """Return the events that have happened at a start, and the values that rise from zero there without being
     positive after one step."""
     sunk, sinks = [], []
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
@@ -101,13 +98,15 @@ def first_event(w, before: Values, after: Values):
 
 
 def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of a + m s + A s^2 + B s^3 (0 <= s <= 1) by values and rates at the ends of a step h."""
+    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and s = 1, the ends of a step
+    h.
+    """
     m_0, m_1, rise = h * slope_a, h * slope_b, b - a
     return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
 
 
 def falls_through(w, h, a, slope_a, b, slope_b):
-    """Return the fraction of a step at which the cubic falls to zero, or else the straight line."""
+    """Return the fraction of a step at which the cubic, or else the straight line, falls to zero."""
     m, A, B = cubic(h, a, slope_a, b, slope_b)
     s = line = a / (a - b)
     for _ in range(4):
@@ -117,8 +116,8 @@ def falls_through(w, h, a, slope_a, b, slope_b):
 
 
 def trial(w, t, c, step, last, guess) -> tuple:
-    """Return the next time to try in a step of length `step`, and whether the last one is near enough, from
-    the times and values of a bracket.
+    """Return the next time to try in a step of length `step`, and whether the last time tried is near enough.
+    `times` and values are those of a bracket.
 
     The first trial divides the bracket by the fraction `guess`. With `last` the search ends, at a time where
     the value is a number."""
@@ -171,8 +170,8 @@ def search_of(form: Form, p: Lanes) -> Search:
 
 
 def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
-    """Advance the search by a step with its `start` and `end` (time, values of all events, rates), in lanes
-    where it `changes`.
+    """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time, values of
+    all events, rates).
 
     `begins`: whether the event is in this step. Returns the index of the event that the search follows."""
     old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
@@ -230,8 +229,8 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half the fraction of a step `h` during which the values that rise from zero stay positive, as
-    their cubics show. It is at most a half."""
+    """Return half the fraction of a step `h` during which the values that rise from zero stay positive
+    according to their cubics. The result is at most a half."""
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
         m, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -265,8 +264,9 @@ def monitored(
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of events that were not left, so that a value that rises above zero and falls
-        again within a step counts as a new event."""
+        """Reverse the sign of events that were not left: rising above zero and falling again in a step counts
+        as new.
+        """
         if not form.goes_on:
             return found
         off = p.every("disarmed")

@@ -51,7 +51,7 @@ class Method:
 
     @property
     def at_the_end(self) -> int:
-        """Return the last stage at the end of a step, or the last of all stages if none is at the end."""
+        """Return the last stage at the end of a step. If no stage is at the end, return the last of all."""
         return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
@@ -146,7 +146,7 @@ class Aim(NamedTuple):
 
 
 def aimed(w, p, target, reach, shift=None) -> Aim:
-    """Return the length of a step to the `target`, to half of the way, or to `reach`, whichever applies;
+    """Return the length of a step to the `target`, to half of the way, or to `reach`, whichever applies.
     `shift`: from a search for an event, if there is one.
     """
     locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
@@ -178,7 +178,9 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
 
 
 def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """Return the result code of a motion whose `span` has ended; `h`: the length of the next step."""
+    """Return the result code of a motion that ends after `span`, when every requested time has been reached.
+    `h`: the length of the next step.
+    """
     # the last steps against the average one
     # 0.01 of the average step: a singularity is near
     shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))

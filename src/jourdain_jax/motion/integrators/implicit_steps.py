@@ -69,8 +69,8 @@ class FixedStepMethod(ImplicitMethod):
 
 
 def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
-    """Return the size of each unknown, relative to which round-off is judged: that of the state x and of its
-    change; 1 where both are zero.
+    """Return the size of each unknown, relative to which round-off is judged: the larger of the state x and
+    of its change; 1 where both are zero.
     """
     size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(change))
     return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))

@@ -28,7 +28,9 @@ def state_norm(y: Integrated) -> PerLane:
 
 
 def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorField, Instant]:
-    """Return the vector field, and its arguments in a state; `of_rates`: for its rates. Of lanes, with their axis last."""
+    """Return the vector field, and its arguments in a state. `of_rates`: return those of its rates. Lanes
+    have their axis last.
+    """
     field, scene, inputs, fixed, origin = args
     t = origin + tau
     values = field.now if of_rates else lambda inputs, t: inputs(t)
@@ -37,7 +39,9 @@ def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorFie
 
 
 def _lane_by_lane(knows_lanes: Callable[[VectorField], bool]) -> Callable:
-    """Return a decorator for functions of (tau, y, args): lanes go through them one by one, unless the field knows lanes."""
+    """Return a decorator for functions of (tau, y, args). Lanes go through such a function one by one, unless
+    the field handles lanes.
+    """
 
     def decorated(function: Callable) -> Callable:
         @eqx.filter_jit

@@ -40,8 +40,8 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
 
 def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> list[list[Number]]:
-    """Return values and rates of events. For a relation at rest, the value is the distance at which its
-    number leaves zero.
+    """Return values and rates of events. The value of a relation at rest is the distance at which its number
+    leaves zero.
     """
     c, rate = (list(part) for part in found)
     for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
@@ -53,8 +53,8 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
 
 
 def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
-    """Return which values fall after an event, and the values; those that still rise from zero are not
-    falling.
+    """Return which values fall after an event, and the values. Values that still rise from zero do not count
+    as falling.
 
     The next saved time may be within round-off of the event.
     """

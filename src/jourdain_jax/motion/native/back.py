@@ -147,7 +147,7 @@ def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -
 
 
 def _used(method: Method) -> list[int]:
-    """Return the stages that the end of a step depends on, the last one first."""
+    """Return the stages on which the end of a step depends, the last one first."""
     found: list[int] = []
     for stage in reversed(range(method.needed)):
         if method.b[stage] != 0 or any(method.A[j][stage] != 0 for j in found):
@@ -222,7 +222,7 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
 
 def _write_project_back(w: MachineWriter, form: Form) -> None:
     """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into those of the
-    state `free` before it.
+    state `free` before the projection.
     """
     moves, count = form.moves, form.integrated
     with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
@@ -237,8 +237,8 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 
 
 def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `event_back(job, state, who, g, by_known)`: the function of this name, with cotangents of the
-    end's time from the job.
+    """Write `event_back(job, state, who, g, by_known)`, the function of the same name here, with cotangents
+    of the end's time from the job.
     """
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         located = is_located(w, Lanes(w, form, state))
@@ -252,8 +252,8 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
 
 
 def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `reset_back(job, state, who, left, g, by_known)`: the function of this name, with cotangents of
-    the transition's time from the job.
+    """Write `reset_back(job, state, who, left, g, by_known)`, the function of the same name here, with
+    cotangents of the transition's time from the job.
     """
     with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
@@ -349,8 +349,9 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
 
 
 def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable[..., Float[Array, "found"]]:
-    """Return cotangents of the start's state and of the requested known numbers (`asked`), as a function of
-    the start and of cotangents of the states at the goals and of the end and its time.
+    """Return a function that returns cotangents of the start's state and of the requested known numbers
+    (`asked`). Its arguments are the start, and cotangents of the states at the goals, of the end and of the
+    end's time.
     """
     n = form.y
 

@@ -71,7 +71,7 @@ def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], 
 
 
 def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Return values of all nodes of outputs that are given from outside; `known`: as returned by
+    """Return values of those nodes of outputs that are given from outside. `known`: as returned by
     `known_values`.
     """
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
@@ -135,7 +135,7 @@ def write_projection(w: MachineWriter, form: Form) -> None:
 
 def _write_along(w: MachineWriter, form: Form) -> None:
     """Write `along(state, tau, y)`: for a state `y` on the constraints, keep only the part of its error along
-    them, since a projection removes the rest.
+    the constraints, since a projection removes the rest.
     """
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
@@ -231,7 +231,8 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
 
 
 def steps_of(form: Form) -> dict[str, NodeList]:
-    """Return the parts of a step: rates, the whole state after either part of a projection, stop events."""
+    """Return the parts of a step: rates, the whole state after either part of a projection, and stop events.
+    """
     program, (_, _, y, _) = form.program, form.split(form.program.variables)
     q, u = y[: form.coordinates], y[form.coordinates :]
     found = {"rates": form.rates}

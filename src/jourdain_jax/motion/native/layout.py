@@ -374,7 +374,7 @@ def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
 
 
 def room_of_lanes(w: MachineWriter, form: Form) -> Value:
-    """Return memory for all rows. On a GPU, the location of the shared rows follows."""
+    """Return memory for all rows. On a GPU, the location of the shared rows comes after them."""
     return w.room(form.all + w.device)
 
 

@@ -173,7 +173,7 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
 
 
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
-    """Return the rows of a lane's start, each contiguous range with its source.
+    """Return the rows of a lane's start as contiguous ranges, each with its source.
 
     On a GPU, numbers that all lanes share and that steps do not change are not copied.
     """
@@ -274,7 +274,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
 
 
 def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
-    """Save the state of a lane at a due time; at the end, save it for all remaining times, and begin the next
+    """Save the state of a lane at a due time. At the end, save it for all remaining times and begin the next
     sample.
     """
     times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
@@ -328,7 +328,9 @@ OF_SAMPLES = 'machine code does not differentiate with respect to samples of an 
 
 
 def flow(form: Form, method: Method, order: int | None) -> Loop:
-    """Return the motion by a kernel; `order`: that of a Taylor series, in place of the tableau."""
+    """Return the motion by a kernel. `order`: the order of a Taylor series, which then takes the place of the
+    tableau.
+    """
 
     def motion(form: Form) -> Loop:
         # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau

@@ -48,14 +48,14 @@ Unknowns = Float[Array, "z"]
 
 def numbers_of(channel: FunctionOfTime) -> list:
     """Return each number of a function of time. If a tree of flags or tangents is given, return its entries
-    in their place (None: nothing).
+    in place of the numbers (None: nothing).
     """
     return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers` and all of `channel.held` from the next replacements of each number; None if
-    there are none.
+    """Return `channel.numbers` and all of `channel.held`, each number replaced by the next replacement; None
+    if there are none.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
@@ -72,8 +72,8 @@ def _each(part, shape: tuple[int, ...]) -> list:
 
 
 def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return z, which depends on a displacement of time along its `rates`. The value of the displacement is
-    zero; only its derivative matters.
+    """Return a function of z and of a displacement of time that moves z along its `rates`. The value of the
+    displacement is zero: it only carries derivatives.
     """
 
     def moving_with_time(slope: Callable) -> Callable:
@@ -223,8 +223,8 @@ def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function that moves a state at time t along its rates by a time d. The value of d is zero;
-    only its derivative matters.
+    """Return a function that moves a state at time t along its rates by a time d. The value of d is zero: it
+    only carries derivatives.
     """
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(_rates(form))
 
@@ -272,8 +272,8 @@ def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scala
 
 
 def known_of(args: tuple) -> list:
-    """Return the known numbers of the rates: those of parameters only, those of functions of time, and
-    constant inputs; None for samples.
+    """Return the known numbers of the rates: numbers that depend on parameters only, numbers of functions of
+    time, and constant inputs. Samples have None.
     """
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
@@ -281,7 +281,7 @@ def known_of(args: tuple) -> list:
 
 
 def with_known(inputs: Inputs, known: Sequence) -> Inputs:
-    """Return inputs with replacements of their numbers, in the order of `known_of` and without fixed ones."""
+    """Return inputs with their numbers replaced, in the order of `known_of` but without the fixed ones."""
     each = iter(known)
     new = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in parts_from(channel, each)]
     new += [x for channel, x in zip(others_of(inputs), each, strict=True) if isinstance(channel, Constant)]

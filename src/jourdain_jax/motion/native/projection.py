@@ -102,8 +102,8 @@ def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_cholesky(w: MachineWriter, n: int) -> None:
-    """Write `cholesky(M)`: L in place of the lower triangle of M; the identity if M is not positive definite
-    to round-off, NaN if it is not finite.
+    """Write `cholesky(M)`, which puts L in place of the lower triangle of M. L is the identity if M is not
+    positive definite to round-off, and NaN if M is not finite.
     """
     with w.procedure("cholesky", "M") as (M,):
         finite, smallest = w.room(), w.room()
@@ -200,7 +200,7 @@ class Rows:
 
 
 def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
-    """Write the module, which takes `of.given`, marks of free entries, and lengths, to the projected
+    """Write the module. It takes `of.given`, marks of free entries, and lengths, and returns the projected
     quantities and the residual.
 
     `cutoff`: singular values of rows below this share of the largest one count as zero.
@@ -233,7 +233,7 @@ def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) 
 
 def _write_metric(w: MachineWriter, of: Rows) -> None:
     """Write `metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled
-    speeds; held speeds have the identity.
+    speeds. Held speeds have the identity in it.
     """
     n, first_free = len(of.moving), len(of.given)
     with w.procedure("metric", "state L c") as (state, L, c):

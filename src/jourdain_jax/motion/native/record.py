@@ -113,8 +113,8 @@ def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
 
 
 def _write_more_room(w: MachineWriter) -> None:
-    """Write `more_room(old, bytes)`: allocate twice as many bytes, and copy the old ones; null if there are
-    none.
+    """Write `more_room(old, bytes)`: allocate twice as many bytes and copy the old content. The result is
+    null if there is no memory.
     """
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
         new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)

@@ -39,8 +39,8 @@ class Start(NamedTuple):
     plain: tuple[Array, ...] = ()  # `known` without lanes where all share it, for kernels of a GPU
 
     def numbers(self) -> Numbers:
-        """Return the rows at the start that are not `constant_rows`, after the state; without lanes where all
-        share them.
+        """Return the rows at the start that are not `constant_rows`, after the state. Rows that all lanes
+        share have no axis of lanes.
         """
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
@@ -87,8 +87,8 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return the results of `vmap` with lanes removed from parts that do not need them, and marks of the
-        parts that keep them; `given`: the parts of the start that have lanes.
+        """Return the results of `vmap`, with lanes removed from parts that do not need them, and marks of the
+        parts that keep them. `given`: the parts of the start that have lanes.
 
         A tangent has lanes if anything on which it depends has. All directions share the values of one
         motion.

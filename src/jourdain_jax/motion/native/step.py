@@ -155,7 +155,9 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
-    """Update the lanes after a tried step; `k`: derivatives at the stages, with that at the start first."""
+    """Update the lanes after a tried step. `k`: derivatives at the stages, beginning with the one at the
+    start.
+    """
     y, count = p.pointer, form.integrated
     if form.goes_on:
         p["left"] = w.number(0.0)
@@ -221,8 +223,8 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
 
 
 def unseen(w: StepWriter, form: Form) -> tuple:
-    """Return the initial values for monitoring pivots and directions: first directions, extremes of pivots,
-    and whether a row turned round.
+    """Return the initial values for monitoring pivots and directions: the directions at the start, extremes
+    of pivots, and whether a row turned round.
     """
     low, high = ([w.number(x)] * form.pivots for x in (math.inf, -math.inf))
     return [w.number(0.0)] * form.turning, low, high, w.literal(0, w.truth)
@@ -245,7 +247,9 @@ def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
-    """Return the squared part of each row normal to the rows before it, and its squared size."""
+    """Return the square of the part of each row that is normal to the rows before it, and the square of its
+    size.
+    """
     found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
     return list(zip(found[::2], found[1::2], strict=True))
 

@@ -129,8 +129,8 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """Return the given indices j, sorted so that the products a_j b_{k-j} whose factors become known last
-    come last.
+    """Return the given indices j in an order in which the products a_j b_{k-j} come last whose factors become
+    known last.
     """
     return sorted(js, key=lambda j: max(j, k - j))
 
@@ -139,8 +139,8 @@ Terms = list[tuple[tuple[int, ...], int]]  # a sum of products: factors that var
 
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
-    """Return nodes for equal numbers, up to round-off, with fewer products of varying values, each of which
-    is a sum in every coefficient; `moving`: varying inputs.
+    """Return nodes for the same numbers, equal to round-off, with fewer products of varying values, since
+    every coefficient of a product is a sum. `moving`: varying inputs.
 
     Sums and products are expanded into terms. Then the sharing that saves most products is applied
     repeatedly: x y where several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a

@@ -29,8 +29,8 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
 
 @lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
-    """Return the program with these functions in place of inputs, or the reason why there is none. Their
-    numbers come last among the `fixed` ones.
+    """Return the program with these functions in place of inputs, or the reason why this is not possible.
+    Their numbers come last among the `fixed` ones.
     """
     numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
     if numbers > MOST_NUMBERS:

@@ -157,7 +157,7 @@ def is_noted(w: StepWriter, form: Form, left: Number) -> Number:
 
 
 def slowest(w: StepWriter, p: Lanes) -> Number:
-    """Return the largest change over the whole motion with which a number counts as resting."""
+    """Return the largest change over the whole motion for which a number still counts as resting."""
     return w.larger(RESTS * p["atol"], w.eps)
 
 

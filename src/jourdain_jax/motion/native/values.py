@@ -261,7 +261,7 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Return values of nodes as a function of the values of the variables: by XLA, and by machine code.
+    """Return values of nodes as a function of the values of the variables, by XLA and by machine code.
 
     Machine code returns only the nonzero numbers, since the whole matrix of 32 trailers would not fit on its
     stack.
@@ -283,7 +283,9 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Machine code for quantities beside the steps of a program: functions of fixed values, time, coordinates, privileged speeds and inputs."""
+    """Machine code for quantities beside the steps of a program. They are functions of fixed values, time,
+    coordinates, privileged speeds and inputs.
+    """
 
     program: Lowered
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others

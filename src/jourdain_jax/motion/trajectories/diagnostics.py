@@ -20,8 +20,8 @@ OverTimes = Float[Array, "*lanes times"]
 
 
 class Energies(eqx.Module):
-    """Energies along a motion, in J. `balance` is constant for a correct motion: T + V, minus the work done
-    if it is integrated.
+    """Energies along a motion, in J. `balance`, which is T + V minus the work done (if that is integrated),
+    is constant for a correct motion.
     """
 
     kinetic: OverTimes

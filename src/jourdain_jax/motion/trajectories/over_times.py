@@ -57,7 +57,7 @@ class Phases(eqx.Module, Printed):
         return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())]) if self.ts.ndim == 1 else f"Phases of lanes {self.ts.shape[:-1]}"
 
     def lost_until(self, ts: Float[Array, "*lanes times"]) -> Float[Array, "*lanes times"]:
-        """Return by how much events have lowered T + V at each time `ts` (s), in J."""
+        """Return the loss of T + V by events until each time `ts` (s), in J."""
         ahead = (self.ts[..., None, :] - ts[..., None]) * jnp.sign(ts[..., -1:] - ts[..., :1])[..., None]
         return jnp.sum(jnp.where(ahead <= 0, self.lost[..., None, :], 0.0), axis=-1)
 

@@ -13,13 +13,13 @@ MESSAGES = {
     EVENT: "stopped at an event",
     MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() or "
         "retry=True where forces are stiff, or look for a singularity near the last time",
-    STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be "
-        "met near the last time",
+    STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or constraints that "
+        "cannot be satisfied near the last time",
     NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or constraint is NaN "
         "there, or they are not determined (rows that lose rank, no inertia along a free direction); examine "
         "the last state with `accelerations` and `verify`",
-    INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a "
-        "body begins below the ground of a contact with friction, or Coulomb's law has no solution for its "
+    INCONSISTENT_START: "the start does not satisfy the constraints and could not be projected onto them; or "
+        "a body begins below the ground of a contact with friction; or Coulomb's law has no solution for its "
         "contacts (an impact that gains energy, Painleve's paradox)",
     SINGULAR_PARTITION: "near the last time the privileged speeds do not determine the others, or the "
         "scene's own `coordinate_rates` become infinite; choose other `privileged` or other speeds, or give "
@@ -33,15 +33,15 @@ MESSAGES = {
         "did not reach the end either; replace a stiff spring or damper by a constraint, or loosen the "
         "tolerances",
     OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection undid "
-        "more than half of it, or a solver of diffrax left them by more than its step errors explain: use "
-        "shorter steps, or the default solver, or look for rows that lose rank",
+        "more than half of it, or a solver of diffrax left the constraints by more than its step errors "
+        "explain; use shorter steps or the default solver, or look for rows that lose rank",
     BAD_TIMES: "saved times lie outside the span or are not in order, the span is empty or not finite, or "
         "time runs backward in spite of friction; give increasing `ts` between `t0` and `t1`",
     ENERGY_LOST: "the energy, which should be constant, changed by more than the steps' tolerances explain: "
         "the motion left its branch at a singular position, missed a short feature of a load, or a load's "
         "potential does not belong to its force (`verify`)",
     CONTRADICTORY_ROWS: "redundant velocity constraints contradict each other at some saved time; omit one, "
-        "or correct the inputs and times that they follow",
+        "or correct the inputs and times that determine them",
     PROCESS_DIED: "processes died on it repeatedly, and a study of an earlier version skipped it",
     UNRESOLVED: "the step size shrank to zero, and `rtol` is below the resolution of this precision, 1.2e-7 "
         "in float32 and 2.2e-16 in float64: loosen it to 1e-5 and 1e-13, or set "
@@ -54,11 +54,11 @@ MESSAGES = {
     PAINLEVE: "Coulomb's law has no solution at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
     CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no tried combination of modes satisfies Coulomb's law at each; "
     "or slip turns during an impact that is followed along its impulse: give the contact impact='moreau'",
-    LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where its contact is no point; give "
-        "it contacts that can bear it there, or stop the motion before, by an event",
+    LIES_FLAT: "a disc or wheel with friction fell flat on its ground, where it does not touch in one point; "
+        "give it contacts that can support it there, or end the motion earlier by an event",
     STICKS: "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a speed does at rest: "
-    "no motion follows; give the contact `friction=` or the joint `jj.joint_friction`, which hold at rest, or let the load "
-    "change within a short range, as by `jnp.tanh`",
+    "the motion cannot continue; give the contact `friction=` or use `jj.joint_friction`, which both hold at rest, or let the "
+    "load change over a short range, as `jnp.tanh` does",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; use a shorter step, or look for a singularity there",
 }
 

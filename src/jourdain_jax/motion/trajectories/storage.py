@@ -63,7 +63,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     trajectory, kind, reruns = (motion.lanes, "rollout", motion.reruns) if isinstance(motion, Rollout) else (motion, "trajectory", ())
     if trajectory is motion and motion.q.ndim != 2:
         raise ValueError(
-            f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
+            f"`save` takes one motion, but was given a batch of shape {motion.q.shape[:-2]}; for one axis of lanes, save `jj.Rollout(batch)`"
         )
     scene = trajectory.scene
     parameters, static = _stored_fields(scene)

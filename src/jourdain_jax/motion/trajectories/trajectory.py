@@ -62,7 +62,7 @@ class Trajectory(Record, Printed):
 
     @property
     def succeeded(self) -> Bool[Array, "*lanes"]:
-        """Whether the motion reached the end of its span, or an event; also under jit and vmap."""
+        """Whether the motion reached the end of its span or an event. It works under jit and vmap."""
         return jnp.asarray(self.result) <= results.EVENT
 
     @property
@@ -72,8 +72,8 @@ class Trajectory(Record, Printed):
 
     @property
     def end(self) -> State:
-        """Return the last state reached, projected onto the constraints; a batch for many motions. Another
-        motion can continue from it at its time.
+        """Return the last state reached, projected onto the constraints; for many motions a batch of such
+        states. Another motion can continue from it at its time.
 
         motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
         """
@@ -101,8 +101,8 @@ class Trajectory(Record, Printed):
         return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
-        """Return kinetic and potential energy, and tracked work, in J; `.balance` is constant for a correct
-        motion.
+        """Return kinetic and potential energy, and the integrated work, in J. `.balance` is constant for a
+        correct motion.
         """
         kinetic, potential = map_over_times(over_times.energies, self)
         return Energies(kinetic, potential, self.work, lost_of(self))
@@ -119,8 +119,8 @@ class Trajectory(Record, Printed):
         return map_over_times(over_times.reactions, self, by_inputs=True)
 
     def contact_forces(self) -> dict[str, ContactForce]:
-        """Return normal and tangential force (N) on the body and needed friction coefficient of every rolling
-        contact at all times.
+        """Return, for every rolling contact at all times, the normal and tangential force (N) on the body and
+        the friction coefficient that it needs.
         """
         return map_over_times(over_times.contacts, self, by_inputs=True)
 

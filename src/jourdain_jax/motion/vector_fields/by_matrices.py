@@ -30,8 +30,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 class UsualLengths(eqx.Module):
-    """Usual lengths of the rows in scaled speeds, with their rank; and those of geometric rows and quaternion
-    norms in the coordinates.
+    """Usual lengths of the rows in scaled speeds, with their rank, and usual lengths of geometric rows and
+    quaternion norms in the coordinates.
     """
 
     rows: UsualRows
@@ -68,14 +68,15 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
 
 
 def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """Return the median over states, or the largest value if half of them are zero; NaN does not count."""
+    """Return the median over states, or the largest value if half of the values are zero. NaN does not count.
+    """
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """Return the median over probed states. For traced parameters it is a thousand times that, so that only
-    far longer rates count as infinite.
+    """Return the median size of the rates over probed states. For traced parameters it is a thousand times as
+    large, so that only much larger rates count as infinite.
     """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
@@ -105,8 +106,8 @@ class ByMatrices(VectorField):
         return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
 
     def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
-        """Return the rates with these accelerations `v`, pivots and rows, and with the rates of coordinates by each speed of the scene's own, which
-        must not become infinite.
+        """Add the rates of coordinates by each of the scene's own speeds, which must stay finite, to these
+        rates, pivots and rows.
         """
         power = rate_of_work(at.scene, motion, found, self.of_inputs) if self.with_work else None
         N = jax.lax.stop_gradient(rates_by_own_speeds(at.scene, at.t, at.y.q))
@@ -195,8 +196,8 @@ class FullByMatrices(ByMatrices):
         return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, eliminated rows, and a number: 1 if the rows determine the branch of the motion, -1
-        if only round-off does.
+        """Return `rates`, eliminated rows, and a number that is 1 if the rows determine the branch of the
+        motion, and -1 if only round-off determines it.
         """
         motion, found, directions = self.solved(at, at.y.v)
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]

@@ -94,8 +94,8 @@ def as_formulation(formulation) -> Formulation:
 
 
 def reason_for_matrices(structure: Structure, constant: bool) -> str:
-    """Return the reason why a scene with a scalar program is integrated by dense matrices; empty if the
-    program is used. `constant`: whether all inputs are constant.
+    """Return the reason why a scene with a scalar program is integrated by dense matrices. Return nothing if
+    the program is used. `constant`: whether all inputs are constant.
     """
     if structure.rows_of_inputs and not constant:
         return "velocity rows with inputs that change with time need dense matrices"
@@ -122,8 +122,8 @@ class Integrated(eqx.Module):
 
 
 class Watched(NamedTuple):
-    """Rates; pivots that must keep their signs; directions of rows nonlinear in the speeds, which must not
-    turn round; a sine that is small near a loss of rank.
+    """Four quantities: rates; pivots that must keep their signs; directions of rows nonlinear in the speeds,
+    which must not turn round; and a sine that is small near a loss of rank.
     """
 
     rates: Integrated
@@ -245,8 +245,8 @@ class VectorField(eqx.Module):
         return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
 
     def events(self, at: Instant) -> Float[Array, "events *lanes"]:
-        """Return values of the stop events, in the order of their names; for lanes only where
-        `lowers_events`.
+        """Return values of the stop events, in the order of their names. Values are for lanes only where
+        `lowers_events` is true.
         """
         return event_values(at.scene, self.motion(at))
 
@@ -305,12 +305,15 @@ class ByProgram(VectorField):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether an elimination, or the rates of the coordinates, divide by numbers that must not vanish."""
+        """Whether an elimination, or the rates of the coordinates, involve a division by numbers that must
+        not vanish.
+        """
         return self.pivots > 0 or bool(self.program.directions) or self.near_rank_loss
 
     @property
     def pivots(self) -> int:
-        """Return the number of monitored pivots: all, or with multipliers only those of the coordinate rates.
+        """Return the number of monitored pivots. With multipliers these are only the pivots of the coordinate
+        rates.
         """
         return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
 
