@@ -29,8 +29,8 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-modes friction mutants identify linearize malformed_inputs periodic types native_mutants inertia gpu sensors result_codes plain_numbers study_faults
-load_jumps inputs events feasible_starts native simulate whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32
+friction modes linearize identify native_mutants malformed_inputs gpu inertia mutants periodic types result_codes load_jumps sensors study_faults
+plain_numbers sides inputs events feasible_starts native simulate whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32
 derivatives_of_failed diffrax build fit_report quality native_derivatives native_second traced_parameters extremes report
 """
 
@@ -51,7 +51,6 @@ def pytest_collection_modifyitems(items):
 
 def pytest_collection_finish(session):
     """Tracing makes millions of objects that live for a moment: what is there for good is not looked through again and again for garbage among it."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
     gc.enable()

@@ -3,6 +3,11 @@
 import jax
 
 
+def with_value(derivative, f):
+    """`derivative(f)`, and what `f` gives, by one compiled program."""
+    return jax.jit(derivative(lambda *x: (f(*x),) * 2, has_aux=True))
+
+
 def derivatives(f, x, directions):
     """Of a scalar `f` at the vector `x`, along the two rows of `directions`.
 

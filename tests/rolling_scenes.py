@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 import jourdain_jax as jj
 
@@ -54,7 +55,7 @@ def egg(x, y, z):
     return x**2 / 0.25 + y**2 / 0.2 + z**2 / 0.16 + 0.4 * z * x**2 - 1.0
 
 
-AXIS = jnp.array([2.0, 1.0, 2.0]) / 3.0
+AXIS = np.array([2.0, 1.0, 2.0]) / 3.0
 GROUNDS = {
     "plane": lambda scene, pose: jj.Plane(normal=jnp.array([1.0, 2.0, 2.0]) / 3.0),
     "within a cylinder": lambda scene, pose: jj.Cylinder(scene.size, AXIS, side="inside"),

@@ -203,7 +203,7 @@ def test_the_attitude_turns_with_the_angular_velocity_of_the_rows():
 
 
 ANGLES, RODS = DoublePendulumAngles(), DoublePendulumRods()
-CHAIN = PendulumChain(links=2, mass=jnp.array([1.0, 0.7]), length=jnp.array([1.0, 0.8]))
+CHAIN = PendulumChain(links=2, mass=np.array([1.0, 0.7]), length=np.array([1.0, 0.8]))
 TIMES = np.linspace(0.0, double_pendulum.RUN["t_end"], 6)
 EXPECTED = double_pendulum.motion(TIMES, **double_pendulum.RUN)
 CARTESIAN = {f"{axis}{k}": EXPECTED[f"{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))}

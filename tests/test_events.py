@@ -88,7 +88,7 @@ SHAPES = ("flat", "jump", "kinked", "saturated", "steep", "straight")
 class Shaped(OnLine):
     """A particle that meets walls, by values of many shapes."""
 
-    walls: object = jj.parameter(jnp.full(6, 3.0))
+    walls: object = jj.parameter(np.full(6, 3.0))
 
     def events(self, motion):
         flat, jump, kinked, saturated, steep, straight = self.walls - motion.q.x

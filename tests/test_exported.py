@@ -2,13 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
 
-SPEEDS = jnp.array([0.5, 1.0, 2.0])
+SPEEDS = np.array([0.5, 1.0, 2.0])
 MACHINE_CODE = "jourdain_jax_"  # names of handlers begin so
 
 

@@ -17,7 +17,7 @@ import jourdain_jax as jj
 
 
 START, OTHER = {"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.4, "heading_rate": 0.6}
-TS = jnp.linspace(0.0, 4.0, 41)
+TS = np.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
 

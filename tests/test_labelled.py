@@ -3,7 +3,6 @@
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -11,7 +10,7 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 
-TIMES = jnp.linspace(0.0, 0.4, 5)
+TIMES = np.linspace(0.0, 0.4, 5)
 
 
 @pytest.fixture(scope="module")

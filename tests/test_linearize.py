@@ -367,7 +367,7 @@ def test_a_family_along_a_parameter_ends_where_this_leaves_the_sign_declared_for
 class SplineBead(HoopBead):
     """The bead with a field of many numbers, which is not a parameter, before the one that varies."""
 
-    weight: jj.Spline = jj.Spline(jnp.linspace(0.0, 1.0, 5), jnp.full(5, 9.81))
+    weight: jj.Spline = jj.Spline(np.linspace(0.0, 1.0, 5), np.full(5, 9.81))
     pace: float = jj.parameter(3.0, unit="rad/s")
 
     def bodies(self, t, q):

@@ -16,7 +16,7 @@ from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
-TS = jnp.linspace(0.0, 2.0, 9)
+TS = np.linspace(0.0, 2.0, 9)
 
 
 class Pushed(OnPlane):

@@ -33,7 +33,7 @@ class Oscillator(OnLine):
         return {"wall": self.wall + motion.q.x}
 
 
-X = jnp.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
+X = np.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
 
 
 def _ends(x, backend="native", events=False, **options):

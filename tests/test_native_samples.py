@@ -27,7 +27,7 @@ class Pushed(OnLine):
         return {"wall": self.wall - motion.q.x}
 
 
-OPTIONS = {"ts": jnp.array([0.0, 0.25, 0.7, 1.1]), "t1": 1.7, "rtol": 1e-10, "atol": 1e-10}
+OPTIONS = {"ts": np.array([0.0, 0.25, 0.7, 1.1]), "t1": 1.7, "rtol": 1e-10, "atol": 1e-10}
 TIMES = np.array([-0.3, 0.1, 0.25, 0.4, 0.9, 1.3])
 
 

@@ -34,7 +34,7 @@ class Falling(jj.Scene):
         return {"ground": motion.q.z}
 
 
-X = jnp.array([1.5, 0.4, 2.0, 3.0, 0.7, 0.1, 0.5])  # mass, drag, height, speed, wind, start, a time saved
+X = np.array([1.5, 0.4, 2.0, 3.0, 0.7, 0.1, 0.5])  # mass, drag, height, speed, wind, start, a time saved
 
 
 def _seen(x, events, **options):

@@ -41,8 +41,8 @@ CASES = {
     "disc that falls": (DISC, {"lean": 0.6, "spin_rate": -0.1}, {}),
     "disc with a quaternion, projected": (jj.models.MODELS["tilting-disc-quaternion"](), None, {"formulation": jj.Formulation("full"), "events": False}),
 }
-TIMES = jnp.array([0.2, 0.45, 0.71, 1.3])  # start, two that are saved, end
-BACK = jnp.array([2.0, 1.9, 1.2, 0.6])
+TIMES = np.array([0.2, 0.45, 0.71, 1.3])  # start, two that are saved, end
+BACK = np.array([2.0, 1.9, 1.2, 0.6])
 
 
 def _seen(name, times, backend="native", **options):

@@ -1,6 +1,5 @@
 """Figures of quantities against time: what is drawn is what the motion holds, in the unit that was asked for."""
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from small_scenes import BeadOnTurningWire
 import jourdain_jax as jj
 
 SLEIGH = jj.models.ChaplyginSleigh()
-TS = jnp.linspace(0.0, 1.0, 6)
+TS = np.linspace(0.0, 1.0, 6)
 
 
 @pytest.fixture(scope="module")

@@ -158,7 +158,7 @@ def test_the_report_for_machines_has_the_named_fields_and_is_json(scene):
 
 
 SLEIGH = ChaplyginSleigh()
-RUN = {"t1": 0.2, "ts": jnp.linspace(0.0, 0.2, 5)}
+RUN = {"t1": 0.2, "ts": np.linspace(0.0, 0.2, 5)}
 
 
 def test_round_off_is_printed_as_zero():

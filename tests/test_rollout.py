@@ -12,7 +12,7 @@ from small_scenes import OnLine
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh
 
-OPTIONS = {"t1": 2.0, "ts": jnp.linspace(0.0, 2.0, 5), "rtol": 1e-9, "atol": 1e-9}
+OPTIONS = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 5), "rtol": 1e-9, "atol": 1e-9}
 
 
 @pytest.fixture(scope="module")

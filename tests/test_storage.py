@@ -14,7 +14,7 @@ from test_inputs import OnBelt
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, PendulumChain, TiltingDisc
 
-TS = jnp.linspace(0.0, 0.5, 3)
+TS = np.linspace(0.0, 0.5, 3)
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,7 @@ class SmallLoop(Upright):
         return {"ring": jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0)) - jnp.sqrt(0.0025 - self.radius**2)}
 
 
-OPTIONS = {"ts": jnp.array([0.0, 0.4, 0.8]), "rtol": 1e-10, "atol": 1e-10}
+OPTIONS = {"ts": np.array([0.0, 0.4, 0.8]), "rtol": 1e-10, "atol": 1e-10}
 
 
 def sliding(**parameters):

@@ -12,7 +12,7 @@ from small_scenes import InSpace, OnPlane
 
 import jourdain_jax as jj
 
-KNOTS = jnp.linspace(-3.0, 3.0, 7)
+KNOTS = np.linspace(-3.0, 3.0, 7)
 TIGHT = {"rtol": 1e-9, "atol": 1e-9}
 
 

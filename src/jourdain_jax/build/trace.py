@@ -12,7 +12,8 @@ The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -204,14 +205,14 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
 
     `of_inputs`: indices of the loads whose potential depends on inputs.
     """
-    closed, shape = jaxpr_of_scene(scene, of_inputs)
-    try:
-        return _on_graph(scene, closed, shape, interpret)
-    except Unsupported:
-        return _on_graph(scene, closed, shape, interpret_with_calls)
+    found = _traced(scene, of_inputs)[1]
+    if isinstance(found, str):
+        raise Unsupported(found)
+    graph = copy(found.graph)
+    vars(graph).update({name: copy(x) for name, x in vars(graph).items()})  # its lists, to which nodes may be added
+    return replace(found, graph=graph)
 
 
-@once_per_class
 def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
     and inputs, and their shapes.
@@ -219,6 +220,25 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError where a method
     reads a value that JAX traces elsewhere.
     """
+    return _traced(scene, of_inputs)[0]
+
+
+@once_per_class
+def _traced(scene: Scene, of_inputs: tuple[int, ...]) -> tuple:
+    """Return the jaxpr with its shapes, and the scene on a graph that nothing is added to, or the operation
+    that has no scalar form.
+    """
+    closed, shape = _jaxpr(scene, of_inputs)
+    try:
+        return (closed, shape), _on_graph(scene, closed, shape, interpret)
+    except Unsupported:
+        try:
+            return (closed, shape), _on_graph(scene, closed, shape, interpret_with_calls)
+        except Unsupported as reason:
+            return (closed, shape), str(reason)
+
+
+def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
     leaves, treedef = jax.tree.flatten(scene)
     real = real_type()
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]

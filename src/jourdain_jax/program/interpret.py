@@ -97,7 +97,8 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
 
 def refuse(equation) -> None:
     """ValueError where an equation can be no part of a scene."""
-    if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
+    kinds = {v.aval.dtype for v in (*equation.invars, *equation.outvars)}
+    if any(jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
         raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
             "them outside, and give them as parameters or inputs")
 
