@@ -33,7 +33,7 @@ DESIGNS: dict[str, str] = {
     "jj.Design(TWO, samples=8, correlation={('mass', 'radius'): '0.5'})": "expected real numbers",
     "jj.Design(TWO, samples=8, correlation={'mass': 0.5})": "expected pairs of names",
     "jj.Design({'a': [[1.0], [1.0, 2.0]]})": "`a` varies as",
-    "jj.Design({f'a{i}': jj.Levels([0.0] * 10) for i in range(20)})": "cross to 100000000000000000000 samples",
+    "jj.Design({f'a{i}': jj.Levels([0.0] * 10) for i in range(20)})": "form 100000000000000000000 samples",
     "jj.Design(TWO, samples=8).values(0, 9)": "not among 0 to 8",
 }
 
