@@ -54,9 +54,9 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
 
     Over a short span a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
     begins at the end of the fit over the shorter span; unknowns that a short span does not determine stay
-    near the first guess. A distant fit without progress is replaced by growing spans, and continues only if
-    these do not lead to small residuals either. If every theta is a first guess of the same problem, spans
-    grow only if none led to a minimum with small residuals.
+    near the first guess. If a fit makes no progress far from its minimum, growing spans are tried; it
+    continues only if these do not lead to small residuals either. If every theta is a first guess of the same
+    problem, spans grow only if none led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample

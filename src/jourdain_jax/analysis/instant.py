@@ -45,7 +45,7 @@ Nodes = Int[np.ndarray, "_ _"]
 
 
 class Places(NamedTuple):
-    """Locations of the parts of v, and of the columns of D. Geometric constraints come first in g."""
+    """Positions of the parts of v and of the columns of D. In g, geometric constraints come first."""
 
     qdot: np.ndarray
     udot: np.ndarray

@@ -52,8 +52,8 @@ def lanes_first(tree):
 
 
 def lanes_of(values, axes) -> int:
-    """Return the size of the batch from the batch axes of arrays, as given to a batching rule; None for an
-    array without one.
+    """Return the size of the batch, from the batch axes that JAX gives to a batching rule. An array without a
+    batch has None.
     """
     return next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
 
@@ -75,7 +75,8 @@ batching.primitive_batchers[lanes_first_p] = _with_lanes_first
 
 
 def entries_of(v: Shaped[Array, "entries *rest"]) -> tuple[Shaped[Array, "*rest"], ...]:
-    """Split a vector into scalars, with the batch axis last; otherwise XLA compiles one slice per entry.
+    """Split a vector into scalars, with the batch axis last. With the batch axis first, XLA would compile one
+    slice per entry.
 
     Measured, for 111 entries of 26 lanes that are reassembled: 1.3 to 1.8 s of compilation with lanes first,
     0.05 s with lanes last.

@@ -158,8 +158,8 @@ class StudyResult(Printed):
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
     def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the histogram, and which of its cells extend beyond the grid (their lanes may lie anywhere
-        in them).
+        """Return the histogram, and marks of its cells that extend beyond the grid. The lanes in such a cell
+        may lie anywhere in it.
         """
         (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
         return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])

@@ -135,7 +135,9 @@ def _derivative(graph: Graph, node: int, dots: list):
 
 
 def _of_call(graph: Graph, node: int, dots: list) -> tuple:
-    """Return `d y_i = sum_j J_ij d x_j`. Another call computes the columns of J for the varying operands."""
+    """Return the rates `d y_i = sum_j J_ij d x_j` of a call. Another call computes the columns of J for the
+    operands that vary.
+    """
     operands, call = graph.args[node], graph.value[node]
     entries = [graph.entries_of(a) for a in operands]
     numbers = [np.issubdtype(graph.value[a][-1], np.floating) for a in operands]

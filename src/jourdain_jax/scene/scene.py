@@ -154,15 +154,16 @@ class Scene(eqx.Module):
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
-        """Return named events at a `motion`: values that are positive while it may continue. It stops where a
-        value falls through zero, or is not a number beyond. A value of zero at the start that rises has not
-        happened. A `jj.Event` in place of a value may let the motion continue.
+        """Return named events at a `motion`: values that are positive while the motion may continue. It stops
+        where a value falls through zero; beyond that the value may be NaN. A value that begins at zero and
+        rises does not count as an event. A `jj.Event` in place of a value may let the motion continue.
 
         If several events happen in one step, the first in time counts. A value that falls through zero and
-        rises again within one step is found if the cubic through values and rates at the ends of the step
-        shows it (default solvers), or the dense output at three times in the step (other adaptive ones), and
-        where a relation in it (`<`, `where`, `abs`, ...) changes. A smooth dip of a stop event that is
-        narrower than the longest step may be missed: use values that fall once, or a smaller `max_step`.
+        rises again within one step is found in two cases: a relation in it (`<`, `where`, `abs`, ...)
+        changes, or the fall shows in the cubic through values and rates at the ends of the step (default
+        solvers) or in the dense output at three times in the step (other adaptive solvers). A smooth dip of a
+        stop event that is narrower than the longest step may be missed: use values that fall once, or a
+        smaller `max_step`.
         """
         return {}
 

@@ -91,7 +91,9 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
 
 
 def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
-    """Return the reverse mode of `flow`, `cotangents` of `back.py`, as a function of start and cotangents."""
+    """Return the reverse mode of `flow` as a function of the start and of cotangents, by `cotangents` in
+    `back.py`.
+    """
     back = partial(cotangents, of, asked, memory)
     if not at_once:
         return back

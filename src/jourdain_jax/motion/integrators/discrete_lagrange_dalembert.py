@@ -123,8 +123,9 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
     `L_d = h/2 (L(q_0, v) + L(q_1, v))`, v = (q_1 - q_0)/h; rows are taken by the same rule, geometric rows at every node; h in s. Loads without a
     potential enter as discrete forces. The state between steps is (q, u) with u on the rows: the momentum at the node, projected.
 
-    Order 2, symmetric in time, variational where there are no velocity rows (then symplectic, with the momenta of symmetries kept). Needs speeds
-    that are the coordinate rates and rows linear or affine in them.
+    It has order 2, is symmetric in time, and is variational where there are no velocity rows; it is then
+    symplectic and keeps the momenta of symmetries. It needs speeds that are the coordinate rates, and rows
+    linear or affine in them.
 
     Use it for long motions of reversible scenes whose coordinates suit L: energy errors stay bounded there.
     In general they do not: a gauge term that changes no equation of motion, or a scene that is not

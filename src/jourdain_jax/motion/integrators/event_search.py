@@ -391,7 +391,7 @@ def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, 
 
 
 def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
-    """Add `dt` times the rates from row `rates` of `k` on to the rows of `y` from `rows` on."""
+    """Add `dt` times rows of `k`, from row `rates` on, to rows of `y`, from row `rows` on."""
 
     def moved(i: int | Number) -> Number:
         before = w.load(y, i + rows)

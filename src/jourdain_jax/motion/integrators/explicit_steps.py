@@ -56,8 +56,8 @@ class Method:
 
 
 def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
-    """Return a method from its nodes and the rows of A (both without the first stage), and the weights of its
-    embedded method.
+    """Return a method from its nodes, the rows of A and the weights of its embedded method. Nodes and rows
+    are given without those of the first stage.
     """
     stages = len(c) + 1
     A = np.zeros((stages, stages))

@@ -28,8 +28,8 @@ def state_norm(y: Integrated) -> PerLane:
 
 
 def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorField, Instant]:
-    """Return the vector field, and its arguments in a state. `of_rates`: return those of its rates. Lanes
-    have their axis last.
+    """Return the vector field, and its arguments at a state. With `of_rates`, return the arguments of the
+    rates alone. Lanes have their axis last.
     """
     field, scene, inputs, fixed, origin = args
     t = origin + tau
