@@ -32,7 +32,7 @@ from jourdain_jax.analysis.runs import run_of
 from jourdain_jax.analysis.spread import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.calculus.reals import Entries, described, largest
+from jourdain_jax.calculus.reals import Entries, described, largest, static
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import moving_jumps
@@ -180,7 +180,7 @@ class Estimated(Printed, eqx.Module):
     standard_error: PerRepeat
     low: PerRepeat  # ends of the 95 % interval
     high: PerRepeat
-    unit: str = eqx.field(static=True)
+    unit: str = static()
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Entries, Number, array_module, check_kind, checked_unless_traced, holds, is_traced
+from jourdain_jax.calculus.reals import Entries, Number, array_module, check_kind, checked_unless_traced, holds, is_traced, static
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import Labels, as_names, check_names, nearest
@@ -64,9 +64,9 @@ class Experiment(eqx.Module):
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Entries, ""]  # s
     correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
-    unknown_sigma: Labels = eqx.field(static=True)  # channels; their sigma here is 1
-    unknown_correlation: Labels = eqx.field(static=True)  # channels
-    ended_by: str = eqx.field(static=True)  # the event whose time was observed, among the channels; empty: none
+    unknown_sigma: Labels = static()  # channels; their sigma here is 1
+    unknown_correlation: Labels = static()  # channels
+    ended_by: str = static()  # the event whose time was observed, among the channels; empty: none
 
     def __init__(
         self,

@@ -34,7 +34,7 @@ from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Entries, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest
+from jourdain_jax.calculus.reals import Entries, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest, static
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -213,8 +213,8 @@ class PlannedInformation(Printed, eqx.Module):
     matrix: Matrix  # F, in the units of the unknowns
     values: Float[Entries, "unknowns"]  # at which it is taken
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
-    labels: Labels = eqx.field(static=True)
-    units: Labels = eqx.field(static=True)
+    labels: Labels = static()
+    units: Labels = static()
 
     @property
     def covariance(self) -> Matrix:

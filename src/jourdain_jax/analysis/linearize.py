@@ -30,7 +30,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import Count, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest
+from jourdain_jax.calculus.reals import Count, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest, static
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -51,7 +51,7 @@ class Modes(eqx.Module):
     left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
     condition: Float[Array, "modes"]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
     scene: Scene
-    named: Labels | None = eqx.field(static=True)
+    named: Labels | None = static()
 
     @property
     def names(self) -> Labels:
@@ -72,9 +72,9 @@ class Linearization(Printed, eqx.Module):
     residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
     coupling: Scalar  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
     pivot: Scalar  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
-    states: Labels = eqx.field(static=True)  # names of the entries of x
-    inputs: Labels = eqx.field(static=True)
-    coordinates: Labels = eqx.field(static=True)  # names of p
+    states: Labels = static()  # names of the entries of x
+    inputs: Labels = static()
+    coordinates: Labels = static()  # names of p
     about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
 
     def _text(self) -> str:

@@ -30,7 +30,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type
+from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type, static
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -49,9 +49,9 @@ OverTimes = Float[Array, "times 3"]
 class Channel(eqx.Module):
     """A function of a motion as it was when it was given."""
 
-    operations: Call = eqx.field(static=True)  # on what it closes over and the numbers of a motion
+    operations: Call = static()  # on what it closes over and the numbers of a motion
     held: tuple[Array, ...]  # what it closes over
-    shape: tuple[int, ...] = eqx.field(static=True)
+    shape: tuple[int, ...] = static()
 
     def __call__(self, motion: Motion) -> Array:
         """Return the value of the channel at one instant."""
@@ -136,7 +136,7 @@ class Accelerometer(Instrument):
     **Raises** ValueError for anything but a name, or three components.
     """
 
-    body: str = eqx.field(static=True)
+    body: str = static()
     point: Vector3  # m
     gravity: Vector3  # m/s^2
 
@@ -182,7 +182,7 @@ class LoadCell(Instrument):
     force the rows do not determine.
     """
 
-    contact: str = eqx.field(static=True)
+    contact: str = static()
 
     def __init__(self, contact):
         check_kind(contact, str, "`contact` of `LoadCell`", "the name of a contact")
@@ -220,7 +220,7 @@ LATEST = 4.0  # times the observed time: where a motion meets the event later th
 class StopEvent(eqx.Module):
     """An event of a scene, by name, whose time was measured."""
 
-    name: str = eqx.field(static=True)
+    name: str = static()
 
     @staticmethod
     def of(scene: Scene, name: str, where: str) -> "StopEvent":

@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import Entries, Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type
+from jourdain_jax.calculus.reals import Entries, Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type, static
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -256,7 +256,7 @@ class Actuator(eqx.Module):
     bias: Scalar | Estimate
     delay: Scalar | Estimate  # s
     lag: Scalar | Estimate  # s
-    hold: bool = eqx.field(static=True)
+    hold: bool = static()
 
     def __init__(self, command: Sampled, *, gain: Stated = 1.0, bias: Stated = 0.0, delay: Stated = 0.0, lag: Stated = 0.0, hold: bool = False):
         check_kind(command, Sampled, "`command` of `Actuator`", "`jj.Sampled(ts, values)`")
@@ -311,8 +311,8 @@ class Response(eqx.Module):
     """The numbers of a sensor or actuator of one run, with first guesses for estimated ones."""
 
     numbers: dict[str, Numbers | float]
-    unknown: Labels = eqx.field(static=True)  # names of numbers that are estimated
-    used: Labels = eqx.field(static=True)  # names of numbers that are not those of an ideal sensor
+    unknown: Labels = static()  # names of numbers that are estimated
+    used: Labels = static()  # names of numbers that are not those of an ideal sensor
 
     @property
     def is_late(self) -> bool:
@@ -334,7 +334,7 @@ class Reading(Response):
     """A sensor of one run made ready: its quantity looked up."""
 
     operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
-    name: str = eqx.field(static=True)  # of that
+    name: str = static()  # of that
 
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
         """Return the measured quantity along a motion; `states`: the same motion as bodies, for channels that
@@ -361,8 +361,8 @@ class Drive(Response):
     """An actuator of one run made ready."""
 
     command: Sampled
-    index: int = eqx.field(static=True)  # of its input
-    hold: bool = eqx.field(static=True)
+    index: int = static()  # of its input
+    hold: bool = static()
 
     def signal(self) -> Sampled:
         """Return the input of the scene."""

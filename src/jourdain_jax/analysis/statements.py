@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, static, tiny_of
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -57,11 +57,11 @@ THRESHOLDS = {
 class Check(eqx.Module):
     """One comparison: its relative size, its threshold, and its subject."""
 
-    name: str = eqx.field(static=True)
+    name: str = static()
     value: float
     threshold: float
-    culprit: str = eqx.field(static=True)  # body, load, row, form or reduction with the largest value
-    note: str = eqx.field(static=True, default="")
+    culprit: str = static()  # body, load, row, form or reduction with the largest value
+    note: str = static(default="")
 
     @property
     def passed(self) -> bool:
@@ -113,10 +113,10 @@ def central_difference(along: list, h: float):
 class Verification(Printed, eqx.Module):
     """All checks of one state; `print` shows them as a table."""
 
-    scene: str = eqx.field(static=True)
+    scene: str = static()
     checks: tuple[Check, ...]
-    not_applicable: Labels = eqx.field(static=True)  # reductions that do not apply at this state
-    mistakes: str = eqx.field(static=True, default="")  # the table of `jj.check`
+    not_applicable: Labels = static()  # reductions that do not apply at this state
+    mistakes: str = static(default="")  # the table of `jj.check`
 
     @property
     def certifies(self) -> bool:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths
 from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.calculus.reals import Entries, real_type
+from jourdain_jax.calculus.reals import Entries, real_type, static
 from jourdain_jax.calculus.roots import nearest_root, shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
@@ -52,8 +52,8 @@ class Probed(eqx.Module):
     M: Float[Entries, "*states speeds speeds"]
     vanishing: dict[str, Float[Entries, "*states entries"]]  # as in `LookedAt`
     numbers: Numbers
-    unproved: frozenset[str] = eqx.field(static=True, default=frozenset())  # what may be other than zero where no probe lies
-    in_calls: frozenset[str] = eqx.field(static=True, default=frozenset())  # what calls of JAX compute of poses and rows
+    unproved: frozenset[str] = static(default=frozenset())  # what may be other than zero where no probe lies
+    in_calls: frozenset[str] = static(default=frozenset())  # what calls of JAX compute of poses and rows
 
 
 def generic_inputs(scene: Scene) -> np.ndarray:

@@ -200,6 +200,11 @@ def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None
         raise ValueError(f"{what} has shape {array.shape}, expected {expected}; {advice}")
 
 
+def static(**default) -> Any:
+    """Declare a field of a module that belongs to its structure: no number, and part of the key of what is compiled."""
+    return eqx.field(static=True, **default)
+
+
 def check_kind(value, kind, what: str, expected: str) -> None:
     """Raise a ValueError that describes the `value`, unless it is an instance of `kind`, a class or a union
     of classes.

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Flag, Scalar, eps_of, largest, rank_cutoff
+from jourdain_jax.calculus.reals import Flag, Scalar, eps_of, largest, rank_cutoff, static
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
@@ -43,8 +43,8 @@ class RowReactions(eqx.Module):
     torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
     direct: Float[Array, "*times rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
     determined: Bool[Array, "*times rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
-    row_names: Labels = eqx.field(static=True)
-    body_names: Labels = eqx.field(static=True)
+    row_names: Labels = static()
+    body_names: Labels = static()
 
     def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
         """Force on one body (N), by row."""

@@ -17,7 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
-from jourdain_jax.calculus.reals import at_index
+from jourdain_jax.calculus.reals import at_index, static
 from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
@@ -74,9 +74,9 @@ class Diffrax(eqx.Module, Integrator):
     """`diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
-    alongside: bool = eqx.field(static=True)  # as of `OwnSteps`
-    max_steps: int = eqx.field(static=True)
-    event_names: tuple[str, ...] = eqx.field(static=True)
+    alongside: bool = static()  # as of `OwnSteps`
+    max_steps: int = static()
+    event_names: tuple[str, ...] = static()
     own: ClassVar[bool] = False
 
     @property

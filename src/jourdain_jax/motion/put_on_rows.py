@@ -27,7 +27,7 @@ from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.derivatives import differentiated_as
-from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, rank_cutoff, real_type
+from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, rank_cutoff, real_type, static
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -57,7 +57,7 @@ class State(Printed, eqx.Module):
     moved_q: Scalar  # largest change of a coordinate by the projection
     moved_u: Scalar  # largest change of a speed by the projection
     residual: Scalar  # what is left of rows and quaternion norms
-    names: tuple[Names, Names] = eqx.field(static=True)
+    names: tuple[Names, Names] = static()
     # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
     guess: Scalar = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
@@ -94,9 +94,9 @@ class Usual(eqx.Module):
     width: Float[Entries, "coordinates"]  # of the domain
     low: Float[Entries, "coordinates"]  # where a coordinate is found by the rows; infinite where it may be anywhere
     high: Float[Entries, "coordinates"]
-    affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
-    program: RowProgram | None = eqx.field(static=True)  # by which machine code puts a start onto them; None: XLA does
+    affine: bool = static()  # rows are, in the speeds
+    determined: bool = static()  # rows determine the speeds that are free
+    program: RowProgram | None = static()  # by which machine code puts a start onto them; None: XLA does
 
 
 def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:

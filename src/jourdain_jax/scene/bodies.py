@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, checked_real, real_type
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, checked_real, real_type, static
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -54,7 +54,7 @@ class RigidBody(eqx.Module):
     position: Vector3  # m, mass centre, inertial frame
     orientation: Matrix3  # body components to space components
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
-    solid: str = eqx.field(static=True)
+    solid: str = static()
 
     def __init__(self, mass: Any, inertia: Any, position: Any, orientation: Any, outline: Any = None, solid: str = ""):
         self.mass = checked_real(mass, "mass of a rigid body", ())

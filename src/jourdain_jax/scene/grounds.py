@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, as_real, checked_positive, checked_real, described, known_numbers
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, as_real, checked_positive, checked_real, described, known_numbers, static
 from jourdain_jax.calculus.rotations import rot_y
 
 Tangents = Float[Array, "2 3"]
@@ -117,7 +117,7 @@ class _Round(_Ground):
     """A ground at one distance from an axis or a centre."""
 
     radius: Scalar  # m
-    side: str = eqx.field(static=True)  # "inside" or "outside"
+    side: str = static()  # "inside" or "outside"
 
     @abstractmethod
     def arm_to(self, point: Vector) -> Vector3:
@@ -209,7 +209,7 @@ class Surface(_Ground):
     (rad/s) describe a moving surface; all in the inertial frame. Raises ValueError for any other `f`.
     """
 
-    f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
+    f: Callable = static()  # (x, y, z) -> number, positive on the side of the bodies
 
     def __init__(self, f, **motion: Unpack[RigidMotion]):
         """The surface on which `f(x, y, z)` is zero; `motion`: of the ground."""
@@ -238,7 +238,7 @@ class HeightMap(_Ground):
     Raises ValueError for any other `h`.
     """
 
-    h: Callable = eqx.field(static=True)  # (x, y) -> height, m
+    h: Callable = static()  # (x, y) -> height, m
 
     def __init__(self, h, **motion: Unpack[RigidMotion]):
         """The surface of height `h(x, y)`; `motion`: of the ground."""

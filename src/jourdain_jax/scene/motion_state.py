@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, checked_real
+from jourdain_jax.calculus.reals import Scalar, checked_real, static
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, check_name
@@ -25,7 +25,7 @@ class Point(eqx.Module):
     position: Vectors  # m, inertial frame
     velocity: Vectors  # m/s, inertial frame
     arm: Vectors  # m, from the mass centre of the body to the point, inertial frame
-    body: str | None = eqx.field(static=True, default=None)
+    body: str | None = static(default=None)
 
 
 def fixed_point(position: Any) -> Point:
@@ -38,7 +38,7 @@ def fixed_point(position: Any) -> Point:
 class BodyPose(eqx.Module):
     """One body's pose."""
 
-    name: str = eqx.field(static=True)
+    name: str = static()
     body: Body
 
     @property
@@ -70,7 +70,7 @@ class BodyPose(eqx.Module):
 class BodyMotion(eqx.Module):
     """One body's pose and velocity."""
 
-    name: str = eqx.field(static=True)
+    name: str = static()
     body: Body
     velocity: Vectors  # m/s, mass centre, inertial frame
     angular_velocity: Vectors  # rad/s, inertial frame; zero for a particle

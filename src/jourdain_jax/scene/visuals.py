@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type, static
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -56,15 +56,15 @@ class Visual(eqx.Module):
             return {"rider": jj.Visual.capsule(0.1, 0.5), "": jj.Visual.line(hub, mass)}
     """
 
-    kind: str = eqx.field(static=True)  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
+    kind: str = static()  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
     # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule without its ends), line: points, mesh: factors
     size: Float[Array, "*size"]
     position: Vector3  # m, body frame
     orientation: Matrix3  # own components to body components
     radius: Scalar | None = None  # m, of a line; None: thin
-    faces: Faces | None = eqx.field(static=True, default=None)
-    colour: str | None = eqx.field(static=True, default=None)
-    opacity: float = eqx.field(static=True, default=1.0)
+    faces: Faces | None = static(default=None)
+    colour: str | None = static(default=None)
+    opacity: float = static(default=1.0)
 
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":

@@ -25,7 +25,7 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
-from jourdain_jax.calculus.reals import compiled_quickly, largest
+from jourdain_jax.calculus.reals import compiled_quickly, largest, static
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
@@ -51,12 +51,12 @@ class Sensitivities(Printed, eqx.Module):
     include the effect of the change of the steady motion.
     """
 
-    mode: str = eqx.field(static=True)
+    mode: str = static()
     eigenvalue: complex  # 1/s
     condition: float  # |y' x| of unit left and right vectors: zero at a double root, where there is no derivative
     by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
     code: int
-    held: Labels = eqx.field(static=True)  # what tells the motion apart and keeps its value
+    held: Labels = static()  # what tells the motion apart and keeps its value
 
     def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
         """Return the derivative by a parameter."""
@@ -132,7 +132,7 @@ class CriticalPoint(Printed, eqx.Module):
     eigenvalue: Complex[Array, "*batch"]  # 1/s, that passes the axis or is double
     condition: Float[Array, "*batch"]  # least pivot of the equations over the largest; near zero, special points are close together
     code: Int[Array, "*batch"]
-    kind: str = eqx.field(static=True)
+    kind: str = static()
 
     def __getitem__(self, name: str) -> Float[Array, "*batch"]:
         """Return a coordinate, a speed, or the parameter that varies."""
@@ -192,9 +192,9 @@ _program_of = once_per_class(_Program)
 class Special(eqx.Module):
     """The equations of a special point, and the point of the family from which it is followed as parameters change."""
 
-    equations: SteadyEquations = eqx.field(static=True)
-    program: _Program = eqx.field(static=True)
-    kind: str = eqx.field(static=True)
+    equations: SteadyEquations = static()
+    program: _Program = static()
+    kind: str = static()
     X: Unknowns
 
     def parts(self, X: Unknowns) -> list[Array]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import at_index, checked_real, checked_whole, described, is_traced, known_numbers, real_type, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import at_index, checked_real, checked_whole, described, is_traced, known_numbers, real_type, static, with_nan_as_a_mark
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.explicit_steps import Taylor
@@ -42,7 +42,7 @@ class Rollout(Printed, eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
 
     lanes: Trajectory
-    reruns: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> `RERUN_FIELDS` of such lanes
+    reruns: tuple[tuple[int, tuple], ...] = static(default=())  # fallback -> `RERUN_FIELDS` of such lanes
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.calculus.reals import Scalar, Speeds
+from jourdain_jax.calculus.reals import Scalar, Speeds, static
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import speeds_are_rates
@@ -58,7 +58,7 @@ class Interval(eqx.Module):
 
     t0: Scalar
     h: Scalar  # its length, s
-    rule: str = eqx.field(static=True)
+    rule: str = static()
 
     @property
     def t1(self) -> Scalar:
@@ -135,7 +135,7 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
     283; J. E. Marsden and M. West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001) 357, sections 2.1 and 3.2 (forces).
     """
 
-    rule: str = eqx.field(static=True, default="midpoint")
+    rule: str = static(default="midpoint")
 
     def __check_init__(self):
         if self.rule not in RULES:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jourdain_jax.calculus.reals import Number, is_traced
+from jourdain_jax.calculus.reals import Number, is_traced, static
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.trajectories import results
@@ -207,7 +207,7 @@ class Taylor(eqx.Module):
     (2005) 99.
     """
 
-    order: int | None = eqx.field(static=True, default=None)
+    order: int | None = static(default=None)
 
     def __check_init__(self) -> None:
         if self.order is not None and (not isinstance(self.order, int) or isinstance(self.order, bool) or not LEAST_ORDER <= self.order <= MOST_ORDER):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, static, with_nan_as_a_mark
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
@@ -47,7 +47,7 @@ class Diagnostics(eqx.Module):
     """Extremes of diagnostic quantities along a motion."""
 
     energy_drift: Scalar  # J, max - min of T + V, less the work done where it is tracked
-    energy_kind: str = eqx.field(static=True)
+    energy_kind: str = static()
     energy_size: Scalar  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
     position_residual: Scalar  # largest residual of the geometric rows and quaternion norms
     velocity_residual: Scalar  # largest residual of the velocity rows

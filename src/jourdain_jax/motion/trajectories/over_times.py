@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, with_nan_as_a_mark, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static, with_nan_as_a_mark, with_usual_promotion
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
@@ -34,8 +34,8 @@ class Phases(eqx.Module, Printed):
     events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
     modes: Float[Array, "modes phases"]  # numbers of their values in each phase
     lost: Float[Array, "transitions"]  # J, by which T + V fell at each event
-    event_names: Labels = eqx.field(static=True)
-    named: Modes = eqx.field(static=True)
+    event_names: Labels = static()
+    named: Modes = static()
 
     @property
     def count(self) -> Count:
@@ -93,12 +93,12 @@ class Record(eqx.Module):
     smallest_pivot: Scalar
     inputs: Inputs
     phases: Phases
-    state_form: str = eqx.field(static=True)  # "minimal" or "full"
-    reduction: str = eqx.field(static=True)
-    solver: str = eqx.field(static=True)
-    projected: bool = eqx.field(static=True)
-    unwatched: str = eqx.field(static=True)  # why steps do not watch relations, in words; empty where they do, or there are none
-    event_names: Labels = eqx.field(static=True)
+    state_form: str = static()  # "minimal" or "full"
+    reduction: str = static()
+    solver: str = static()
+    projected: bool = static()
+    unwatched: str = static()  # why steps do not watch relations, in words; empty where they do, or there are none
+    event_names: Labels = static()
 
 
 @with_usual_promotion
@@ -166,7 +166,7 @@ class BodyPoint(eqx.Module):
     from the mass centre).
     """
 
-    body: str = eqx.field(static=True)
+    body: str = static()
     local: Vector3
 
     def __call__(self, scene, t, q, u, inputs):
@@ -181,7 +181,7 @@ def energies(scene, t, q, u, inputs):
 class InputOf(eqx.Module):
     """An input by its name."""
 
-    name: str = eqx.field(static=True)
+    name: str = static()
 
     def __call__(self, scene, t, q, u, inputs) -> Scalar:
         return inputs[scene.inputs.entries.index(self.name)]

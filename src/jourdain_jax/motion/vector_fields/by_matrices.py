@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.probed_on_graph import generic_inputs
 from jourdain_jax.build.structure import closure_lengths, structure_whatever_its_faults, trust, usual_rows
-from jourdain_jax.calculus.reals import Scalar, Speeds, is_traced
+from jourdain_jax.calculus.reals import Scalar, Speeds, is_traced, static
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.contact_state import At
@@ -89,9 +89,9 @@ class ByMatrices(VectorField):
 
     stabilisation: Baumgarte | None
     usual: UsualLengths  # of the rows
-    inputs_in_rows: bool = eqx.field(static=True)  # some change in time, and rows depend on them: their rates are needed
-    nonlinear_rows: tuple[int, ...] = eqx.field(static=True)  # all, where some are nonlinear in the speeds, and none follows from the others
-    cutoff: float | None = eqx.field(static=True)  # of the projection of speeds: below it rows count as dependent; None: round-off
+    inputs_in_rows: bool = static()  # some change in time, and rows depend on them: their rates are needed
+    nonlinear_rows: tuple[int, ...] = static()  # all, where some are nonlinear in the speeds, and none follows from the others
+    cutoff: float | None = static()  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     def now(self, inputs, t):
         """Return the values of the inputs, and their rates where rows depend on them."""
@@ -131,8 +131,8 @@ class ByMatrices(VectorField):
 class MinimalByMatrices(ByMatrices):
     """Coordinates and privileged speeds."""
 
-    independent: tuple[int, ...] = eqx.field(static=True)
-    rows: tuple[int, ...] = eqx.field(static=True)  # that determine the dependent speeds
+    independent: tuple[int, ...] = static()
+    rows: tuple[int, ...] = static()  # that determine the dependent speeds
 
     @property
     def has_pivots(self) -> bool:
@@ -163,8 +163,8 @@ class FullByMatrices(ByMatrices):
     """Coordinates and all speeds."""
 
     # where rows lose rank, a cut-off leaves one out, and branches cross: of their usual size, what round-off decides; None: nothing branches
-    undecided: float | None = eqx.field(static=True)
-    own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
+    undecided: float | None = static()
+    own_equations: str = static(default="")  # of a solver that takes no accelerations: what it solves instead
 
     @property
     def reduction_name(self) -> str:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import event_resets, event_values, stored_by_inputs
-from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, check_kind, described
+from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, check_kind, described, static
 from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -57,7 +57,7 @@ class Formulation(eqx.Module):
         print(motion.state_form, motion.reduction)
     """
 
-    state: Literal["auto", "minimal", "full"] = eqx.field(static=True, default="auto")
+    state: Literal["auto", "minimal", "full"] = static(default="auto")
     reduction: Reduction | GibbsAppell | str | None = None
     stabilisation: Baumgarte | Literal["projection"] | None = "projection"
 
@@ -150,16 +150,16 @@ class Instant(NamedTuple):
 class VectorField(eqx.Module):
     """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
 
-    independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
+    independent: tuple[int, ...] | None = static()  # privileged speeds; None: the full state
     reduction: Reduction | GibbsAppell
-    with_work: bool = eqx.field(static=True)
-    conserves: bool = eqx.field(static=True)  # T + V is constant along every motion
-    projects_positions: bool = eqx.field(static=True)
-    projects_speeds: bool = eqx.field(static=True)
-    rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/integration.py`)
-    of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
-    event_names: Labels = eqx.field(static=True)  # sorted
-    stops: tuple[bool, ...] = eqx.field(static=True)  # whether each event ends the motion
+    with_work: bool = static()
+    conserves: bool = static()  # T + V is constant along every motion
+    projects_positions: bool = static()
+    projects_speeds: bool = static()
+    rows_may_contradict: bool = static()  # each other, although the start meets all (`motion/integration.py`)
+    of_inputs: tuple[int, ...] = static()  # numbers of the loads whose potential depends on inputs
+    event_names: Labels = static()  # sorted
+    stops: tuple[bool, ...] = static()  # whether each event ends the motion
 
     @property
     def name(self) -> str:
@@ -286,9 +286,9 @@ class VectorField(eqx.Module):
 class ByProgram(VectorField):
     """The minimal or the full state of a lowered scene."""
 
-    program: Lowered = eqx.field(static=True)
-    affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    native: values.Beside | None = eqx.field(static=True, default=None)
+    program: Lowered = static()
+    affine: bool = static()  # rows are, in the speeds
+    native: values.Beside | None = static(default=None)
 
     @property
     def lowered(self) -> Lowered:
