@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Entries, Number, array_module, check_kind, checked_unless_traced, holds, is_traced, static
+from jourdain_jax.calculus.reals import Entries, Number, Shape, array_module, check_kind, checked_unless_traced, holds, is_traced, static
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import Labels, as_names, check_names, nearest
@@ -245,7 +245,7 @@ def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_n
     return name, _named_shape(scene, name, channel_name, where)
 
 
-def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, ...], estimates: dict) -> Reading:
+def _reading(sensor: Sensor, name: str, where: str, quantity, shape: Shape, estimates: dict) -> Reading:
     numbers, unknown, used = response(sensor)
     for number in ("gain", "bias"):
         if numbers[number].shape not in ((), shape):
@@ -318,7 +318,7 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
         )
 
 
-def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
+def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> Shape:
     """Return the shape of a coordinate or speed: (4,) for a quaternion, (3,) for its rates."""
     both = scene.coordinate_names, scene.speed_names
     entries = both[0].entries + both[1].entries

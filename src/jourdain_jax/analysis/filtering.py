@@ -28,7 +28,7 @@ from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import gauss_legendre, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_at, privileged_speeds
-from jourdain_jax.calculus.reals import Scalar, Speeds, checked_real, holds, real_type
+from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, checked_real, holds, real_type
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
@@ -96,7 +96,7 @@ def filtered_log_likelihood(
 class _Filter:
     """The filter of one run."""
 
-    def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: tuple[int, ...], intensities: Speeds):
+    def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: Indices, intensities: Speeds):
         assert isinstance(run.inputs, Inputs)  # of a run that was checked
         self.scene, self.run, self.inputs, self.options = scene, run, run.inputs, options
         self.speeds, self.intensities = np.array(speeds, int), intensities
@@ -221,21 +221,21 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
                 )
 
 
-def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
+def _independent_speeds(scene: Scene, run: Experiment) -> Indices:
     """Return the scene's independent speeds. If they do not determine the rest at a known start, return those
     of a copy of the scene with another choice.
     """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)
 
-    def at_start() -> tuple[int, ...]:
+    def at_start() -> Indices:
         return privileged_at(scene, begin, inputs_at(inputs, run.t0), usual)
 
     determined = scene.privileged is not None or holds(lambda *_: at_start() == usual, *jax.tree.leaves((scene, begin)))
     return usual if determined else at_start()
 
 
-def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speeds:
+def _intensities(scene: Scene, speeds: Indices, given: Mapping) -> Speeds:
     names = [scene.speed_names.entries[i] for i in speeds]
     if not isinstance(given, Mapping):
         raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> "

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, array_module, compiled_quickly, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, array_module, compiled_quickly, real_type
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -111,7 +111,7 @@ class ByProgram:
     input is one vector of all numbers: parameters, t, q, u, inputs.
     """
 
-    def __init__(self, scene: Scene, program: Lowered, asked: tuple[int, ...], varied: tuple[int, ...] = ()) -> None:
+    def __init__(self, scene: Scene, program: Lowered, asked: Indices, varied: Indices = ()) -> None:
         rows = row_program(scene)
         if rows is None:
             raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program")
@@ -154,7 +154,7 @@ class ByMatrices:
     the speeds that must be constant.
     """
 
-    constant: tuple[int, ...]
+    constant: Indices
 
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
         """v, D and the mass matrix of a scene at an instant."""
@@ -162,7 +162,7 @@ class ByMatrices:
 
 
 @compiled_quickly
-def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
+def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
     at = places_of(scene)
 
     def instant(x):
@@ -177,7 +177,7 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
     return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
 
 
-def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
+def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":
     """Return the program that evaluates a scene at single instants, with these speeds constant or
     independent. `masses`: whether the mass matrix of these speeds is needed.
     """

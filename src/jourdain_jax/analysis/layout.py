@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, described, largest, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, Shape, described, largest, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
@@ -72,7 +72,7 @@ class Entry:
     """A parameter that is an entry of an inertia matrix, but for a constant."""
 
     name: str
-    index: tuple[int, ...]  # in the parameter, where that is an array
+    index: Indices  # in the parameter, where that is an array
     row: int
     column: int
     factor: float  # entry = factor * parameter
@@ -84,8 +84,8 @@ class BodyInertia:
 
     body: str
     entries: tuple[Entry, ...]  # the first of each parameter
-    axes: tuple[int, ...]  # which of D belongs to an axis
-    products: tuple[int, ...]  # which of l12, l23, l13 there are
+    axes: Indices  # which of D belongs to an axis
+    products: Indices  # which of l12, l23, l13 there are
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -259,7 +259,7 @@ class Place:
     """
 
     name: str  # of a sensor's or actuator's: "gyro.gain"
-    shape: tuple[int, ...]
+    shape: Shape
     begin: int
     kind: Kind
 

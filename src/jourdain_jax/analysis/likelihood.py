@@ -34,7 +34,7 @@ from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Entries, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest, static
+from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest, static
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -266,7 +266,7 @@ def _inverse(F: Matrix) -> Matrix:
 
 
 @compiled
-def _log_det(F: Matrix, places: tuple[int, ...]) -> Scalar:
+def _log_det(F: Matrix, places: Indices) -> Scalar:
     """Return the logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]

@@ -30,7 +30,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import Count, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest, static
+from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest, static
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -220,7 +220,7 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
         warn(text, SensitivityWarning)
 
 
-def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: Labels | None, coordinates: Labels | None) -> Linearization:
+def _about(instant, scene: Scene, state: State, f, y: Indices, dependent: Labels | None, coordinates: Labels | None) -> Linearization:
     v, D, mass = instant(scene, state.t, state.q, state.u, f)
     at, names = places_of(scene), perturbed_names(scene)
     q, known = state.q, not is_traced((D, state))
@@ -237,7 +237,7 @@ def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent
     return Linearization(**matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f))
 
 
-def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: tuple[int, ...], coordinates: Labels) -> dict:
+def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coordinates: Labels) -> dict:
     """Return the contents of `Linearization`."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))

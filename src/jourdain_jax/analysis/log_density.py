@@ -26,7 +26,7 @@ from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Scalar, compiled, holds, is_traced, real_type, static
+from jourdain_jax.calculus.reals import Indices, Scalar, compiled, holds, is_traced, real_type, static
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
@@ -59,8 +59,8 @@ class LogDensity(eqx.Module):
     labels: Labels = static()
     units: Labels = static()
     layout: Layout = static()
-    runs: tuple[tuple[int, ...], ...] = static()  # numbers of those of each group
-    places: tuple[int, ...] = static()  # of those unknowns that are no sigmas
+    runs: tuple[Indices, ...] = static()  # numbers of those of each group
+    places: Indices = static()  # of those unknowns that are no sigmas
     sigmas: Labels = static()  # channels whose sigma is unknown, which come after those
     with_memory: Labels = static()  # channels whose correlation time is, last among the unknowns
     ranges: tuple[Range, ...] = static()  # of all unknowns

@@ -30,7 +30,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type, static
+from jourdain_jax.calculus.reals import Scalar, Shape, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type, static
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -51,7 +51,7 @@ class Channel(eqx.Module):
 
     operations: Call = static()  # on what it closes over and the numbers of a motion
     held: tuple[Array, ...]  # what it closes over
-    shape: tuple[int, ...] = static()
+    shape: Shape = static()
 
     def __call__(self, motion: Motion) -> Array:
         """Return the value of the channel at one instant."""

@@ -31,7 +31,7 @@ from jourdain_jax.analysis.quantities import Channel, StopEvent
 from jourdain_jax.analysis.sensors import Drive, Numbers, Reading, Times, grid, ideal, intervals, with_numbers
 from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Entries, Scalar
+from jourdain_jax.calculus.reals import Entries, Indices, Scalar
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate
@@ -117,7 +117,7 @@ def on_equal_grids(runs: Sequence[Run]) -> list[Run]:
     return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
 
 
-def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
+def equal_runs(data: Sequence[Experiment]) -> list[tuple[Indices, Run]]:
     """Stack runs of equal structure and shapes. Return them with their indices; numbers may be traced."""
     groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in grouped(data):

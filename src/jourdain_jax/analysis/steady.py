@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import Flag, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, real_type, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, real_type, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
@@ -125,8 +125,8 @@ class _Problem(eqx.Module):
     t: Scalar
     f: Float[Array, "inputs"]
     instant: ByProgram | ByMatrices = static()
-    privileged: tuple[int, ...] = static()
-    resting: tuple[int, ...] = static()  # coordinates that must not move
+    privileged: Indices = static()
+    resting: Indices = static()  # coordinates that must not move
 
     def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, list[Scalar]]:
         """Return the residual, its derivatives, and the largest entries of the constraints, of dy/dt, and of

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, array_module, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import Entries, Indices, array_module, rank_cutoff, tiny_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
@@ -91,7 +91,7 @@ def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray,
     return rows / xp.where(length > 0, length, 1.0)
 
 
-def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> tuple[int, ...]:
+def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> Indices:
     """Return indices of the independent speeds: the named ones, else the scene's own choice, else the
     engine's.
     """
@@ -99,7 +99,7 @@ def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> tuple[
     return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
 
 
-def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tuple[int, ...]:
+def privileged_at(scene: Scene, state: State, f, usual: Indices) -> Indices:
     """Return indices of independent speeds at a known state: the `usual` ones, or others if these determine
     the rest poorly.
     """

@@ -18,6 +18,7 @@ from jourdain_jax.analysis.estimate import Correlated, Estimate, Range, positive
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import BodyInertia, Kind, Layout, Place, PossibleInertia, inertia_of_body, tied_by
 from jourdain_jax.analysis.sensors import UNITS, default_range
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.parameters import parameters_of
@@ -145,7 +146,7 @@ def unknowns_of(
     of_runs = _of_all_runs(runs)
     shared += [(label, "sensor", _of_sensor(label, label, estimate)) for label, estimate in of_runs.items() if not estimate.per_run]
     starts = {name: run.start[name].shape for run in reversed(runs) for name in run.unknown_start}
-    own: list[tuple[str, tuple[int, ...], Kind]] = [(name, starts[name], "start") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
+    own: list[tuple[str, Indices, Kind]] = [(name, starts[name], "start") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
     own += [(label, np.shape(estimate.guess), "sensor") for label, estimate in of_runs.items() if estimate.per_run]
     local = _placed(own)
     of_each = [_of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local]
@@ -188,7 +189,7 @@ def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
     return replace(entry, range=cut)
 
 
-def _placed(parts: Iterable[tuple[str, tuple[int, ...], Kind]]) -> tuple[Place, ...]:
+def _placed(parts: Iterable[tuple[str, Indices, Kind]]) -> tuple[Place, ...]:
     """Places one after another."""
     found: list[Place] = []
     for name, shape, kind in parts:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.reals import Scalar, compiled_quickly, real_type
+from jourdain_jax.calculus.reals import Indices, Scalar, compiled_quickly, real_type
 from jourdain_jax.scene.names import Labels, check_name
 
 PerHanging = Float[Array, "hangings"]
@@ -97,7 +97,7 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Lab
 
 
 @compiled_quickly
-def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
+def _with_slopes(means: Values, hangings: tuple[tuple[str, Indices], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
     """Return parameters, distances of plumb lines, and their derivatives with respect to each reading, in the
     order of the means.
     """
@@ -105,7 +105,7 @@ def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 
-def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:
+def _parameters(y: Values, hangings: dict[str, Indices], by_table: bool) -> Values:
     """Return all parameters of the benchmark, and the distances of plumb lines from the mass centres ("miss
     B1").
     """
@@ -128,7 +128,7 @@ def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool)
     return found if "G" not in hangings else found | _of_whole_bicycle(found)
 
 
-def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> PerHanging:
+def _column(what: str, part: str, numbers: Indices, y: Values) -> PerHanging:
     return jnp.stack([y[f"{what}{part}{k}"] for k in numbers])
 
 
@@ -182,7 +182,7 @@ def _moments_about_y(y: Values, lengths: Values) -> Values:
     return {f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l) for p, l in lengths.items()}
 
 
-def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: dict[str, Float[Array, "_"]]) -> Values:
+def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, Float[Array, "_"]]) -> Values:
     """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists, by
     least squares for more than three.
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.scene.names import Labels
 
 _FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
@@ -39,7 +40,7 @@ class Readings:
     path: str
     means: dict[str, float]
     sigmas: dict[str, float]
-    hangings: dict[str, tuple[int, ...]]
+    hangings: dict[str, Indices]
     without_sigma: Labels
     unused: Labels
 
@@ -88,7 +89,7 @@ def read_readings(path: str | Path) -> Readings:
     )
 
 
-def _hangings(means: dict[str, float], part: str) -> tuple[int, ...]:
+def _hangings(means: dict[str, float], part: str) -> Indices:
     """Return the hangings of a part with all three readings."""
     numbers = sorted(int(name[len(f"Tt{part}") :]) for name in means if re.fullmatch(rf"Tt{part}\d+", name))
     return tuple(k for k in numbers if f"alpha{part}{k}" in means and f"a{part}{k}" in means)

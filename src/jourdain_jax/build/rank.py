@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.reals import at_index, check_kind, eps_of, largest, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import Indices, at_index, check_kind, eps_of, largest, rank_cutoff, tiny_of
 from jourdain_jax.scene.names import Labels, as_names
 from jourdain_jax.scene.scene import Scene
 
@@ -123,7 +123,7 @@ def _are_bounded(c: np.ndarray) -> bool:
     return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (largest(c, 0) > 2)))
 
 
-def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tuple[int, ...]:
+def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Indices:
     """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and unless
     there are `freedoms` of them.
     """
@@ -158,7 +158,7 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
     return float(pivots.min(initial=1.0))
 
 
-def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
+def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
     """Return the independent speeds for which the worst pivot over all probes is largest; among equals the
     largest typical pivot decides.
     """
@@ -178,7 +178,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...
     return tuple(i for i in range(count) if i not in dependent)
 
 
-def _greedy(A: np.ndarray, rank: int) -> tuple[int, ...]:
+def _greedy(A: np.ndarray, rank: int) -> Indices:
     """Return columns chosen one after another by largest remaining length (pivoted QR)."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):

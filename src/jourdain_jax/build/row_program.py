@@ -15,6 +15,7 @@ import numpy as np
 
 from jourdain_jax.build.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -34,18 +35,18 @@ class RowProgram:
     """
 
     graph: Graph
-    parameters: tuple[tuple[int, ...], ...]  # of each leaf of the scene, entry by entry; -1 for what is not needed
+    parameters: tuple[Indices, ...]  # of each leaf of the scene, entry by entry; -1 for what is not needed
     t: int
-    q: tuple[int, ...]
-    u: tuple[int, ...]
-    inputs: tuple[int, ...]
-    g: tuple[int, ...]
+    q: Indices
+    u: Indices
+    inputs: Indices
+    g: Indices
     G: Matrix
-    phi: tuple[int, ...]
+    phi: Indices
     A: Matrix
     M: Matrix | None  # lower triangle; None where it is too large to be written out
     right: int  # whether parameters and bodies are
-    others: tuple[int, ...]  # coordinates of other states, projected onto the geometric rows, on which that depends too
+    others: Indices  # coordinates of other states, projected onto the geometric rows, on which that depends too
 
 
 @once_per_class

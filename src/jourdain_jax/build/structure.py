@@ -20,7 +20,7 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import at_index, eps_of, is_traced, largest
+from jourdain_jax.calculus.reals import Indices, at_index, eps_of, is_traced, largest
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
@@ -43,7 +43,7 @@ class Structure:
     redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
     may_set_in: Labels  # those of them that no identity makes follow from the others: they may not, where no probe lies
     rank_losses: Labels  # configurations among the probed ones with fewer independent rows, as text
-    independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
+    independent: Indices  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
     typical_pivot: float  # its median
     affine: bool  # rows are linear or affine in the speeds
@@ -52,7 +52,7 @@ class Structure:
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
     varying_inertia: bool  # masses or central inertias change along the motion
-    potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
+    potentials_of_inputs: Indices  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
     kinks: Labels  # what is not smooth, as sentences
@@ -91,7 +91,7 @@ class Structure:
         return len(self.independent)
 
     @property
-    def kept_rows(self) -> tuple[int, ...]:
+    def kept_rows(self) -> Indices:
         """Numbers of the rows that are not redundant."""
         return tuple(s for s, name in enumerate(self.row_names) if name not in self.redundant_rows)
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import Entries, Scalar, is_traced, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
 from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, of_bodies, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
@@ -95,7 +95,7 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
     return jax.jvp(pieces, (motion.t,), (jnp.ones_like(motion.t),))[1]
 
 
-def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
+def velocity_quantities(scene: Scene, motion: Motion, of_inputs: Indices = (), with_events: bool = True) -> VelocityQuantities:
     """Return the traced quantities, evaluated at numbers; `of_inputs`: indices of the loads whose potential
     depends on inputs.
     """
@@ -135,7 +135,7 @@ def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Ar
     return jnp.stack([values[name] for name in sorted(values)]) if values else jnp.zeros(0)
 
 
-def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: At | None = None) -> Float[Array, "events rows"]:
+def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None = None) -> Float[Array, "events rows"]:
     """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the stored
     energy of the loads `of_inputs`.
 
@@ -180,7 +180,7 @@ class TracedScene(Variables):
     at: VelocityQuantities
     particulars: Particulars
     effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
-    quaternions: tuple[int, ...]  # the coordinate that is the first part of each
+    quaternions: Indices  # the coordinate that is the first part of each
 
     @property
     def attitudes(self) -> list[list[int]]:
@@ -200,7 +200,7 @@ class TracedScene(Variables):
         return [at.v, at.omega, at.position, at.orientation, at.mass, at.inertia, at.phi, at.closure, at.qdot]
 
 
-def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
+def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
     """Return the scene as a new graph. Parts without a scalar form, or with their own derivative, are calls.
 
     `of_inputs`: indices of the loads whose potential depends on inputs.
@@ -213,7 +213,7 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
     return replace(found, graph=graph)
 
 
-def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
+def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
     """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
     and inputs, and their shapes.
 
@@ -224,7 +224,7 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
 
 
 @once_per_class
-def _traced(scene: Scene, of_inputs: tuple[int, ...]) -> tuple:
+def _traced(scene: Scene, of_inputs: Indices) -> tuple:
     """Return the jaxpr with its shapes, and the scene on a graph that nothing is added to, or the operation
     that has no scalar form.
     """
@@ -298,13 +298,13 @@ def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
     return {node: owner for owner, nodes in reversed(pairs) for node in np.ravel(nodes).tolist()}
 
 
-def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Scalar:
+def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
     """Potential energy in J of the loads with the numbers `of_inputs`."""
     loads = tuple(loads_of(scene, motion))
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Scalar:
+def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None = None) -> Scalar:
     """Return the part of `rate_of_work` without accelerations, W: loads without a potential, and potentials
     that depend on time or on inputs.
 
@@ -332,7 +332,7 @@ def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
     return whole - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
 
 
-def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Scalar:
+def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
     """Return the power in W of the loads `of_inputs` minus the explicit rate of their stored energy."""
     if not of_inputs:
         return jnp.zeros_like(motion.t)
@@ -341,7 +341,7 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ..
 
 
 def power_of_loads(
-    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
+    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: Indices | None = None, loads: tuple[Load, ...] | None = None
 ) -> Scalar:
     """Return `sum F.v + L.omega + Q_k u_k` in W, over loads with a potential (`conservative=True`), without
     one (`False`), or with the indices `among`.

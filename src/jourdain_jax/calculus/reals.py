@@ -34,6 +34,8 @@ Vector3 = Float[Array, "3"]
 Matrix3 = Float[Array, "3 3"]
 Speeds = Float[Array, "speeds"]
 PerLane = Float[Array, "*lanes"]
+Shape = Indices
+Indices = Indices  # places in an array, or numbers of rows, coordinates or speeds
 
 
 def real_type() -> np.dtype:
@@ -103,7 +105,7 @@ def _of_jax(x) -> Array:
         raise ValueError("an integer is too large for a floating-point number; give a smaller one") from None
 
 
-def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is "
+def checked_real(value, what: str, shape: Shape | None = None, *, advice: str = "check how it is "
     "put together") -> Array:
     """Return `value` as a floating-point array.
 
@@ -125,7 +127,7 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
     return as_real(array)
 
 
-def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, advice: str = "give it in m") -> Array:
+def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str = "give it in m") -> Array:
     """Check as `checked_real`, for numbers above zero. ValueError for known values that are not."""
     found = checked_real(value, what, shape, advice=advice)
     if not np.all(known_numbers(found) > 0):
@@ -133,7 +135,7 @@ def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, ad
     return found
 
 
-def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is "
+def checked_known(value, what: str, shape: Shape | None = None, *, advice: str = "check how it is "
     "put together") -> np.ndarray:
     """Return `value`, which is not traced, as a NumPy array of the default float, also inside `jit`.
     Arguments and errors: as of `checked_real`.
@@ -150,7 +152,7 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
     return array.astype(real_type())
 
 
-def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):
+def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advice: str):
     """Return `value` in the default float: a NumPy array if known, also inside `jit`; a JAX array if traced.
     Raises ValueError as `checked_real` does.
     """
@@ -192,7 +194,7 @@ def in_default_precision(tree):
     return jax.tree.map(lambda x: x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
-def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None:
+def _check(array, what: str, shape: Shape | None, advice: str) -> None:
     if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")
     if shape is not None and array.shape != shape:
@@ -246,7 +248,7 @@ def known_numbers(x) -> np.ndarray:
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 
-def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False):
+def largest(x, axis: int | Indices | None = None, keepdims: bool = False):
     """Return the largest magnitude in an array, of JAX or of NumPy, or along its axes; zero if it is empty.
     """
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)

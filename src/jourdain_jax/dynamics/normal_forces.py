@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import eps_of, largest, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import Indices, eps_of, largest, rank_cutoff, tiny_of
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.names import Labels, check_names
 
@@ -42,7 +42,7 @@ def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float
     return found
 
 
-def _supports(carried: dict[str, tuple[int, ...]]) -> list[list[str]]:
+def _supports(carried: dict[str, Indices]) -> list[list[str]]:
     """Contacts that carry bodies in common, directly or through others, belong together."""
     groups: list[list[str]] = []
     for name, own in carried.items():
@@ -89,7 +89,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     return {name: (N[i], determined[i]) for i, name in enumerate(names)}
 
 
-def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], here):
+def _resultant(wrench: Wrenches, positions, sets: tuple[Indices, ...], here):
     """Return force and moment about a point for each of several sets of bodies."""
     moment = wrench.torque + jnp.cross(positions - here, wrench.force)
     summed = [[jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)]
@@ -102,7 +102,7 @@ def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance)
     return largest(changes, 0) <= tolerance * size
 
 
-def _carried(contact: Contact, name: str, bodies: Labels) -> tuple[int, ...]:
+def _carried(contact: Contact, name: str, bodies: Labels) -> Indices:
     """Return numbers of the bodies that a contact holds up."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
     return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import explicit_rate, forces_for_potentials, power_of_loads
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Indices, Scalar
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.equations.kinematics import inertias, motion_at, of_bodies, velocities_of
@@ -74,7 +74,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     )
 
 
-def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Scalar:
+def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices) -> Scalar:
     """Return the integrand of the work, in W: the power of the loads. For the loads `of_inputs`, forces count
     in place of potentials.
 

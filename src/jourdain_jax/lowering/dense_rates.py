@@ -20,14 +20,14 @@ from jourdain_jax.build.assembling import speed_scales, typical_lengths
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import at_index
+from jourdain_jax.calculus.reals import Indices, at_index
 from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.scene.scene import Scene
 
 
-def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+def dense_rates(scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
     """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
     states; NaN where accelerations are not determined.
 
@@ -53,7 +53,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
     return tuple(map(np.concatenate, zip(*found, strict=True)))
 
 
-def _rates(functions: tuple[Callable, Callable], structure: Structure, independent: tuple[int, ...], parameters, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+def _rates(functions: tuple[Callable, Callable], structure: Structure, independent: Indices, parameters, t, q, u, inputs) -> tuple[np.ndarray, ...]:
     values, slopes = functions
     kept, (states, speeds) = list(structure.kept_rows), u.shape
     dependent = np.setdiff1d(np.arange(speeds), independent)

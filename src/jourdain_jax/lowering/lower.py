@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.equations.listed import names_of_events, stops
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
@@ -263,7 +263,7 @@ def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
     return [n for n in dict.fromkeys(found) if graph.varies[n] and graph.op[n] != "select"]
 
 
-def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:
+def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int) -> Iterator[Strategy]:
     """Yield strategies worth trying; `plainly`: without normal forms of operations.
 
     For all models, with all speeds and without, no other of twelve strategies took fewer operations.

@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import largest
+from jourdain_jax.calculus.reals import Indices, largest
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
@@ -31,9 +31,9 @@ FEW = 12  # equations: with more, the operations that lead to a pivot are not co
 class Pivot:
     """Rows and columns eliminated together: one of each, or two."""
 
-    rows: tuple[int, ...]
-    columns: tuple[int, ...]
-    inverse: tuple[tuple[int, ...], ...]  # of A[rows][columns]
+    rows: Indices
+    columns: Indices
+    inverse: tuple[Indices, ...]  # of A[rows][columns]
     monitored: int  # must not vanish
 
 

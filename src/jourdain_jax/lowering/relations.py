@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList
 
@@ -79,7 +80,7 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
     return above, below
 
 
-def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[Indices, Indices]:
     """Return the numbers whose signs are monitored, in two parts: those of the rates, and those that occur in
     stop events only.
 
@@ -114,7 +115,7 @@ def _may_dip(values, above, below, least) -> bool:
     return not np.all(values <= np.minimum(above, below) + least)
 
 
-def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
+def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
     """Return the numbers whose branches may be continued beyond their zeros, since both branches are finite
     where the outputs are.
     """
@@ -127,7 +128,7 @@ def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
     return tuple(n for n in numbers if go_on(n))
 
 
-def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
+def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
     """Return the numbers at whose zeros, between probes, an output jumps."""
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, pushed_by_jax, with_rules
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
@@ -252,7 +252,7 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     return any(depend_on(program.graph, left_out, compress(program.variables, varies)))
 
 
-def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
+def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, Indices]:
     """Return the program and its relations. Functions of time among its inputs, if there are any, are part of
     it.
     """

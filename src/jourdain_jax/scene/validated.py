@@ -10,7 +10,7 @@ from typing import get_args
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, check_kind, checked_real, described
+from jourdain_jax.calculus.reals import Scalar, Shape, check_kind, checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.held_rows import HeldRow, JointFriction, held_rows
@@ -194,12 +194,12 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
     return given
 
 
-def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: tuple[int, ...] | None = ()) -> dict[str, Array]:
+def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: Shape | None = ()) -> dict[str, Array]:
     """Return a method's result at a time, pose or motion: numbers by name, or arrays of another `shape`."""
     return _checked(scene, _dictionary(scene, method, (at,), example), what, advice, shape)
 
 
-def _checked(scene: Scene, given: dict, what: str, advice: str, shape: tuple[int, ...] | None) -> dict[str, Array]:
+def _checked(scene: Scene, given: dict, what: str, advice: str, shape: Shape | None) -> dict[str, Array]:
     return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
 
 

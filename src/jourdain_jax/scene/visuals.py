@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type, static
+from jourdain_jax.calculus.reals import Indices, Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type, static
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -24,7 +24,7 @@ class Faces:
     object.
     """
 
-    def __init__(self, corners: np.ndarray, polygons: tuple[tuple[int, ...], ...]):
+    def __init__(self, corners: np.ndarray, polygons: tuple[Indices, ...]):
         self.corners, self.polygons = corners, polygons
 
 

@@ -25,7 +25,7 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
-from jourdain_jax.calculus.reals import compiled_quickly, largest, static
+from jourdain_jax.calculus.reals import Indices, compiled_quickly, largest, static
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
@@ -160,7 +160,7 @@ class _Program:
     functions of all numbers, a, b, and S (by rows).
     """
 
-    def __init__(self, scene: Scene, instant: ByProgram, of: tuple[tuple[int, ...], ...]) -> None:
+    def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
         graph, (rows, rates, states, of_states, places) = instant.graph, of
         x, m = [instant.columns[k] for k in states], len(states)
         given = [graph.input(f"special {k}", True) for k in range(2 * m + 4)]

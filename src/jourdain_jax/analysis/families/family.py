@@ -17,7 +17,7 @@ from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import Modes, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Numbers, checked_known, largest
+from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_name, check_names
@@ -118,7 +118,7 @@ class Family(Printed):
         exact = [point for point in self.points[: -1 if self.ends[1] == CLOSED else None] if past(point) == 0.0]
         return tuple(self.point(point) for point in (*exact, *found) if point)
 
-    def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
+    def point(self, point: Point, kind: str = "", columns: Indices = ()) -> FamilyPoint:
         """Return a point of the curve with its state and eigenvalues."""
         known = self.equations
         values, entries = known.values(point.z), (known.scene.coordinate_names.entries, known.scene.speed_names.entries)

@@ -32,7 +32,7 @@ from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, pla
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Flag, Number, Scalar, checked_whole, compiled_quickly, known_numbers, largest, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, checked_whole, compiled_quickly, known_numbers, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -169,8 +169,8 @@ class _Shooting(eqx.Module):
     instant: ByProgram | ByMatrices = static()
     pieces: int = static()
     until: int | None = static()
-    kept: tuple[int, ...] = static()  # numbers of z that matter
-    free: tuple[int, ...] = static()  # and of those that are unknown at the start
+    kept: Indices = static()  # numbers of z that matter
+    free: Indices = static()  # and of those that are unknown at the start
     shifted: Labels = static()  # names of what the user says to move
 
     @property

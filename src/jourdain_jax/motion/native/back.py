@@ -30,6 +30,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import filled
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen, slope_is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import write_pulled
@@ -331,7 +332,7 @@ def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotange
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable:
+def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable:
     """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
     (with its time last), and the goals.
 
@@ -348,7 +349,7 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
     return lambda *arguments: run_rows(*arguments)[0]
 
 
-def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable[..., Float[Array, "found"]]:
+def flow_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable[..., Float[Array, "found"]]:
     """Return a function that returns cotangents of the start's state and of the requested known numbers
     (`asked`). Its arguments are the start, and cotangents of the states at the goals, of the end and of the
     end's time.

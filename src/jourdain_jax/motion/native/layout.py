@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
@@ -41,11 +42,11 @@ class Form:
     affine: bool
     has_events: bool
     pivots: int  # how many are monitored
-    moving: tuple[tuple[int, ...], ...] = ()  # of every tangent, which of the numbers known have it
-    sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
+    moving: tuple[Indices, ...] = ()  # of every tangent, which of the numbers known have it
+    sampled: Indices = ()  # which of the inputs are given by samples
     time_moves: bool = False  # whether time has tangents
     compensated: bool = False  # whether the state is summed with what rounding leaves off, as in single precision
-    switched: tuple[int, ...] = ()  # which of the inputs are modes
+    switched: Indices = ()  # which of the inputs are modes
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
     most: int = 0  # transitions of a motion
     stopping: bool = True  # whether events that end a motion do
@@ -89,7 +90,7 @@ class Form:
         return {"known": len(self.program.fixed) + len(self.program.inputs), "dknown": sum(map(len, self.moving))}
 
     @property
-    def squares(self) -> tuple[int, ...]:
+    def squares(self) -> Indices:
         """Return the squared parts of rows normal to their predecessors, and squared sizes, alternating."""
         return self.program.squares if self.projects else ()
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
-from jourdain_jax.calculus.reals import Scalar, real_type
+from jourdain_jax.calculus.reals import Indices, Scalar, Shape, real_type
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
@@ -61,13 +61,13 @@ def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
     return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
 
 
-def _shapes(channel: FunctionOfTime) -> list[tuple[int, ...]]:
+def _shapes(channel: FunctionOfTime) -> list[Shape]:
     shapes = channel.program.shapes
     count = len(shapes) - len(channel.held)
     return [(count,), *shapes[count:]]
 
 
-def _each(part, shape: tuple[int, ...]) -> list:
+def _each(part, shape: Shape) -> list:
     return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
 
 
@@ -197,7 +197,7 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled, switched=switched, **of_events)
 
 
-def modes_among(inputs: Inputs) -> tuple[int, ...]:
+def modes_among(inputs: Inputs) -> Indices:
     """Return which of the inputs that are no functions of time are modes."""
     return tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Mode))
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.calculus.roots import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.motion.native.layout import MachineWriter
@@ -156,12 +157,12 @@ class Rows:
     affine: bool = False  # in what moves: one matrix serves, and a second step is for round-off
 
     @property
-    def moving(self) -> tuple[int, ...]:
+    def moving(self) -> Indices:
         """Nodes of the moving quantities."""
         return self.program.q if self.kind == "positions" else self.program.u
 
     @property
-    def residuals(self) -> tuple[int, ...]:
+    def residuals(self) -> Indices:
         """Nodes of the residuals."""
         return self.program.g if self.kind == "positions" else self.program.phi
 

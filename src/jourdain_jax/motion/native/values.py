@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, lanes_of
-from jourdain_jax.calculus.reals import Flag, Scalar, Speeds, real_type
+from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
 from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.motion.native.operands import Operands
@@ -288,7 +288,7 @@ class Beside:
     """
 
     program: Lowered
-    needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
+    needed: tuple[Indices, ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
     fixed: Callable[[Array], Array]  # of those entries
     speeds: Callable[..., Array] | None  # all of them; None where XLA is quicker
     numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate

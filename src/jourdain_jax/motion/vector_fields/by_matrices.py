@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.probed_on_graph import generic_inputs
 from jourdain_jax.build.structure import closure_lengths, structure_whatever_its_faults, trust, usual_rows
-from jourdain_jax.calculus.reals import Scalar, Speeds, is_traced, static
+from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, is_traced, static
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.contact_state import At
@@ -90,7 +90,7 @@ class ByMatrices(VectorField):
     stabilisation: Baumgarte | None
     usual: UsualLengths  # of the rows
     inputs_in_rows: bool = static()  # some change in time, and rows depend on them: their rates are needed
-    nonlinear_rows: tuple[int, ...] = static()  # all, where some are nonlinear in the speeds, and none follows from the others
+    nonlinear_rows: Indices = static()  # all, where some are nonlinear in the speeds, and none follows from the others
     cutoff: float | None = static()  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     def now(self, inputs, t):
@@ -131,8 +131,8 @@ class ByMatrices(VectorField):
 class MinimalByMatrices(ByMatrices):
     """Coordinates and privileged speeds."""
 
-    independent: tuple[int, ...] = static()
-    rows: tuple[int, ...] = static()  # that determine the dependent speeds
+    independent: Indices = static()
+    rows: Indices = static()  # that determine the dependent speeds
 
     @property
     def has_pivots(self) -> bool:

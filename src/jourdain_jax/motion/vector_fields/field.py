@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import event_resets, event_values, stored_by_inputs
-from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, check_kind, described, static
+from jourdain_jax.calculus.reals import Indices, PerLane, Scalar, Speeds, check_kind, described, static
 from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -150,14 +150,14 @@ class Instant(NamedTuple):
 class VectorField(eqx.Module):
     """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
 
-    independent: tuple[int, ...] | None = static()  # privileged speeds; None: the full state
+    independent: Indices | None = static()  # privileged speeds; None: the full state
     reduction: Reduction | GibbsAppell
     with_work: bool = static()
     conserves: bool = static()  # T + V is constant along every motion
     projects_positions: bool = static()
     projects_speeds: bool = static()
     rows_may_contradict: bool = static()  # each other, although the start meets all (`motion/integration.py`)
-    of_inputs: tuple[int, ...] = static()  # numbers of the loads whose potential depends on inputs
+    of_inputs: Indices = static()  # numbers of the loads whose potential depends on inputs
     event_names: Labels = static()  # sorted
     stops: tuple[bool, ...] = static()  # whether each event ends the motion
 
