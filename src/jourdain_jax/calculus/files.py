@@ -18,11 +18,12 @@ from pathlib import Path
 
 from jourdain_jax.calculus.reals import check_kind
 
+FilePath = str | os.PathLike
 DEEPEST = 250  # levels of what is nested: a chain of so many bodies, as elements of MJCF
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
 
-def read_bytes(path: str | os.PathLike, limit: int, what: str = "a file") -> bytes:
+def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
     """Return the content of the file `path`, at most `limit` bytes; `what`: its kind, for the error, such as
     "a URDF file".
     """
@@ -38,7 +39,7 @@ def read_bytes(path: str | os.PathLike, limit: int, what: str = "a file") -> byt
     return content
 
 
-def read_text(path: str | os.PathLike, limit: int, what: str = "a text file") -> str:
+def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
     """Return the text of the file `path`, which must be UTF-8 without zero bytes; arguments as of
     `read_bytes`.
     """
@@ -121,10 +122,10 @@ def _near(path: Path, error: Exception) -> str:
 _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for every one that is a line feed
 
 
-def check_place(path: str | os.PathLike) -> None:
+def check_place(path: FilePath) -> None:
     """Raise ValueError where no file can be written at `path`: its folder does not exist, or it is a folder.
     """
-    check_kind(path, str | os.PathLike, "`path`", "the name of a file")
+    check_kind(path, FilePath, "`path`", "the name of a file")
     place, folder = os.fspath(path), os.path.dirname(path) or "."
     if not os.path.isdir(folder):
         raise ValueError(f"cannot write `{place}`: there is no folder `{folder}`; make it first")
@@ -132,7 +133,7 @@ def check_place(path: str | os.PathLike) -> None:
         raise ValueError(f"cannot write `{place}`: it is a folder; give the name of a file in it")
 
 
-def write_whole(path: str | os.PathLike, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:
+def write_whole(path: FilePath, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:
     """Write a file with this `content` to `path` as a whole; `wait`: until it is on the disk; `mode`: its
     permissions, as of `open`.
     """

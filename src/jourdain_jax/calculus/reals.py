@@ -34,8 +34,8 @@ Vector3 = Float[Array, "3"]
 Matrix3 = Float[Array, "3 3"]
 Speeds = Float[Array, "speeds"]
 PerLane = Float[Array, "*lanes"]
-Shape = Indices
-Indices = Indices  # places in an array, or numbers of rows, coordinates or speeds
+Shape = tuple[int, ...]
+Indices = tuple[int, ...]  # places in an array, or numbers of rows, coordinates or speeds
 
 
 def real_type() -> np.dtype:

@@ -1,7 +1,6 @@
 """What came out of a study: statistics, failures, single lanes, labelled arrays."""
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from jourdain_jax.calculus.figures import figure
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.statistics import Grid, Statistics, Tally, combined
@@ -192,7 +192,7 @@ class StudyResult(Printed):
     def _opened(self):
         return needed("xarray", "a study as labelled arrays", "studies").open_zarr(self.store.path, chunks=None, consolidated=True)
 
-    def to_netcdf(self, path: str | os.PathLike) -> None:
+    def to_netcdf(self, path: FilePath) -> None:
         """Write all arrays to the NetCDF file `path`, by any installed engine of xarray."""
         found = self.to_xarray().load()
         found.attrs = {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.attrs.items()}
@@ -203,7 +203,7 @@ class StudyResult(Printed):
             array.encoding = {}
         found.to_netcdf(path)
 
-    def plot(self, *outputs: str, path: str | os.PathLike | None = None):
+    def plot(self, *outputs: str, path: FilePath | None = None):
         """Draw histograms of `outputs` (default: all). Return the figure, and write it to `path` if given.
         Needs matplotlib.
         """
@@ -268,7 +268,7 @@ class StudyResult(Printed):
         return "\n".join(lines)
 
 
-def load_study(path: str | os.PathLike) -> StudyResult:
+def load_study(path: FilePath) -> StudyResult:
     """Open the results of a study in the folder `path`, finished or not, without its scene. `study.run` with
     equal arguments also offers `.lane(k).simulate()`.
 
@@ -282,7 +282,7 @@ def load_study(path: str | os.PathLike) -> StudyResult:
     return found
 
 
-def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) -> StudyResult:
+def merge_studies(path: FilePath, shares: Sequence[FilePath]) -> StudyResult:
     """Copy chunks from the folders `shares` of one study (`study.run(..., shard=(k, n))`) into the folder
     `path`, which is one of them.
 

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jourdain_jax.calculus.files import parsed, read_bytes, shortened, write_whole
+from jourdain_jax.calculus.files import FilePath, parsed, read_bytes, shortened, write_whole
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked
@@ -98,7 +98,7 @@ class Receipt:
 class Store:
     """A study's folder, `path`."""
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: FilePath):
         self.path = Path(path)
         self.study = self._read_study()
         self._digests = self._read_manifest()
@@ -109,7 +109,7 @@ class Store:
         self.identity = _digest(json.dumps(decides).encode())
 
     @staticmethod
-    def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
+    def make(path: FilePath, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
         """Create a folder, whole or not at all; an existing one is not changed. `constants`: name -> axis,
         values, attributes."""
         zarr = needed("zarr", "storing a study", "studies")
@@ -210,7 +210,7 @@ class Store:
         return f"lanes {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
 
     @staticmethod
-    def is_taken(path: str | os.PathLike) -> bool:
+    def is_taken(path: FilePath) -> bool:
         """Whether something is at `path`; an empty folder does not count."""
         path = Path(path)
         return path.exists() and not (path.is_dir() and not any(path.iterdir()))

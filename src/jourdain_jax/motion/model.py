@@ -2,7 +2,6 @@
 scene.
 """
 
-import os
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import jax
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
@@ -183,7 +183,7 @@ class Model(BuiltFor, Printed):
             )
         return tuple(said)
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: FilePath) -> None:
         """Write the results of `build` for the numbers of the scene to the file `path`, for `jj.load_model`.
 
         Raises ValueError for a model with its own reduction or stabilisation, and where parts of the scene
@@ -281,7 +281,7 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     return settled
 
 
-def load_model(path: str | os.PathLike, scene: Scene) -> Model:
+def load_model(path: FilePath, scene: Scene) -> Model:
     """Load the model of a scene from a file of `Model.save`, without tracing, probing or lowering.
 
         jj.build(bicycle).save("bicycle.model")

@@ -8,7 +8,6 @@ A dataclass of `KINDS` or a graph is {its name: its fields}, an array {"array": 
 
 import hashlib
 import json
-import os
 from collections.abc import Hashable, Mapping
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import Variables
-from jourdain_jax.calculus.files import parsed, read_bytes, write_whole
+from jourdain_jax.calculus.files import FilePath, parsed, read_bytes, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.program.graph import Graph
@@ -28,7 +27,7 @@ from jourdain_jax.scene.scene import Scene
 KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram, Variables, Graph)}
 
 
-def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
+def write(path: FilePath, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
     """Write the findings about a scene and `how` to build it. Findings are keyed by the functions that find
     them and the first part of their key.
     """
@@ -40,7 +39,7 @@ def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hasha
     write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
 
 
-def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
+def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
     """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file is
     damaged or does not match.
     """

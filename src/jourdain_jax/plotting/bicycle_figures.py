@@ -1,11 +1,11 @@
 """The figures of the bicycle job: eigenvalues against speed with uncertainty bands, rides against time, a ride in space."""
 
-import os
 
 import numpy as np
 
 from jourdain_jax.bicycle.job import Study
 from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.plotting.pictures import animate
 from jourdain_jax.plotting.quantities import plot
 
@@ -14,7 +14,7 @@ _MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("w
 _CEILING = 12.0  # 1/s; castering goes far below what matters
 
 
-def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
+def draw_eigenvalues(study: Study, path: FilePath) -> None:
     """Draw real and imaginary parts against forward speed. Bands lie between the 2.5 and 97.5 % quantiles of
     the samples; the speeds of stability have such bands as well. The stable range is green.
     """
@@ -69,7 +69,7 @@ def _mark_range(study: Study, axes) -> None:
             axis.axvspan(low, high, lw=0, **paint)
 
 
-def draw_rides(study: Study, path: str | os.PathLike) -> None:
+def draw_rides(study: Study, path: FilePath) -> None:
     """Lean and steer against time for the three rides."""
     rides = study.rides
     lanes = [rides.lanes.lane(i) for i in range(len(rides.labels))]
@@ -88,7 +88,7 @@ def draw_rides(study: Study, path: str | os.PathLike) -> None:
     pyplot().close(figure)
 
 
-def animate_ride(study: Study, path: str | os.PathLike) -> None:
+def animate_ride(study: Study, path: FilePath) -> None:
     """The first ride (below the stable range) in space, the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)

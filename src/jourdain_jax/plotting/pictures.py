@@ -2,14 +2,13 @@
 a notebook.
 """
 
-import os
 from collections.abc import Sequence
 
 import numpy as np
 
 from jourdain_jax.calculus.figures import figure as figure_in_html
 from jourdain_jax.calculus.figures import pyplot
-from jourdain_jax.calculus.files import check_place
+from jourdain_jax.calculus.files import FilePath, check_place
 from jourdain_jax.calculus.reals import checked_whole, described
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -20,7 +19,7 @@ from jourdain_jax.scene.arguments import of_known_numbers
 VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
 
 
-def check_suffix(path: str | os.PathLike) -> None:
+def check_suffix(path: FilePath) -> None:
     """ValueError where an animation cannot be written to a file of this name."""
     check_place(path)
     if not str(path).lower().endswith(".gif"):
@@ -30,7 +29,7 @@ def check_suffix(path: str | os.PathLike) -> None:
 @of_known_numbers
 def animate(
     trajectory: Trajectory,
-    path: str | os.PathLike,
+    path: FilePath,
     *,
     frames: int = 60,
     paths: Sequence[tuple[str, Sequence[float]]] | None = None,
@@ -82,7 +81,7 @@ def animate(
 
 def draw_still(
     trajectory: Trajectory,
-    path: str | os.PathLike,
+    path: FilePath,
     *,
     at: int | Sequence = 3,
     paths: Sequence[tuple[str, Sequence]] | None = None,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.figures import pyplot
-from jourdain_jax.calculus.files import check_place
+from jourdain_jax.calculus.files import FilePath, check_place
 from jourdain_jax.calculus.reals import check_kind, described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
@@ -27,7 +27,7 @@ UNITS = {  # by what is measured in them, in those of SI
 }
 
 
-def check_format(path: str | os.PathLike) -> None:
+def check_format(path: FilePath) -> None:
     """ValueError where matplotlib knows no picture with the suffix of this path."""
     known = pyplot().FigureCanvasBase.get_supported_filetypes()
     check_place(path)
@@ -45,7 +45,7 @@ def plot(
     labels: "Sequence[str] | None" = None,
     bands: Sequence[float] = (0.5, 0.95),
     title: str | None = None,
-    path: str | os.PathLike[str] | None = None,
+    path: FilePath | None = None,
     axes: Any = None,
 ) -> tuple[Any, Any]:
     """Plot named quantities of a `motion` against time, one panel each.

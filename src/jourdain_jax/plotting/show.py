@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.files import check_place
+from jourdain_jax.calculus.files import FilePath, check_place
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -26,7 +26,7 @@ class View:
     def __init__(self, page: str, title: str, height: int):
         self.html, self.title, self.height = page, title, height
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: FilePath) -> None:
         """Write the page to `path` (.html), one file that needs neither other files nor a network. Raises
         ValueError for another suffix.
         """
@@ -43,7 +43,7 @@ class View:
 
 
 @of_known_numbers
-def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.PathLike[str] | None = None, **how: Any) -> View:
+def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath | None = None, **how: Any) -> View:
     """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
     - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly
@@ -119,7 +119,7 @@ def _file(name: str) -> str:
     return (resources.files("jourdain_jax") / "plotting" / "viewer" / name).read_text(encoding="utf-8")
 
 
-def _check_suffix(path: str | os.PathLike) -> None:
+def _check_suffix(path: FilePath) -> None:
     if not str(path).lower().endswith((".html", ".htm")):
         raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use "
             "`jj.animate`, for figures `jj.plot`")

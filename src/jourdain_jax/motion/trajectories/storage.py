@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.trace import velocity_quantities
-from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
+from jourdain_jax.calculus.files import FilePath, check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.calculus.reals import at_index, check_kind, described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
@@ -51,7 +51,7 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 
 
 @of_known_numbers
-def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
+def save(motion: Trajectory | Rollout, path: FilePath) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
 
     An existing file is replaced only when the new one is complete: an interruption leaves the old one. Inputs
@@ -112,7 +112,7 @@ def _sampled(inputs: Inputs, ts):
 
 
 @with_nan_as_a_mark
-def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
+def load_trajectory(path: FilePath, scene: Scene | type[Scene]) -> Trajectory:
     """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
     Raises ValueError where the file cannot be read, has another format, contains a rollout, or belongs to
@@ -124,7 +124,7 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
 
 
 @with_nan_as_a_mark
-def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
+def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
     """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
 
     `scene`: the scene's class, or any scene of that class; parameters come from the file. Raises ValueError
@@ -220,7 +220,7 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
     """Return header and arrays of a file of this kind, and the class of its scene."""
-    check_kind(path, str | os.PathLike, "`path`", "the name of a file")
+    check_kind(path, FilePath, "`path`", "the name of a file")
     what = f"{kind} file written by `save`"
     try:
         with open(path, "rb") as file:
