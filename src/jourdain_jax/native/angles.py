@@ -208,7 +208,7 @@ def _reduced_far(w: Writer, x: Value) -> Triple:
     w.store(math.nan, r)
     w.store(0.0, over)
     w.store(w.literal(0, w.whole), quadrant)
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         one = w.intrinsic("fabs", w.load(given, lane, "double"))
         with w.when((one > LARGEST_ANGLE) & (one < math.inf)):
             w.run("far_angle", *(w.at(place, lane, "double") for place in (given, r, over, quadrant)))

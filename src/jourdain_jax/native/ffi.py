@@ -114,7 +114,7 @@ def product(w: Writer, x: Given, but: int) -> Value:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
     total = w.room(type="i64")
     w.store(w.literal(1, "i64"), total)
-    with w.counted(0, x.rank - but) as axis:
+    with w.counted(x.rank - but) as axis:
         w.store(w.load(total, type="i64") * w.load(x.sizes, axis, "i64"), total)
     return w.load(total, type="i64")
 
@@ -251,7 +251,7 @@ def share(w: Writer, job: Value, count: Value) -> None:
             w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)
     w.call("loop", "ptr", job)
     if threads > 1:
-        with w.counted(0, w.load(started, type="i64")) as number:
+        with w.counted(w.load(started, type="i64")) as number:
             w.external("pthread_join", "i32", w.load(others, number, "i64"), nothing)
 
 
@@ -287,13 +287,13 @@ def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: V
 
 def taken_in(w: Writer, count: int, numbers: OfLane, rows: Value, lane: Value) -> None:
     """Copy so many numbers of a lane into its rows."""
-    with w.counted(0, count) as row:
+    with w.counted(count) as row:
         w.store(w.load(numbers.place(row), type="double"), rows, row * w.lanes + lane)
 
 
 def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane) -> None:
     """Copy so many rows of a lane into its numbers."""
-    with w.counted(0, count) as row:
+    with w.counted(count) as row:
         w.store(w.load(rows, row * w.lanes + lane, "double"), numbers.place(row))
 
 
@@ -308,7 +308,7 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
         rows, results, count = w.load(job, IN, "ptr"), w.load(job, OUT, "ptr"), w.load(job, COUNT, "i64")
         with w.repeated() as leave:
             leave(~w.together(lanes_taken(w, job, NEXT) < count))
-            with w.counted(0, w.lanes) as lane:
+            with w.each_lane() as lane:
                 number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
                 taken_in(
@@ -319,7 +319,7 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
                     lane,
                 )
             w.run("row", state, found)
-            with w.counted(0, w.lanes) as lane:
+            with w.each_lane() as lane:
                 number = w.load(who, lane, "i64")
                 with w.when(number < count):
                     handed_out(w, returned, found, lane, of_lane(w, results, count, returned, number))

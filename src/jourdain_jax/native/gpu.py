@@ -50,7 +50,7 @@ def handler_text() -> str:
         words, count = w.room(ffi.WORDS * ffi.MOST_BUFFERS, "i64"), w.room(type="i64")
         w.store(w.literal(0, "i64"), count)
         for of, buffers in ((ffi.ARGS - 2, ffi.ARGS), (ffi.RETS - 2, ffi.RETS)):
-            with w.counted(0, w.load(frame, of, "i64")) as k:
+            with w.counted(w.load(frame, of, "i64")) as k:
                 place = w.load(count, type="i64")
                 w.run("described", w.load(w.load(frame, buffers, "ptr"), k, "ptr"), w.at(words, place * ffi.WORDS, "i64"))
                 w.store(place + 1, count)

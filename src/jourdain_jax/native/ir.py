@@ -11,7 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
@@ -176,7 +176,7 @@ class Writer:
         self.place(after)
 
     @contextmanager
-    def counted(self, first: Value | int, end: Value | int) -> Iterator[Value]:
+    def counted(self, end: Value | int, *, first: Value | int = 0) -> Iterator[Value]:
         """A loop over whole numbers from `first` up to before `end`."""
         number = self.room(type="i64")
         self.store(self.literal(first, "i64"), number)
@@ -185,6 +185,10 @@ class Writer:
             leave(now >= end)
             yield now
             self.store(now + 1, number)
+
+    def each_lane(self) -> AbstractContextManager[Value]:
+        """Return a loop over the lanes."""
+        return self.counted(self.lanes)
 
     # instructions
 

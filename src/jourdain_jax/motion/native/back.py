@@ -98,7 +98,7 @@ def _write_note(w: MachineWriter, form: Form) -> None:
     """
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form, state)
-        with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
+        with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.each_lane() as lane:
             times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
             with w.repeated() as leave:
                 leave(~(lanes.of("code", lane).equals(RUNNING) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
@@ -126,14 +126,14 @@ def _write_added(w: MachineWriter, form: Form) -> None:
         firsts, ends = w.room(), w.room()
         w.store(first, firsts)
         w.store(end, ends)
-        with w.when(w.any(first < end)), w.counted(0, w.lanes) as lane:
+        with w.when(w.any(first < end)), w.each_lane() as lane:
             number, times = w.load(who, lane, "i64"), w.load(job, TIMES, "i64")
             with w.when(number >= 0):
                 a, b = (w.converted("fptosi", w.load(x, lane, "double"), "i64") for x in (firsts, ends))
                 states = of_lane(
                     w, w.load(job, TO_STATES, "ptr"), w.load(job, COUNT, "i64"), times * count, number
                 )
-                with w.counted(a, b) as k, w.counted(0, count) as row:
+                with w.counted(b, first=a) as k, w.counted(count) as row:
                     more = w.load(states.place(k * count + row), type="double")
                     place = w.at(g, row * w.lanes + lane, "double")
                     w.store(w.load(place, type="double") + more, place)
@@ -245,7 +245,7 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
         located = is_located(w, Lanes(w, form, state))
         with w.when(w.any(located)):
             g_t = w.room(1 + len(form.moving))
-            with w.counted(0, w.lanes) as lane:
+            with w.each_lane() as lane:
                 number = w.load(who, lane, "i64")
                 end = _cotangents_of_end(w, form, job, w.where(number >= 0, number, 0))
                 taken_in(w, 1 + len(form.moving), end.after(form.integrated), g_t, lane)
@@ -260,7 +260,7 @@ def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
         w.store(w.where(is_noted(w, form, w.load(left)), w.load(left), 0.0), numbers)
         each_row(w, 1 + len(form.moving), g_t, lambda i: 0.0)
-        with w.counted(0, w.lanes) as lane:
+        with w.each_lane() as lane:
             number = w.load(who, lane, "i64")
             with w.when(w.load(numbers, lane, "double").differs(0.0) & (number >= 0)):
                 passed = lanes.of("passed", lane) - 1.0

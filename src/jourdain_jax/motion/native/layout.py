@@ -278,7 +278,7 @@ class MachineWriter(Writer):
         values, indices = self.room(), self.room()
         self.store(value, values)
         self.store(self.where(where & (index < float(rows)), index, -1.0), indices)
-        with self.counted(0, self.lanes) as lane:
+        with self.each_lane() as lane:
             row = self.load(indices, lane, "double")
             with self.when(row >= 0.0):
                 into = self.converted("fptosi", row, "i64") * self.lanes + lane
@@ -295,7 +295,7 @@ class MachineWriter(Writer):
             for i in rows:
                 body(i)
         else:
-            with self.counted(rows.start, rows.stop) as i:
+            with self.counted(rows.stop, first=rows.start) as i:
                 body(i)
 
     def _total(self, rows: range, added: Callable[[Value, Any], Value]) -> Value:

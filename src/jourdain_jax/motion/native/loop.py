@@ -133,10 +133,10 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
         w.room(form.integrated * method.needed),
     )
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
-    with w.counted(0, form.all) as row:
+    with w.counted(form.all) as row:
         w.store(1.0, state, row)
     lanes = Lanes(w, form, state)
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         w.run("begin", job, state, who, lane)
         w.run("serve", job, state, who, lane)
     with w.repeated() as leave:
@@ -146,7 +146,7 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
             w.run("save_within", job, state, who, k)
         code = lanes["code"]
         on_its_way = (code.equals(RUNNING) & lanes["t"].differs(lanes["goal"])) | code.equals(LOCATING) | code.equals(IDLE)
-        with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
+        with w.when(w.any(~on_its_way)), w.each_lane() as lane:
             w.run("serve", job, state, who, lane)
 
 
@@ -249,7 +249,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
             due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
             leave(~w.any(due))
             s = goal - lanes["before"]
-            with w.counted(0, every) as row:
+            with w.counted(every) as row:
                 total = w.load(k, row + method.order * every)
                 for j in reversed(range(method.order)):
                     total = w.fma(total, s, w.load(k, row + j * every))
@@ -257,7 +257,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
             if form.projects:
                 w.run("project", state, goal, y)
             w.store(w.where(due, 1.0, 0.0), flags)
-            with w.counted(0, w.lanes) as lane, w.when(w.load(flags, lane, "double") > 0.0):
+            with w.each_lane() as lane, w.when(w.load(flags, lane, "double") > 0.0):
                 saved = w.load(who, lane + w.lanes, "i64")
                 number = w.load(who, lane, "i64")
                 handed_out(
@@ -281,7 +281,7 @@ def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, la
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
     number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
     last = w.where(runs, saved + 1, times)
-    with w.counted(saved, last) as k:
+    with w.counted(last, first=saved) as k:
         handed_out(
             w, every, lanes.pointer, lane, of_lane(w, states, count, times * every, number).after(k * every)
         )

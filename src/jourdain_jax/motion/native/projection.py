@@ -33,14 +33,14 @@ def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
     """Return the sum of products of so many numbers from two places on."""
     total = w.room()
     w.store(0.0, total)
-    with w.counted(0, count) as k:
+    with w.counted(count) as k:
         w.store(w.fma(w.load(a, k), w.load(b, k), w.load(total)), total)
     return w.load(total)
 
 
 def cleared(w: MachineWriter, place: Value, count: int) -> None:
     """Store zeros at so many places from one on."""
-    with w.counted(0, count) as k:
+    with w.counted(count) as k:
         w.store(0.0, place, k)
 
 
@@ -52,9 +52,9 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
     with w.procedure("rotated", "B") as (B,):
         turned = w.room(type="i1")
         # 40 of rotations; 6 to 10 are taken
-        with w.counted(0, 40):
+        with w.counted(40):
             w.store(w.literal(0, "i1"), turned)
-            with w.counted(0, rows) as i, w.counted(i + 1, rows) as j:
+            with w.counted(rows) as i, w.counted(rows, first=i + 1) as j:
                 first, second = w.at(B, i * width), w.at(B, j * width)
                 a, b, p = (_product_of_rows(w, x, y, columns) for x, y in ((first, first), (second, second), (first, second)))
                 lengths = w.root(a) * w.root(b)
@@ -65,7 +65,7 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
                     t = w.intrinsic("copysign", w.number(1.0) / (w.magnitude(zeta) + w.root(zeta * zeta + 1.0)), zeta)
                     c = w.number(1.0) / w.root(t * t + 1.0)
                     c, s = w.where(slanted, c, 1.0), w.where(slanted, c * t, 0.0)
-                    with w.counted(0, width) as k:
+                    with w.counted(width) as k:
                         x, y = w.load(first, k), w.load(second, k)
                         w.store(w.where(slanted, c * x - s * y, x), first, k)
                         w.store(w.where(slanted, s * x + c * y, y), second, k)
@@ -79,12 +79,12 @@ def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> 
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
         w.store(0.0, longest)
-        with w.counted(0, rows) as i:
+        with w.counted(rows) as i:
             row = w.at(B, i * width)
             length = w.root(_product_of_rows(w, row, row, columns))
             w.store(length, weights, i)
             w.store(w.larger(w.load(longest), length), longest)
-        with w.counted(0, rows) as i:
+        with w.counted(rows) as i:
             length = w.load(weights, i)
             short = length <= w.load(longest) * cutoff  # never where one is not a number, which shows
             w.store(w.where(short, 0.0, w.number(1.0) / w.where(short, 1.0, length * length)), weights, i)
@@ -95,10 +95,10 @@ def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
         cleared(w, x, columns)
-        with w.counted(0, rows) as i:
+        with w.counted(rows) as i:
             row = w.at(B, i * width)
             share = w.load(weights, i) * _product_of_rows(w, w.at(row, columns), b, rows)
-            with w.counted(0, columns) as k:
+            with w.counted(columns) as k:
                 w.store(w.fma(share, w.load(row, k), w.load(x, k)), x, k)
 
 
@@ -110,11 +110,11 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
         finite, smallest = w.room(), w.room()
         w.store(0.0, finite)  # stays zero where all entries are finite
         w.store(1.0, smallest)
-        with w.counted(0, n) as i, w.counted(0, n) as j:
+        with w.counted(n) as i, w.counted(n) as j:
             w.store(w.fma(w.load(M, i * n + j), 0.0, w.load(finite)), finite)
-        with w.counted(0, n) as i:
+        with w.counted(n) as i:
             row = w.at(M, i * n)
-            with w.counted(0, i) as j:
+            with w.counted(i) as j:
                 other = w.at(M, j * n)
                 rest = w.load(row, j) - _product_of_rows(w, row, other, j)
                 w.store(rest / w.load(other, j), row, j)
@@ -123,7 +123,7 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
             w.store(w.root(pivot), row, i)
         is_finite = w.load(finite).equals(0.0)
         definite = w.load(smallest) > 16 * n * w.eps
-        with w.counted(0, n) as i, w.counted(0, i + 1) as j:
+        with w.counted(n) as i, w.counted(i + 1) as j:
             on_diagonal = w.converted("uitofp", i.equals(j), "double")
             one = w.spread(on_diagonal)
             w.store(w.where(is_finite, w.where(definite, w.load(M, i * n + j), one), float("nan")), M, i * n + j)
@@ -131,15 +131,15 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
 
 def write_triangular(w: MachineWriter, n: int) -> None:
     """`forward(L, x)` and `backward(L, x)`: L^-1 x and L'^-1 x in place of x."""
-    with w.procedure("forward", "L x") as (L, x), w.counted(0, n) as i:
+    with w.procedure("forward", "L x") as (L, x), w.counted(n) as i:
         row = w.at(L, i * n)
         w.store((w.load(x, i) - _product_of_rows(w, row, x, i)) / w.load(row, i), x, i)
-    with w.procedure("backward", "L x") as (L, x), w.counted(0, n) as before:
+    with w.procedure("backward", "L x") as (L, x), w.counted(n) as before:
         i = w.literal(n - 1, "i64") - before
         row = w.at(L, i * n)
         value = w.load(x, i) / w.load(row, i)
         w.store(value, x, i)
-        with w.counted(0, i) as k:
+        with w.counted(i) as k:
             w.store(w.load(x, k) - value * w.load(row, k), x, k)
 
 
@@ -240,9 +240,9 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
     with w.procedure("metric", "state L c") as (state, L, c):
         cleared(w, L, n * n)
         w.run("masses", state, L)
-        with w.counted(0, n) as i:
+        with w.counted(n) as i:
             w.store(_scale_of_speed(w, w.load(L, i * n + i)), c, i)
-        with w.counted(0, n) as i, w.counted(0, i + 1) as k:
+        with w.counted(n) as i, w.counted(i + 1) as k:
             scaled = w.load(c, i) * w.load(L, i * n + k) * w.load(c, k)
             both = (w.load(state, i + first_free) > 0.0) & (w.load(state, k + first_free) > 0.0)
             alone = w.spread(w.converted("uitofp", i.equals(k), "double"))
@@ -267,23 +267,23 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
     with w.procedure("factored", "state L c B d weights") as (state, L, c, B, d, weights):
         cleared(w, B, rows * width)
         w.run("slopes", state, B)
-        with w.counted(0, rows) as i:
+        with w.counted(rows) as i:
             row, square = w.at(B, i * width), w.room()
-            with w.counted(0, columns) as k:
+            with w.counted(columns) as k:
                 slope = w.load(row, k)
                 slope = slope if of.metric is None else slope * w.load(c, k)
                 w.store(w.where(w.load(state, k + first_free) > 0.0, slope, 0.0), row, k)
             if of.metric is not None:
                 w.run("forward", L, row)
             w.store(0.0, square)
-            with w.counted(0, columns) as k:
+            with w.counted(columns) as k:
                 slope = w.load(row, k)
                 w.store(w.fma(slope, slope, w.load(square)), square)
             length = w.larger(w.root(w.load(square)), w.load(state, i + first_typical))
             there = length > 0.0
             scale = w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0)
             w.store(scale, d, i)
-            with w.counted(0, columns) as k:
+            with w.counted(columns) as k:
                 w.store(w.load(row, k) * scale, row, k)
             w.store(1.0, row, i + columns)
         w.run("rotated", B)
@@ -299,12 +299,12 @@ def _write_moved(w: MachineWriter, of: Rows) -> None:
     with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):
         left = w.room(rows)
         w.run("residuals", state, left)
-        with w.counted(0, rows) as i:
+        with w.counted(rows) as i:
             w.store(w.load(left, i) * w.load(d, i), left, i)
         w.run("solved", B, weights, left, x)
         if of.metric is not None:
             w.run("backward", L, x)
-        with w.counted(0, columns) as k:
+        with w.counted(columns) as k:
             change = w.load(x, k)
             change = change if of.metric is None else change * w.load(c, k)
             moves = w.load(state, k + first_free) > 0.0  # what is held does not move by round-off either
@@ -319,7 +319,7 @@ def _write_row(w: MachineWriter, of: Rows) -> None:
         n = columns if of.metric is not None else 0
         factors = [w.room(max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows)]
         _write_putting(w, of, first, state, factors, w.room(columns))
-        with w.counted(0, columns) as k:
+        with w.counted(columns) as k:
             w.store(w.load(state, k + first), found, k)
         w.run("residuals", state, w.at(found, columns))
 
@@ -334,7 +334,7 @@ def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors
     w.run("factored", state, *factors)
     for _ in range(2):
         w.run("moved", state, *factors, x)
-        with w.counted(0, len(of.moving)) as k:
+        with w.counted(len(of.moving)) as k:
             w.store(w.load(x, k), state, k + first)
 
 
@@ -343,13 +343,13 @@ def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(0.0, quiet)
-    with w.counted(0, MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
+    with w.counted(MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
         going = w.load(quiet) < float(QUIET)
         with w.when(w.any(going)):
             w.run("factored", state, *factors)
             w.run("moved", state, *factors, x)
             w.store(-math.inf, changed)
-            with w.counted(0, columns) as k:
+            with w.counted(columns) as k:
                 old, new = w.load(state, k + first), w.load(x, k)
                 beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * w.eps)
                 w.store(w.where(beyond, 1.0, w.load(changed)), changed)

@@ -172,16 +172,16 @@ def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
 
 def _take(w: MachineWriter, job: Value, who: Value) -> None:
     """Return the next samples of the batch; -1 if there is none."""
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         number = next_lane(w, job, NEXT)
         w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
 
 
 def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> None:
     """All lanes at their starts."""
-    with w.counted(0, form.all) as row:
+    with w.counted(form.all) as row:
         w.store(1.0, rooms.state, row)
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         w.run("begin", job, rooms.state, rooms.who, lane)
     w.store(0.0, rooms.saved)
     w.run("note", job, rooms.state, rooms.who, rooms.saved)
@@ -208,7 +208,7 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
     each_row(w, form.integrated, g, lambda i: 0.0)
     ends = w.load(job, TO_ENDS, "ptr")
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
             taken_in(
@@ -239,7 +239,7 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
     g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
             numbers = of_lane(w, found, w.load(job, COUNT, "i64"), each, number)
@@ -252,10 +252,10 @@ def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) 
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 
     def lost(number: Value) -> None:
-        with w.counted(0, each) as row:
+        with w.counted(each) as row:
             w.store(w.literal(math.nan, "double"), found, number * each + row)
 
-    with w.counted(0, w.lanes) as lane:
+    with w.each_lane() as lane:
         number = w.load(who, lane, "i64")
         with w.when(number >= 0):
             lost(number)

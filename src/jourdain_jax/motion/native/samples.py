@@ -55,7 +55,7 @@ def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> Non
     with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
         lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
         w.store(t, times)
-        with w.counted(0, w.lanes) as lane:
+        with w.each_lane() as lane:
             now, count = w.load(times, lane, "double"), lanes.of("samples", lane, "i64")
             for i in range(len(form.sampled)):
                 ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
