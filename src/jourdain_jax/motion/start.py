@@ -25,7 +25,7 @@ from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time, shown_from_users_lines
-from jourdain_jax.scene.names import Labels, nearest
+from jourdain_jax.scene.names import Labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 
 _NOTHING: Mapping = MappingProxyType({})
@@ -44,10 +44,7 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
     model, scene = modelled(scene), as_scene(scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
     t, q, u = one_time(t), as_coordinates(scene, q), as_speeds(scene, u)
-    for name in held:
-        if name not in coordinates + speeds:
-            raise ValueError(f"`held` names `{name}`, which is not a coordinate or speed; "
-                f"{nearest(name, coordinates + speeds)}")
+    check_names(held, coordinates + speeds, "`held` names `{}`, which is not a coordinate or speed")
     free_q, free_u = (free_entries(names, tuple(held)) for names in (coordinates, speeds))
     guess = Guess(q, u, free_q, free_u, ~free_entries(coordinates, ()), model.usual(False))
     return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype))

@@ -194,13 +194,10 @@ class Trajectory(Record, Printed):
         and gravity; if steps became short, a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
-        if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
+        if code in (results.STICKS, results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
-            return (f"{load} jumps, or has a kink, at the last state: let it change within a short range, as "
-                "by `jnp.tanh`",) if load else ()
-        if code == results.STICKS:
-            load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
-            return (load,) if load else ()
+            said = " jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`"
+            return (f"{load}{'' if code == results.STICKS else said}",) if load else ()
         if code != results.BAD_PARAMETER:
             return ()
         if self.wrong_parameters:
