@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, check_kind, checked_known, described, largest
+from jourdain_jax.calculus.reals import Number, all_finite, check_kind, checked_known, described, largest
 
 Numbers = Float[Array, "*batch"]
 
@@ -170,7 +170,7 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     n, names = len(means), list(mean)
     C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice="one row and one column "
         f"for each of {', '.join(names)}")
-    if not (np.all(np.isfinite(C)) and np.all(np.isfinite(means))):
+    if not (all_finite(C) and all_finite(means)):
         raise ValueError("mean and covariance of `joint_normal` must be finite; omit unknown quantities")
     for name, variance in zip(names, variances := np.diag(C), strict=True):
         if variance <= 0:
@@ -230,7 +230,7 @@ class Estimate:
     def __post_init__(self):
         if self.guess is not None:
             guess = checked_known(self.guess, "`guess` of `Estimate`", advice="give a number")
-            if not np.all(np.isfinite(guess)):
+            if not all_finite(guess):
                 raise ValueError(f"`guess` of `Estimate` is {self.guess}, expected a finite number")
             object.__setattr__(self, "guess", tuple(guess.tolist()) if guess.ndim == 1 else float(checked_known(guess, "`guess` of `Estimate`", ())))
         check_kind(

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Indices, Shape, described, largest, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, Shape, all_finite, described, largest, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
@@ -148,7 +148,7 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
         what = f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one or three products, and three moments with any"
         raise ValueError(_refusal(scene, name, what))
     found = BodyInertia(name, tuple(entries), tuple(axes), there)
-    if not np.all(np.isfinite(found.numbers(scene)[0])):
+    if not all_finite(found.numbers(scene)[0]):
         moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
         raise ValueError(
             f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which, "

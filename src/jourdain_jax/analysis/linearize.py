@@ -30,7 +30,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, array_module, compiled_quickly, holds, is_traced, largest, static
+from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, array_module, compiled_quickly, holds, is_traced, largest, static
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -226,7 +226,7 @@ def _about(instant, scene: Scene, state: State, f, y: Indices, dependent: Labels
     q, known = state.q, not is_traced((D, state))
     if known:
         q, v, D, mass = map(np.asarray, (q, v, D, mass))
-    G = D[np.ix_(at.geometric, at.q)] if known and np.all(np.isfinite(D)) else None
+    G = D[np.ix_(at.geometric, at.q)] if known and all_finite(D) else None
     following = [names[i] for i in dependent_coordinates(scene, state, coordinates or (), dependent, G)]
     independent = tuple(name for name in names if name not in following)
     speeds = tuple(scene.speed_names.entries[i] for i in y)

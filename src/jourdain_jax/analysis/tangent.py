@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, Indices, array_module, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import Entries, Indices, all_finite, array_module, rank_cutoff, tiny_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
@@ -78,7 +78,7 @@ def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, 
     """Return the smallest singular value of the dependent part of rows of unit length. It has no derivative.
     """
     xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
-    if xp is np and not np.all(np.isfinite(block)):
+    if xp is np and not all_finite(block):
         return np.asarray(np.nan)
     sizes = xp.linalg.svd(jax.lax.stop_gradient(block) if xp is jnp else block, compute_uv=False)
     return xp.asarray(xp.min(sizes, initial=1.0) if len(block) >= len(dependent) else 0.0)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import eps_of, largest
+from jourdain_jax.calculus.reals import all_finite, eps_of, largest
 from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
@@ -106,7 +106,7 @@ def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarr
     """Return the median over the states at which all entries are numbers, or the largest for a row that
     vanishes at half of them; 0 for one that always does.
     """
-    length = length[np.all(np.isfinite(length), axis=1)]
+    length = length[all_finite(length, axis=1)]
     if not len(length):
         return np.zeros(length.shape[1], length.dtype)
     median = np.median(length, axis=0)

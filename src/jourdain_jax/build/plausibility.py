@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import random_states
-from jourdain_jax.calculus.reals import Flag, Scalar, at_index, eps_of, largest
+from jourdain_jax.calculus.reals import Flag, Scalar, all_finite, at_index, eps_of, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -152,7 +152,7 @@ def _off(square):
 
 def _nowhere(x):
     """Return whether no state has finite numbers, for every state."""
-    bad = ~np.all(np.isfinite(x.reshape(len(x), -1)), axis=1)
+    bad = ~all_finite(x.reshape(len(x), -1), axis=1)
     return bad & np.all(bad)
 
 

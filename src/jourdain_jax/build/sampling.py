@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import Assembled, coordinate_bounds, random_states
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
-from jourdain_jax.calculus.reals import Entries, array_module, checked_whole
+from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 
@@ -37,7 +37,7 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     for t, *begin in drawn_states(scene, drawn, np.random.default_rng(seed)):
         q, u, found = sampled_on_graph(scene, t, *begin)
-        numbers = np.all(np.isfinite(u), axis=1)  # put on rows that are none, speeds are none
+        numbers = all_finite(u, axis=1)  # put on rows that are none, speeds are none
         if (found.on_rows & numbers).any():
             break
     good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)) & numbers)[:count]

@@ -20,7 +20,7 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import Indices, at_index, eps_of, is_traced, largest
+from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, is_traced, largest
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
@@ -234,13 +234,13 @@ def _probed_structure(scene: Scene) -> Structure:
     count = len(scene.speed_names)
     for drawn in drawn_states(scene, RANDOM_PROBES, np.random.default_rng(0)):
         t, u, generic, found = _at_probes(scene, *drawn)
-        if (np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2)))[generic].any():
+        if (np.isfinite(found.error) & all_finite(found.A, axis=(1, 2)))[generic].any():
             break
     on_rows = usable_states(scene, found, generic)
     numbers = at_index(found.numbers, on_rows)
     rough, (grounds, bodies, faults) = kinks(scene, found.q[on_rows & generic], u), (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
     A = found.A * speed_scales(found.M)[:, None]
-    usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
+    usable = all_finite(A, axis=(1, 2)) & on_rows
     if not faults and not usable.any():
         finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
@@ -353,7 +353,7 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
     for first, _ in scene.coordinates.quaternions:
         turned[:, first : first + 4] = q[:, first : first + 4]
     found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
-    good = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    good = np.isfinite(found.error) & all_finite(found.A, axis=(1, 2))
     return at_index(scaled_states(found, typical), good)
 
 

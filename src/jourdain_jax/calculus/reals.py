@@ -249,9 +249,13 @@ def known_numbers(x) -> np.ndarray:
 
 
 def largest(x, axis: int | Indices | None = None, keepdims: bool = False):
-    """Return the largest magnitude in an array, of JAX or of NumPy, or along its axes; zero if it is empty.
-    """
+    """Return the largest magnitude in an array (JAX or NumPy), or along its axes; zero if it is empty."""
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
+
+
+def all_finite(x, axis: int | Indices | None = None):
+    """Return whether numbers that are known are finite: all, or those along axes."""
+    return np.isfinite(x).all(axis)
 
 
 def eps_of(x):

@@ -31,7 +31,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, largest, tiny_of, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, all_finite, eps_of, largest, tiny_of, with_usual_promotion
 
 Unknowns = Float[Array, "unknowns"]
 
@@ -277,7 +277,7 @@ def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndar
     """
     lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
     d = 1 / np.where(lengths > 0, lengths, 1.0)
-    found, finite = np.full(np.swapaxes(G, 1, 2).shape, np.nan), np.all(np.isfinite(G), axis=(1, 2))
+    found, finite = np.full(np.swapaxes(G, 1, 2).shape, np.nan), all_finite(G, axis=(1, 2))
     scaled = d[..., None] * G
     places = np.flatnonzero(finite)
     if G.shape[1] <= G.shape[2]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import largest
+from jourdain_jax.calculus.reals import all_finite, largest
 from jourdain_jax.calculus.roots import shortest
 
 
@@ -74,7 +74,7 @@ class Pattern:
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
-        found, known = np.full(f.shape, np.nan), np.all(np.isfinite(values), axis=1) & np.all(np.isfinite(f), axis=1)
+        found, known = np.full(f.shape, np.nan), all_finite(values, axis=1) & all_finite(f, axis=1)
         states, (rows, columns) = np.arange(np.count_nonzero(known))[:, None], self.shape
         places = (states * rows + self.rows).ravel(), (states * columns + self.columns).ravel()
         G = sparse.csr_array((values[known].ravel(), places), shape=(states.size * rows, states.size * columns))

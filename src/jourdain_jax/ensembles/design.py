@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
+from jourdain_jax.calculus.reals import all_finite, checked_known, checked_whole, described, has_unit
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.rounded_functions import correlated
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
@@ -76,7 +76,7 @@ class Design(Printed):
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
             raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as "
                 "jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
-        if not np.all(np.isfinite(column)):
+        if not all_finite(column):
             raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are "
                 "not finite; omit these rows")
         return "columns"

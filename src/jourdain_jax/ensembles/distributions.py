@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_known
+from jourdain_jax.calculus.reals import all_finite, checked_known
 from jourdain_jax.ensembles.rounded_functions import exponential, normal_quantile, product
 
 
@@ -121,7 +121,7 @@ class Levels:
 
     def __init__(self, levels: Sequence[float]):
         found = np.asarray(checked_known(levels, "`levels`", advice="give a list of numbers"), float)
-        if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
+        if found.ndim != 1 or not found.size or not all_finite(found):
             raise ValueError(f"`levels` has the shape {found.shape}, expected a list of finite numbers, at "
                 "least one")
         object.__setattr__(self, "levels", tuple(found.tolist()))

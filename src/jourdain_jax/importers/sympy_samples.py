@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.reals import all_finite
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
@@ -66,7 +67,7 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
             for step in (_STEP, -_STEP)
         )
         rates = {name: (ahead[name] - behind[name]) / (2 * _STEP) for name in values}
-        infinite = [name for name in values if not np.isfinite([values[name], rates[name]]).all()]
+        infinite = [name for name in values if not all_finite([values[name], rates[name]])]
         if infinite:
             worst = infinite[0] or "rate of a coordinate"
             continue
@@ -91,5 +92,5 @@ def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speed
 def _meeting(both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]) -> dict[Any, float]:
     """Return the nearest speeds at which the rows vanish; NaN where the rows are not numbers."""
     u = np.array([leaves[speed] for speed in speeds])
-    u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if np.isfinite(both).all() else u * np.nan
+    u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if all_finite(both) else u * np.nan
     return dict(zip(speeds, map(float, u), strict=True))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.structure import Structure
-from jourdain_jax.calculus.reals import at_index, largest, real_type
+from jourdain_jax.calculus.reals import all_finite, at_index, largest, real_type
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.dense_rates import dense_rates
 from jourdain_jax.lowering.elimination import pivots_ok
@@ -31,7 +31,7 @@ def values_at(found: Equations, probes: Probes) -> np.ndarray:
 
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Return whether two programs agree wherever the second is valid."""
-    usable = np.all(np.isfinite(expected), axis=0)
+    usable = all_finite(expected, axis=0)
     # 1e-9 between programs at the probes, relative to the size of each rate
     return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable])))
 
@@ -65,7 +65,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
-    usable = np.all(np.isfinite(values), axis=0)
+    usable = all_finite(values, axis=0)
     # operations: above, fewer probes are compared with the dense path
     large = builder.graph.operations(rates_of(found)) > 5000
     # above so many operations, 6 of the probes are compared
@@ -74,7 +74,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     qdot, ydot, events = dense_rates(scene, structure, independent, *states)
     expected, values = np.concatenate([qdot, ydot], axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
-    usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
+    usable = usable[chosen] & all_finite(expected, axis=0)
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
         raise NotLowered("its scalar program is valid at too few of the probed states")

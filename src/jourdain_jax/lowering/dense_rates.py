@@ -20,7 +20,7 @@ from jourdain_jax.build.assembling import speed_scales, typical_lengths
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import Indices, at_index
+from jourdain_jax.calculus.reals import Indices, all_finite, at_index
 from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
@@ -92,7 +92,7 @@ def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndar
     A = d[..., None] * A
     system = np.block([[c[:, :, None] * M * c[:, None], A.mT], [A, np.zeros((*A.shape[:2], A.shape[1]))]])
     right = np.concatenate([c * f, -d * drift], axis=1)
-    finite = np.all(np.isfinite(system), axis=(1, 2)) & np.all(np.isfinite(right), axis=1)
+    finite = all_finite(system, axis=(1, 2)) & all_finite(right, axis=1)
     size, V = np.linalg.eigh(np.where(finite[:, None, None], system, 0.0))
     largest = np.argsort(-np.abs(size), axis=1)[:, : f.shape[1] + rank]
     size, V = np.take_along_axis(size, largest, 1), np.take_along_axis(V, largest[:, None], 2)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
-from jourdain_jax.calculus.reals import Indices, is_traced
+from jourdain_jax.calculus.reals import Indices, all_finite, is_traced
 from jourdain_jax.equations.listed import names_of_events, stops
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
@@ -145,7 +145,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     for tried in (1.0, -1.0, *(0.1**k for k in range(1, 9))):
         share = np.where(possible, share, tried)
         here = probes(share)
-        finite = np.all(np.isfinite(here([n for part in traced.motion for n in part.ravel().tolist()])), axis=0)
+        finite = all_finite(here([n for part in traced.motion for n in part.ravel().tolist()]), axis=0)
         possible = finite & ~np.any(_least_moments(traced, here) < least, axis=1)
         if possible.all():
             break
@@ -155,7 +155,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
 def _least_moments(traced: TracedScene, probes: Probes) -> Float[np.ndarray, "probes bodies"]:
     """Return the smallest principal moment of each body at each probe; NaN if it is undefined."""
     I = np.moveaxis(probes(traced.at.inertia.ravel().tolist()).reshape(-1, 3, 3, probes.count), -1, 0)
-    known = np.all(np.isfinite(I), axis=(2, 3))
+    known = all_finite(I, axis=(2, 3))
     return np.where(known, np.linalg.eigvalsh(np.where(known[..., None, None], I, 0.0))[..., 0], np.nan)
 
 

@@ -18,7 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import Indices, largest
+from jourdain_jax.calculus.reals import Indices, all_finite, largest
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
@@ -169,7 +169,7 @@ class Pivots:
         if self._kept_regular is None:
             count = len(self._given[0])
             A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
-            finite = np.all(np.isfinite(A), axis=(1, 2))
+            finite = all_finite(A, axis=(1, 2))
             A = np.where(finite[:, None, None], A, 0.0)
             lengths = np.linalg.norm(A, axis=2, keepdims=True)
             usual = np.median(lengths[finite], axis=0, keepdims=True) if finite.any() else lengths[:1]

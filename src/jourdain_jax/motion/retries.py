@@ -19,7 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import at_index, known_numbers
+from jourdain_jax.calculus.reals import all_finite, at_index, known_numbers
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, Taylor
 from jourdain_jax.motion.integrators.radau import RadauIIA
@@ -145,7 +145,7 @@ def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
     step = float(motion.last_step)
     step = abs(float(motion.t_end) - float(t0)) / int(motion.accepted) if np.isnan(step) else step
     J = np.asarray(_jacobian(field, motion)) * np.sign(float(motion.t_end) - float(t0))
-    return bool(np.all(np.isfinite(J)) and step * np.max(-np.linalg.eigvals(J).real, initial=0.0) >= 1)
+    return bool(all_finite(J) and step * np.max(-np.linalg.eigvals(J).real, initial=0.0) >= 1)
 
 
 @eqx.filter_jit

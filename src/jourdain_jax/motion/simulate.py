@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import is_judged
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, Numbers, as_array, described, is_traced, known_numbers, nan_is_a_mark, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, all_finite, as_array, described, is_traced, known_numbers, nan_is_a_mark, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method, Taylor, order_for
@@ -242,7 +242,7 @@ def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
     """
     ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))
-    if not ((steps > 0).all() or (steps < 0).all()) or not np.isfinite(known_numbers(ts)).all():
+    if not ((steps > 0).all() or (steps < 0).all()) or not all_finite(known_numbers(ts)):
         raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); "
             "sort it and drop repeated times")
     return ts

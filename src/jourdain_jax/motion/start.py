@@ -15,7 +15,19 @@ import numpy as np
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Number, Numbers, at_once, check_kind, compiled_quickly, described, eps_of, is_traced, known_numbers, nothing_is_traced
+from jourdain_jax.calculus.reals import (
+    Number,
+    Numbers,
+    all_finite,
+    at_once,
+    check_kind,
+    compiled_quickly,
+    described,
+    eps_of,
+    is_traced,
+    known_numbers,
+    nothing_is_traced,
+)
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -118,9 +130,9 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
                 raise ValueError(f"`near` names `{name}`, which is not a coordinate; "
                     f"{nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
-    if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
+    if is_traced(q, u, t) or not (all_finite(q) and all_finite(u) and np.isfinite(t)):  # one look where all is known, and right
         for name, value in {**near, **values, "t0": t}.items():
-            if not np.all(np.isfinite(known_numbers(value))):
+            if not all_finite(known_numbers(value)):
                 raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it "
                     "was computed")
     held, contradict = model.once((given, about), lambda: _held(model, given, about))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import check_kind, has_unit, known_numbers
+from jourdain_jax.calculus.reals import all_finite, check_kind, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.names import as_names, check_names
@@ -144,7 +144,7 @@ def _check_domain(scene) -> None:
 
 def _is_ordered(pair: np.ndarray) -> bool:
     """Return whether numbers are finite and none falls below the one before."""
-    return pair.dtype.kind in "biuf" and bool(np.all(np.isfinite(pair)) and np.all(np.diff(pair) >= 0))
+    return pair.dtype.kind in "biuf" and bool(all_finite(pair) and np.all(np.diff(pair) >= 0))
 
 
 def _check_keys(kind: type, what: str, given, valid) -> None:

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import is_traced_type, largest
+from jourdain_jax.calculus.reals import all_finite, is_traced_type, largest
 from jourdain_jax.scene.parameters import stacked_parameters
 
 
@@ -160,7 +160,7 @@ def _generic(x, near, place: int) -> np.ndarray:
         near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
     except (TypeError, ValueError):  # no numbers, or as many of them as do not fit
         near = np.full(np.shape(x), np.nan)
-    if not np.all(np.isfinite(near)):
+    if not all_finite(near):
         return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)  # knots of a table increase
     if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
         steps = np.diff(near, append=2 * near[-1] - near[-2])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Flag, as_real, described, has_unit, known_numbers
+from jourdain_jax.calculus.reals import Flag, all_finite, as_real, described, has_unit, known_numbers
 
 
 def _as_leaf(value):
@@ -67,7 +67,7 @@ def check_parameters(scene) -> None:
             raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check "
                 "where it was computed")
         numbers = known_numbers(value)
-        if not np.all(np.isfinite(numbers)):
+        if not all_finite(numbers):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):
             raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value "

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, known_numbers, real_type
+from jourdain_jax.calculus.reals import all_finite, checked_real, known_numbers, real_type
 
 
 class Spline(eqx.Module):
@@ -59,10 +59,10 @@ def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[A
             f"vectors of one length, at least {least}; give one value per time, and one `{kind}` per {of}"
         )
     knots, numbers = known_numbers(ts), known_numbers(values)
-    if not (np.all(np.isfinite(knots)) and np.all(np.diff(knots) > 0)):
+    if not (all_finite(knots) and np.all(np.diff(knots) > 0)):
         raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the "
             "samples by time and merge repeated ones")
-    if not np.all(np.isfinite(numbers)):
+    if not all_finite(numbers):
         first = int(np.argmin(np.isfinite(numbers)))
         raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit "
             "missing samples")

@@ -14,7 +14,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Indices, Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type, static
+from jourdain_jax.calculus.reals import (
+    Indices,
+    Matrix3,
+    Scalar,
+    Vector,
+    Vector3,
+    all_finite,
+    checked_known,
+    checked_positive,
+    checked_real,
+    described,
+    real_type,
+    static,
+)
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -145,7 +158,7 @@ class Visual(eqx.Module):
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
-        if corners.ndim != 2 or corners.shape[1] != 3 or not np.all(np.isfinite(corners)):
+        if corners.ndim != 2 or corners.shape[1] != 3 or not all_finite(corners):
             raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, "
                 "m")
         polygons = tuple(tuple(int(i) for i in face) for face in faces)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jourdain_jax.analysis.families.equations import Look, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
-from jourdain_jax.calculus.reals import largest
+from jourdain_jax.calculus.reals import all_finite, largest
 from jourdain_jax.scene.parameters import parameters_of
 
 Targets = list[tuple[int, float]]  # numbers of unknowns, and values at which a curve ends
@@ -41,7 +41,7 @@ def solved(
     """
     for k in range(most):
         look = equations(z)
-        if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
+        if not (all_finite(look.R) and all_finite(look.J)):
             return None
         step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[0]
         noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))  # of R: at a branch point steps are this over a small number
@@ -162,6 +162,6 @@ def located(equations: Motions, here: Point, there: Point, test: Callable[[Point
     part = at_a / (at_a - at_b)
     z, tangent = (getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent"))
     look, tangent = equations(z), tangent / np.linalg.norm(tangent)
-    if not np.all(np.isfinite(look.J)):
+    if not all_finite(look.J):
         return None
     return Point(z, tangent, look, matched(low.modes, equations.eigenvalues(look, tangent)))

@@ -9,7 +9,7 @@ import numpy as np
 from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, along, located, reversed_at, solved, traced
 from jourdain_jax.analysis.families.equations import Motions, Vector
 from jourdain_jax.analysis.families.special import Test, dip, tangents_across, tests_between
-from jourdain_jax.calculus.reals import largest
+from jourdain_jax.calculus.reals import all_finite, largest
 
 
 def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
@@ -65,7 +65,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
     that are held or followed.
     """
     z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
-    if not np.all(np.isfinite(look.R)):
+    if not all_finite(look.R):
         raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
     for fixed in ([*named, *kept], kept):
         rows = np.eye(len(z))[[equations.index(name) for name in fixed]]

@@ -32,7 +32,7 @@ from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, pla
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, checked_whole, compiled_quickly, known_numbers, largest, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, all_finite, checked_whole, compiled_quickly, known_numbers, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -134,7 +134,7 @@ def periodic(
     beside = "it finds a motion whose length is `period`, which no stop event ends, by runs without work and retries"
     options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
     options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)  # tolerances are traced below
-    if not np.all(known_numbers(period) > 0) or not np.all(np.isfinite(known_numbers(period))):
+    if not np.all(known_numbers(period) > 0) or not all_finite(known_numbers(period)):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
     checked_whole(pieces, "`pieces`", 1, expected="of at least 1")
     events, held, entries = names_of_events(scene), as_names(held), scene.coordinate_names.entries
