@@ -13,8 +13,19 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
+
+
+def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
+    """Return the method of values that appends this operation or comparison; `turned`: of the other one."""
+
+    def appended(self: "Value", other) -> "Value":
+        a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)
+        return (self.writer.compared if op in _COMPARED else self.writer.binary)(op, a, b)
+
+    return appended
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,62 +37,20 @@ class Value:
     name: str
     place: str = ""  # where in memory it comes from
 
-    def __add__(self, other) -> "Value":
-        return self.writer.binary("add", self, other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other) -> "Value":
-        return self.writer.binary("sub", self, other)
-
-    def __rsub__(self, other) -> "Value":
-        return self.writer.literal(other, self.type) - self
-
-    def __mul__(self, other) -> "Value":
-        return self.writer.binary("mul", self, other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other) -> "Value":
-        return self.writer.binary("div", self, other)
-
-    def __rtruediv__(self, other) -> "Value":
-        return self.writer.literal(other, self.type) / self
+    __add__ = __radd__ = _operator("add")
+    __sub__, __rsub__ = _operator("sub"), _operator("sub", turned=True)
+    __mul__ = __rmul__ = _operator("mul")
+    __truediv__, __rtruediv__ = _operator("div"), _operator("div", turned=True)
+    __lt__, __le__ = _operator("lt"), _operator("le")
+    __gt__, __ge__ = _operator("gt"), _operator("ge")
+    equals, differs = _operator("eq"), _operator("ne")  # NaN is equal to nothing
+    __and__, __or__, __xor__ = _operator("and"), _operator("or"), _operator("xor")
 
     def __neg__(self) -> "Value":
         return self.writer.instruction(self.type, f"fneg {self.type} {self.name}")
 
-    def __lt__(self, other) -> "Value":
-        return self.writer.compared("lt", self, other)
-
-    def __le__(self, other) -> "Value":
-        return self.writer.compared("le", self, other)
-
-    def __gt__(self, other) -> "Value":
-        return self.writer.compared("gt", self, other)
-
-    def __ge__(self, other) -> "Value":
-        return self.writer.compared("ge", self, other)
-
-    def equals(self, other) -> "Value":
-        """Return whether two values are equal; NaN is equal to nothing."""
-        return self.writer.compared("eq", self, other)
-
-    def differs(self, other) -> "Value":
-        """Return whether two values are not equal."""
-        return self.writer.compared("ne", self, other)
-
-    def __and__(self, other) -> "Value":
-        return self.writer.binary("and", self, other)
-
-    def __or__(self, other) -> "Value":
-        return self.writer.binary("or", self, other)
-
-    def __xor__(self, other) -> "Value":
-        return self.writer.binary("xor", self, other)
-
     def __invert__(self) -> "Value":
-        return self.writer.binary("xor", self, -1)
+        return self ^ -1
 
 
 class Writer:
