@@ -304,7 +304,7 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None = None) -> Scalar:
+def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None) -> Scalar:
     """Return the part of `rate_of_work` without accelerations, W: loads without a potential, and potentials
     that depend on time or on inputs.
 

@@ -69,11 +69,11 @@ def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> fl
     return value
 
 
-def whole_number(text: str, what: str, low: int, high: int) -> int:
-    """Return the whole number from `low` to `high` in `text`; `what` as in `number`."""
+def whole_number(text: str, what: str, high: int) -> int:
+    """Return the whole number from 1 to `high` in `text`; `what` as in `number`."""
     plain = text.strip(" \t\r\n")
-    if not re.fullmatch(r"[+-]?\d{1,30}", plain, re.ASCII) or not low <= int(plain) <= high:
-        raise ValueError(f"{what} is `{shortened(plain)}`, expected a whole number from {low} to {high}")
+    if not re.fullmatch(r"[+-]?\d{1,30}", plain, re.ASCII) or not 1 <= int(plain) <= high:
+        raise ValueError(f"{what} is `{shortened(plain)}`, expected a whole number from 1 to {high}")
     return int(plain)
 
 

@@ -162,8 +162,8 @@ def _shard(text: str) -> tuple[int, int]:
     k, slash, n = text.partition("/")
     if not slash:
         raise ValueError(f"--shard is `{text}`, expected K/N, such as 1/4")
-    count = whole_number(n, "N of --shard K/N", 1, 2**24)
-    return whole_number(k, "K of --shard K/N", 1, count), count
+    count = whole_number(n, "N of --shard K/N", 2**24)
+    return whole_number(k, "K of --shard K/N", count), count
 
 
 def _export(found: StudyResult, options) -> bool:

@@ -42,7 +42,7 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
     return found
 
 
-def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:
+def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None) -> Eliminated:
     """Solve a system. `right[row]` holds the right-hand sides of that row. If there are more rows than
     unknowns, they must be consistent.
 

@@ -99,7 +99,7 @@ def threads() -> int:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     stated = os.environ.get("JOURDAIN_JAX_THREADS", str(min(cores, MOST_THREADS)))
-    return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", 1, MOST_THREADS)
+    return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", MOST_THREADS)
 
 
 def fuses() -> bool:

@@ -145,7 +145,7 @@ class Aim(NamedTuple):
     locating: Any  # whether it is part of one
 
 
-def aimed(w, p, target, reach, shift=None) -> Aim:
+def aimed(w, p, target, reach, shift) -> Aim:
     """Return the length of a step to the `target`, to half of the way, or to `reach`, whichever applies.
     `shift`: from a search for an event, if there is one.
     """
