@@ -41,7 +41,7 @@ def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, in
 
 
 def _own(graph: Graph, node: int) -> int | None:
-    op, args = graph.op[node], graph.args[node]
+    op, args = graph.operation(node)
     if op in COMPARED or op in ("max", "min"):
         return graph.sub(*args)
     if op in ("abs", "sign"):
@@ -53,7 +53,7 @@ def _own(graph: Graph, node: int) -> int | None:
 
 def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
     if node not in known:
-        op, args = graph.op[node], graph.args[node]
+        op, args = graph.operation(node)
         squared = op in ("sqrt", "abs", "exp", "cosh") or (op == "mul" and args[0] == args[1]) or (op == "const" and graph.value[node] >= 0)
         known[node] = squared or (op in ("add", "mul", "div") and all(_is_never_negative(graph, a, known) for a in args))
     return known[node]
@@ -61,7 +61,7 @@ def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
 
 def _branch(graph: Graph, node: int, above: bool) -> int:
     """Return the value of a relation where its own number is positive (`above`) or negative."""
-    op, args = graph.op[node], graph.args[node]
+    op, args = graph.operation(node)
     if op in COMPARED:
         return graph.const(COMPARED[op][0 if above else 1])
     if op == "sign":

@@ -113,7 +113,7 @@ def written_in_turn(
     waves: dict[int, tuple[Value, Value]] = {}
     for i, (node, _) in enumerate(steps):
         at_hand.before(i)
-        op, args = graph.op[node], graph.args[node]
+        op, args = graph.operation(node)
         if op in ("sin", "cos"):
             if args[0] not in waves:
                 waves[args[0]] = sine_and_cosine(w, as_real(w, values[args[0]]))

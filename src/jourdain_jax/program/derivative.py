@@ -79,7 +79,7 @@ def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], var
         weight = total.get(node, graph.zero)
         if weight == graph.zero or node not in leads_to:
             continue
-        op, args = graph.op[node], graph.args[node]
+        op, args = graph.operation(node)
         for i, a in enumerate(args):
             if a in leads_to:
                 part = _part(graph, node, i, weight)
@@ -91,7 +91,7 @@ def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], var
 
 def _part(graph: Graph, node: int, i: int, weight: int) -> int:
     """Return the part of a node's weight for its argument number i."""
-    op, args = graph.op[node], graph.args[node]
+    op, args = graph.operation(node)
     if op == "mul":
         return graph.mul(weight, args[1 - i])
     if op == "div":
@@ -120,7 +120,7 @@ def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> li
 def _derivative(graph: Graph, node: int, dots: list):
     """Return the rate of a node from the rates of its arguments. The rate of an array or a call is a tuple.
     """
-    op, args = graph.op[node], graph.args[node]
+    op, args = graph.operation(node)
     if all(d == graph.zero for d in dots):
         return graph.zero
     if op in TABLE:

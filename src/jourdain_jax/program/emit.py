@@ -70,7 +70,7 @@ def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], d
 def _run_in_a_row(graph: Graph, nodes: NodeList, values: dict[int, jax.Array]) -> None:
     waves: dict = {}
     for node in nodes:
-        op, args = graph.op[node], graph.args[node]
+        op, args = graph.operation(node)
         given = [values[a] for a in args]
         if op == "const":
             values[node] = graph.value[node]

@@ -1,5 +1,4 @@
-"""A hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded while
-building.
+"""A hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded.
 
 Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of square roots, sin(-x), cos(-x).
 Arguments of sums and products are ordered, so that a b and b a are one node.
@@ -22,8 +21,6 @@ ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
 NodeList = list[int]  # numbers of nodes
 _GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
-
-
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
@@ -84,11 +81,15 @@ class Graph:
         """Return whether a node is a number."""
         return self.op[node] == "const"
 
+    def operation(self, node: int) -> tuple[str, tuple[int, ...]]:
+        """Return the name of a node's operation, and its arguments."""
+        return self.op[node], self.args[node]
+
     # arithmetic
 
     def neg(self, a: int) -> int:
         """-a"""
-        op, args = self.op[a], self.args[a]
+        op, args = self.operation(a)
         if op == "const":
             return self.const(-self.value[a])
         if op == "neg":
@@ -375,8 +376,7 @@ class Graph:
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:
-        """Return how many more operations node a needs than node b; operations that both share do not count.
-        """
+        """Return how many more operations node a needs than node b, without those that both share."""
         if a == b:
             return 0
         needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]

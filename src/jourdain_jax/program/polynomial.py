@@ -84,7 +84,7 @@ class NormalForms:
 
     def _expand(self, node: int) -> Polynomial:
         graph = self.graph
-        op, args = graph.op[node], graph.args[node]
+        op, args = graph.operation(node)
         if op == "const":
             return {(): graph.value[node]}
         if op == "input":

@@ -66,7 +66,7 @@ def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dic
 
 
 def _expression(graph: Graph, node: int, written, language: Language) -> tuple[str, int]:
-    op, args = graph.op[node], graph.args[node]
+    op, args = graph.operation(node)
     if op == "const":
         value = graph.value[node]
         text = repr(value) if abs(value) < float("inf") else language.infinity if value > 0 else f"-{language.infinity}"

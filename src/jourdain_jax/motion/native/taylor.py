@@ -79,7 +79,7 @@ class Series:
         graph, found, left = self.graph, set(nodes), list(nodes)
         while left:
             node = left.pop()
-            op, args = graph.op[node], graph.args[node]
+            op, args = graph.operation(node)
             if op in (*_OWN, "const"):
                 continue
             for i in range(len(args)):
@@ -160,7 +160,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
         return [((n,), one)]
 
     for n in nodes:
-        op, args = graph.op[n], graph.args[n]
+        op, args = graph.operation(n)
         if forms.keys().isdisjoint(args):
             continue
         if op == "div":
