@@ -134,7 +134,7 @@ def write_handler(
             [given(w, w.load(arrays, k, "ptr")) for k in range(arguments)],
             [given(w, w.load(returned, k, "ptr")) for k in range(results)],
         )
-        w.give(Value(w, "ptr", "null"))
+        w.give(w.null)
 
 
 def answer_metadata(w: Writer, frame: Value) -> None:
@@ -148,7 +148,7 @@ def answer_metadata(w: Writer, frame: Value) -> None:
             metadata = w.load(extension, 3, "ptr")
             for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
                 w.store(w.literal(number, "i32"), metadata, place)
-        w.give_where(asked, Value(w, "ptr", "null"))
+        w.give_where(asked, w.null)
 
 
 def _write_kernel(
@@ -236,7 +236,7 @@ def lanes_taken(w: Writer, job: Value, word: int) -> Value:
 def share(w: Writer, job: Value, count: Value) -> None:
     """Call the module's `loop(job)` in as many threads as the writer allows; in fewer for small batches."""
     threads = w.threads
-    loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room(threads, "i64"), w.room(type="i64")
+    loop, nothing, others, started = Value(w, "ptr", "@loop"), w.null, w.room(threads, "i64"), w.room(type="i64")
     w.store(w.literal(0, "i64"), started)
     how = w.room(16, "i64")  # a `pthread_attr_t`, which takes up to 64 bytes
     if threads > 1:
@@ -323,7 +323,7 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
                 number = w.load(who, lane, "i64")
                 with w.when(number < count):
                     handed_out(w, returned, found, lane, of_lane(w, results, count, returned, number))
-        w.give(Value(w, "ptr", "null"))
+        w.give(w.null)
 
     def body(arguments: list[Given], results: list[Given]) -> None:
         job, count = w.room(4, "i64"), w.room(type="i64")

@@ -45,7 +45,7 @@ def handler_text() -> str:
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
         # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists stand two words before their pointers
-        nothing, attributes = Value(w, "ptr", "null"), w.load(frame, 20, "ptr")
+        nothing, attributes = w.null, w.load(frame, 20, "ptr")
         blocks, number = (w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in (_BLOCKS, _KERNEL))
         words, count = w.room(ffi.WORDS * ffi.MOST_BUFFERS, "i64"), w.room(type="i64")
         w.store(w.literal(0, "i64"), count)

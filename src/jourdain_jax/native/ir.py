@@ -105,6 +105,11 @@ class Writer:
             self.give(value)
             self.place(self.label())
 
+    @property
+    def null(self) -> Value:
+        """Return a pointer to nothing; from a handler of XLA it says that there was no fault."""
+        return Value(self, "ptr", "null")
+
     def label(self) -> str:
         """Return a new name of a place."""
         self._count += 1

@@ -76,7 +76,7 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
         _write_transition_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), memory, job)
-        w.give(Value(w, "ptr", "null"))
+        w.give(w.null)
     write_handler(
         w,
         4 + arguments_of_samples(form) + w.device,

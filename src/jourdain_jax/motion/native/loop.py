@@ -122,7 +122,7 @@ def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> N
     """`loop(job)`: lanes side by side until none is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_lanes(w, form, method, job)
-        w.give(Value(w, "ptr", "null"))
+        w.give(w.null)
 
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
