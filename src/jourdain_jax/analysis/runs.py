@@ -36,7 +36,7 @@ from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 
 
 class Run(NamedTuple):
@@ -67,7 +67,7 @@ class Run(NamedTuple):
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
-        found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
+        found, filters, place = {}, [], len(state_names(scene))
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None
             if isinstance(sensor.operation, StopEvent):
@@ -222,7 +222,7 @@ class Group:
         shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if is_array(x) else x for x in leaves)
         self._run = _program(Reference(scene, layout.parameters), treedef, shapes, layout)
         saved = times if first.grid is None else first.grid.shape[0]
-        states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
+        states = saved * len(state_names(scene)) * 8 * (1 + sum(layout.sizes))
         # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
         self._width, self._fewest = int(min(64, max(1, 2**18 // states))), 1
 

@@ -39,7 +39,7 @@ from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.scene.validated import events_of, loads_of, potential_of
 
 PerBody = Num[Entries, "bodies 3"]
@@ -145,7 +145,7 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None
     events = [event for _, event in sorted(every.items())]
     if all(event.stop for event in events):
         return jnp.zeros((len(events), 0))
-    names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    names = state_names(scene)
     given, modes = jnp.split(motion.inputs.array, (len(scene.inputs) - len(scene.modes.names),))
     now = jnp.concatenate([motion.q.array, motion.u.array, modes])
 

@@ -225,6 +225,11 @@ class Scene(eqx.Module):
         return jnp.asarray(q), jnp.asarray(u), given
 
 
+def state_names(scene: Scene) -> Labels:
+    """Return the names of all coordinates and speeds, in order."""
+    return state_names(scene)
+
+
 def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
     """As `Scene.named`; on NumPy where all numbers are known."""
     q, u, given = entries_named(scene, values)
@@ -239,9 +244,8 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
     for name, value in values.items():
         hits = _put(coordinates, q, name, value) + _put(speeds, u, name, value)
         if not hits:
-            valid = coordinates.entries + speeds.entries
             raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; "
-                f"{nearest(name, valid)}")
+                f"{nearest(name, state_names(scene))}")
         given += hits
     for first, _ in scene.coordinates.quaternions:
         given += _completed(coordinates.entries[first : first + 4], q, first, given)

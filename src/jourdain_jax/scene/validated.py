@@ -18,7 +18,7 @@ from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, check_names, nearest
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.scene.visuals import Visual
 
 _VANISH = "return numbers that vanish where the constraint is met"
@@ -148,7 +148,7 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
             raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, "
                 "or `stop`")
         check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")
-        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves "
+        check_names(event.jump, state_names(scene), f"{where} moves "
             "`{}`, which is not a coordinate or speed")
         found[name] = Event(
             checked_real(event.value, where, (), advice=advice),

@@ -22,7 +22,7 @@ from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.names import Labels, check_name
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 
 Vector = Float[np.ndarray, "unknowns"]
 PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"
@@ -105,7 +105,7 @@ class SteadyEquations(Motions):
         self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: Labels = (), held: Labels = ()
     ) -> None:
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
-        names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)
+        names, at, program = state_names(scene), places_of(scene), lower(scene)
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
         varied = [getattr(numbered(scene), name) for name in vary]
         self.instant = by_program(scene, program, (), tuple(varied))

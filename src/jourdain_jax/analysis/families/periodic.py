@@ -45,7 +45,7 @@ from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed, complex_numbers
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 
 Unknowns = Float[Array, "unknowns"]
 
@@ -322,7 +322,7 @@ class OrbitEquations(Motions):
 
     def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: Labels, held: Labels) -> None:
         self.scene, self.vary, self.problem, self.t = scene, vary, replace(orbit.by, scene=scene), orbit.state.t
-        names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+        names = state_names(scene)
         pieces = [f"{name} in piece {k + 1}" if k else name for k in range(orbit.by.pieces) for name in names]
         self.given = np.append(np.asarray(orbit.unknowns), [float(getattr(scene, name)) for name in vary])
         self.by_name = {name: k for k, name in enumerate((*pieces, "period", *vary))}

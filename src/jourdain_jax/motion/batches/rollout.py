@@ -35,7 +35,7 @@ from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time, shown_fro
 from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, state_names
 
 
 class Rollout(Printed, eqx.Module):
@@ -301,6 +301,6 @@ def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
     usual = 512 if jax.default_backend() == "cpu" else count
     chunk = usual if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
-    per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
+    per_lane = 8 * times * (len(state_names(scene)) + 2)
     # the stages of 512 lanes fit the cache of a core, and a GPU takes some ten thousand at once; of the saved states of a chunk four copies are there at once
     return max(1, min(count, chunk, memory // (4 * per_lane)))

@@ -15,6 +15,7 @@ from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import state_names
 
 OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion, type, what stands for nothing, attributes
     "result": ("result", "int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
@@ -93,7 +94,7 @@ def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
     known: dict[str, str] = {}
     for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
         known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
-    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    valid = state_names(scene)
     check_names(given or {}, valid, "`units` names `{}`, which is not a coordinate or speed of "
         f"`{type(scene).__name__}`")
     return known | dict(given or {})

@@ -27,6 +27,7 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import Labels, UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import state_names
 
 
 class Trajectory(Record, Printed):
@@ -53,7 +54,7 @@ class Trajectory(Record, Printed):
                 f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its '
                 'pose and velocities at all times'
             )
-        valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
+        valid = (*state_names(self.scene), "t")
         raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; "
             f"{nearest(name, valid)}")
 
