@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.bicycle.from_measurements import benchmark_from_measurements
-from jourdain_jax.bicycle.linear import linear_matrices, upright_running
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
-from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
+from jourdain_jax.bicycle.stability import eigenvalues, linear_matrices, stability_speeds, upright_running
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 from jourdain_jax.calculus.reals import compiled_quickly
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle

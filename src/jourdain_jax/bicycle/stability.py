@@ -15,9 +15,13 @@ All their positive roots are found, and polished by steps of Newton's method tha
 of two eigenvalues times b4^3 v, its slope says which way a pair crosses: down where H' b3 > 0. A real one crosses zero upward where b0' b1 < 0; and two that
 meet become a pair where dp/dv and d2p/ds2 have one sign. Coefficients stand highest power first.
 
+M, C1, K0 and K2 come from the nonlinear model, linearised about upright straight running at rest and at one
+speed; that C grows with v and K with v^2 is a fact of the model, checked in the tests.
+
 Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant (Orlando) and discriminant are textbook.
 """
 
+from collections.abc import Mapping
 from functools import reduce
 from typing import NamedTuple
 
@@ -28,8 +32,13 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
+from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.calculus.reals import Flag, Scalar, compiled_quickly, real_type
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.motion.put_on_rows import State, state_of
 
+_SPEED = 4.0  # m/s, of the second linearisation
+_DEPENDENT = ("pitch",)
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]
 Polynomial = Float[Array, " coefficients"]
@@ -57,6 +66,35 @@ class StabilitySpeeds(eqx.Module):
     stable_from: Scalar  # the widest range of speeds where all four eigenvalues decay (no derivative)
     stable_to: Scalar  # its end: the largest speed looked at if it is still stable there (no derivative)
     stable_range_exists: Flag
+
+
+def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
+    """Return upright straight running at `speed` (m/s), a steady motion, or with a kick in `lean_rate`
+    (rad/s). Both satisfy the constraints exactly.
+    """
+    q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
+    return state_of(bicycle, 0.0, q, u)
+
+
+def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
+    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. It works under jit
+    and vmap.
+    """
+    return _matrices({name: jnp.asarray(value) for name, value in values.items()})
+
+
+def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
+    bicycle = WhippleBicycle.from_values(values)
+
+    def at(speed):
+        small = linearize(bicycle, upright_running(bicycle, speed), ("lean", "steer"), dependent=_DEPENDENT)
+        return small.M, small.C, small.K
+
+    M, C, K = jax.vmap(at)(jnp.array([0.0, _SPEED]))
+    return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
+
+
+_matrices = compiled_quickly(_linearised)  # the first call in 10 s of processor time, not in 23; the second in 6 ms
 
 
 def eigenvalues(

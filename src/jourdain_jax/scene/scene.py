@@ -227,7 +227,7 @@ class Scene(eqx.Module):
 
 def state_names(scene: Scene) -> Labels:
     """Return the names of all coordinates and speeds, in order."""
-    return state_names(scene)
+    return scene.coordinate_names.entries + scene.speed_names.entries
 
 
 def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
