@@ -13,9 +13,8 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, checked_whole, described, known_numbers
-from jourdain_jax.motion.integrators.explicit_steps import Method, Taylor
+from jourdain_jax.motion.integrators.explicit_steps import Method, Taylor, diffrax
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.names import nearest
 

@@ -16,9 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module, eps_of
 from jourdain_jax.motion.inputs import knots_between
-from jourdain_jax.motion.integrators.explicit_steps import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method, diffrax
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene

@@ -18,9 +18,8 @@ from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, Numbers, all_finite, as_array, described, is_traced, known_numbers, nan_is_a_mark, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method, Taylor, order_for
+from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method, Taylor, diffrax, order_for
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps

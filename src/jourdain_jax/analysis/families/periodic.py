@@ -37,7 +37,7 @@ from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.integrators.explicit_steps import diffrax
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of

@@ -16,17 +16,22 @@ the writer of a step (`motion/native/step.py`).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, is_traced, static
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.trajectories import results
+
+if TYPE_CHECKING:
+    import diffrax
+else:
+    diffrax = module_on_first_use("diffrax")
 
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
