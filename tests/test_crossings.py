@@ -59,6 +59,21 @@ KINDS = {
     "Floors": rises_and_falls(lambda x: jnp.floor(x + 7.0)),
     "Bump": Bump(),
 }
+# a step of usual length passes several whole numbers; and choices by other functions of JAX
+OTHER = {
+    "Whole": Sliding(law=lambda s, t, x, v: jnp.where(jnp.floor((x - s.a) / s.width) == 0, -3.0, 0.0)),
+    "Ceil": Sliding(law=lambda s, t, x, v: jnp.where(jnp.ceil((s.a - x) / s.width) == 0, -3.0, 0.0)),
+    "Rounded": Sliding(law=lambda s, t, x, v: -3.0 * (jnp.round((x - s.a) / s.width) == 0)),
+    "Stripes": Sliding(law=lambda s, t, x, v: -3.0 * (jnp.remainder(x - s.a, 0.9) < s.width)),
+    "FineStripes": Sliding(law=lambda s, t, x, v: jnp.where(jnp.mod(x, s.width) < 0.3 * s.width, -0.3, 0.0)),
+    "Select": Sliding(law=lambda s, t, x, v: jnp.select([x < s.a, x < s.a + s.width], [0 * x, -3.0 + 0 * x])),
+    "Cond": Sliding(
+        law=lambda s, t, x, v: jax.lax.cond(
+            (x > s.a) & (x < s.a + s.width), lambda x: -3.0 * x, lambda x: 0 * x, x
+        )
+    ),
+    "Relu": Sliding(law=lambda s, t, x, v: -60 * jax.nn.relu(s.width - jax.nn.relu(x - s.a)) * (x > s.a)),
+}
 START, SPAN = {"x": 0.0, "x_rate": 1.0}, 2.0
 
 
@@ -66,9 +81,9 @@ def motion(scene, start=START, **options):
     return jj.simulate(scene, start, **{"ts": [SPAN], "rtol": 1e-9, "atol": 1e-9} | options)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS | OTHER)
 def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(kind):
-    scene, loose = KINDS[kind], {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
+    scene, loose = (KINDS | OTHER)[kind], {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
     exact = motion(scene, max_step=SPAN / 2000, **loose)
     found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
     assert abs(exact.q_end[0] - SPAN) > 5e-3, "nothing acted"
@@ -108,6 +123,19 @@ def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_deriv
         assert_allclose(slope, v, atol=1e-12)
 
 
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+@pytest.mark.parametrize("kind", ["Whole", "Rounded", "Stripes", "Select", "Relu"])
+def test_derivatives_by_the_place_are_those_of_a_shift(kind, derivative):
+    """What acts moves by da: beyond it the motion has another speed v', and x moves by (1 - v') da."""
+
+    def end(a):
+        return motion(OTHER[kind].replace(a=a)).q_end[0]
+
+    speed = motion(OTHER[kind], max_step=0.01).u_end[0]
+    assert abs(speed - 1.0) > 0.01
+    assert_allclose(derivative(end)(0.7), 1.0 - speed, rtol=0, atol=1e-8)
+
+
 class Cart(Sliding):
     inputs = jj.inputs("push")
 
@@ -140,6 +168,9 @@ def test_guards_and_smooth_functions_do_not_count():
 def test_what_is_not_watched_is_said():
     many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
     assert "not watched: they are 40, more than 32" in str(motion(many))
+    hidden = motion(Sliding(law=lambda s, t, x, v: jnp.interp(x, jnp.array([0.6, 0.7, 0.8]), jnp.eye(3)[1])))
+    assert "not watched: the scene keeps parts as calls" in str(hidden)
+    assert hidden.crossings == -1
     dense = motion(STRIP, backend="dense")
     with pytest.warns(UserWarning, match="Heun does not watch the relations .* of `Sliding`.* the default solver does"):
         by_diffrax = motion(STRIP, solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)

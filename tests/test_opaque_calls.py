@@ -142,8 +142,7 @@ def states_of(scene, count):
 def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_the_dense_path(name):
     scene, reason = LAWS[name]
     program = jj.lower(scene)
-    count = 2 if name == "branches" else 1  # what chooses among four is a number, made from what chose between two
-    assert len(program.calls) == len(program.graph.calls([*program.ydot, program.power])) == count
+    assert len(program.calls) == len(program.graph.calls([*program.ydot, program.power])) == 1
     assert all(reason in call for call in program.calls)
     assert program.operations <= 60
     assert f"kept as a call of JAX, as it has no scalar form: {program.calls[0]}" in str(program)

@@ -220,7 +220,7 @@ def test_files_that_are_none_are_refused_with_their_name(tmp_path, reader, case)
 @pytest.mark.parametrize("path", ["x" * 10_000, "zero\0byte.urdf", ".", ""])
 @pytest.mark.parametrize("reader", [jj.from_urdf, jj.from_mjcf])
 def test_paths_that_are_none_are_refused(reader, path):
-    with pytest.raises(ValueError, match="cannot be read") as error:
+    with pytest.raises(ValueError, match=r"cannot be read|expected the name of a file") as error:
         reader(path)
     assert len(str(error.value)) < 600
 

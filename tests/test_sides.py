@@ -11,6 +11,7 @@ import result_codes as results
 from derivatives import with_value
 from machine_code import BACKENDS
 from numpy.testing import assert_allclose, assert_array_equal
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
@@ -133,6 +134,71 @@ def test_values_and_slopes_are_those_of_closed_forms(kind, backend):
 def test_second_derivatives_are_those_of_closed_forms(kind, second):
     x, exact, at = case(kind)
     assert_allclose(*(jax.jit(second(f))(at) for f in (x, exact)), rtol=0, atol=1e-9)
+
+
+def both(*truths):
+    return jnp.where(jnp.all(jnp.stack(truths)), 1.0, 0.0)
+
+
+# how hard a patch brakes a bead that crosses it on its way x = t, y = 0.4 t; few probed states are on it
+PATCHES = {
+    "one condition": lambda s, t, x, y: jnp.where((x > s.a) & (x < s.a + s.w) & (y > 0.25) & (y < 0.4), s.k, 0.0),
+    "one within the other": lambda s, t, x, y: jnp.where(x > s.a, jnp.where(y < 0.4, jnp.where(x < s.a + s.w, s.k, 0.0), 0.0), 0.0),
+    "what is beside it": lambda s, t, x, y: jnp.where((x < s.a) | (x > s.a + s.w) | (y < 0.25) | (y > 0.4), 0.0, s.k),
+    "a product": lambda s, t, x, y: s.k * (x > s.a) * (x < s.a + s.w) * (jnp.abs(y - 0.3) < 0.05),
+    "signs": lambda s, t, x, y: s.k * both(jnp.sign(x - s.a) > 0, jnp.sign(s.a + s.w - x) > 0) * (jnp.maximum(y, 0.27) == y) * (y < 0.4),
+    "by a margin": lambda s, t, x, y: s.k * (jnp.minimum(x - s.a, s.a + s.w - x) > 0.0) * (y > 0.25) * (y < 0.4),
+    "at its time": lambda s, t, x, y: s.k * both(t > s.a, t < s.a + 3 * s.w, x > s.a, x < s.a + s.w, y > 0.27, y < 0.33),
+}
+
+
+class Patch(OnPlane):
+    a: float = jj.parameter(0.7)
+    w: float = jj.parameter(0.03)
+    k: float = jj.parameter(3.0)
+    on: Callable | None = eqx.field(static=True, default=None)
+    off: Callable | None = eqx.field(static=True, default=None)
+
+    def loads(self, motion):
+        brakes = 0.0 if self.on is None else -self.on(self, motion.t, motion.q.x, motion.q.y)
+        return (jj.generalized_force(motion, x_rate=brakes + 0 * motion.t),)
+
+    def events(self, motion):
+        return {} if self.off is None else {"on it": 0.5 * self.k - self.off(self, motion.t, motion.q.x, motion.q.y)}
+
+
+@pytest.mark.parametrize("kind", PATCHES)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_acts_where_several_conditions_meet_is_met(kind, backend):
+    def found(p):
+        return end(Patch(a=p[0], w=p[1], k=p[2], on=PATCHES[kind]), {"y_rate": 0.4}, backend=backend).q_end[0]
+
+    def exact(p):
+        a, w, k = p
+        v = jnp.sqrt(1 - 2 * k * w)
+        return a + w + v * (SPAN - a - (1 - v) / k)
+
+    at = jnp.array([0.7, 0.03, 3.0])
+    value, slope = jax.value_and_grad(found)(at)
+    assert_allclose(value, exact(at), rtol=0, atol=1e-12)
+    assert_allclose(slope, jax.grad(exact)(at), rtol=0, atol=1e-10)
+    if backend == "native":
+        assert_allclose(jax.jacfwd(found)(at), slope, rtol=0, atol=1e-10)
+        widths, start = 0.03 * 0.5 ** jnp.arange(9), {"x": jnp.zeros(9), "x_rate": 1.0, "y_rate": 0.4}
+        lanes = jj.rollout(Patch(on=PATCHES[kind]), start, parameters={"w": widths}, ts=[SPAN]).lanes
+        expected = jax.vmap(lambda w: exact((0.7, w, 3.0)))(widths)
+        assert_allclose(lanes.q_end[:, 0], expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", PATCHES)
+def test_an_event_where_several_conditions_meet_is_met(kind):
+    def time(a):
+        start = {"x": 0.0, "x_rate": 1.0, "y_rate": 0.4}
+        return jj.simulate(Patch(a=a, off=PATCHES[kind]), start, ts=[SPAN]).t_end
+
+    assert_allclose(time(0.7), 0.7, rtol=0, atol=1e-9)
+    # the value jumps below zero where a relation changes
+    assert_array_equal([jax.grad(time)(0.7), jax.jacfwd(time)(0.7)], np.nan)
 
 
 def test_on_arrays_slopes_are_the_same():

@@ -12,6 +12,7 @@ stiffness of the rod, and the place of a mass centre its moment of inertia about
 Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
+import os
 from pathlib import Path
 
 import jax
@@ -46,7 +47,7 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
     the mass centre by more than their sigmas allow. **Raises** ValueError: an unreadable or incomplete file,
     an unknown name, and readings that belong to no bicycle.
     """
-    if isinstance(path, str) and not Path(path).exists() and not Path(path).suffix:
+    if isinstance(path, str) and not os.path.exists(path) and not Path(path).suffix:
         known = shipped_measurements()
         check_name(path, known, f"there are no measurements of a bicycle `{path}`, and no such file")
         path = known[path]

@@ -111,7 +111,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     form; an unknown (with the nearest valid one), repeated or missing name; a number that is none, not finite, or a
     negative sigma; a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of inertia).
     """
-    path = Path(path)
+    path = Path(files.name_of(path))
     text = read_lines(path)
     lines = _yaml_lines(text, path) if path.suffix.lower() in (".yml", ".yaml") else text_lines(text)
     values: dict[str, float] = {}

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
+from jourdain_jax.calculus.files import name_of
 from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.scene.names import Labels
 
@@ -61,7 +62,7 @@ def read_readings(path: str | Path) -> Readings:
     **Raises** ValueError naming file, line and quantity, for a file that cannot be read, a line of another
     form, a repeated quantity or a negative sigma; and for missing readings.
     """
-    path = Path(path)
+    path = Path(name_of(path))
     means: dict[str, float] = {}
     sigmas: dict[str, float | None] = {}
     for where, name, right in entries(path, text_lines(read_lines(path)), _FORM, "Write several readings in "

@@ -13,10 +13,12 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterable
+import stat
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
-from jourdain_jax.calculus.reals import check_kind
+from jourdain_jax.calculus.reals import described
 
 FilePath = str | os.PathLike
 DEEPEST = 250  # levels of what is nested: a chain of so many bodies, as elements of MJCF
@@ -27,16 +29,37 @@ def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
     """Return the content of the file `path`, at most `limit` bytes; `what`: its kind, for the error, such as
     "a URDF file".
     """
-    try:
-        with open(path, "rb") as file:
-            content = file.read(limit + 1)
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
-        said = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of "
-            f"{what}{_near(Path(path), error)}") from None
+    with opened(path, what) as file:
+        content = file.read(limit + 1)
     if len(content) > limit:
         raise ValueError(f"{path}: larger than {limit} bytes, expected {what}")
     return content
+
+
+@contextlib.contextmanager
+def opened(path: FilePath, what: str) -> Iterator[BinaryIO]:
+    """Open the file `path` for reading; `what` as of `read_bytes`. ValueError where it cannot be read, or no
+    path is given.
+    """
+    try:
+        with open(name_of(path), "rb") as file:
+            yield file
+    except OSError as error:
+        said = error.strerror or type(error).__name__
+        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of "
+            f"{what}{_near(Path(path), error)}") from None
+
+
+def name_of(path) -> str:
+    """Return the path of a file or folder as a text; a ValueError where it is none."""
+    try:
+        found = os.fsencode(path)
+    except (TypeError, UnicodeError):
+        found = b"\0"
+    if b"\0" in found:
+        said = shortened(described(path), 300)
+        raise ValueError(f"`path` is {said}, expected the name of a file or folder")
+    return os.fsdecode(found)
 
 
 def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
@@ -125,12 +148,17 @@ _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for
 def check_place(path: FilePath) -> None:
     """Raise ValueError where no file can be written at `path`: its folder does not exist, or it is a folder.
     """
-    check_kind(path, FilePath, "`path`", "the name of a file")
-    place, folder = os.fspath(path), os.path.dirname(path) or "."
-    if not os.path.isdir(folder):
-        raise ValueError(f"cannot write `{place}`: there is no folder `{folder}`; make it first")
-    if os.path.isdir(path):
-        raise ValueError(f"cannot write `{place}`: it is a folder; give the name of a file in it")
+    place = name_of(path)
+    folder = os.path.dirname(place) or "."
+    try:
+        if not os.path.basename(place) or stat.S_ISDIR(os.stat(place).st_mode):
+            raise ValueError(f"cannot write `{place}`: it is a folder; give the name of a file in it")
+    except FileNotFoundError:
+        if not os.path.isdir(folder):
+            said = f"cannot write `{place}`: there is no folder `{folder}`; make it first"
+            raise ValueError(said) from None
+    except OSError as error:
+        raise ValueError(f"cannot write `{shortened(place, 300)}`: {error.strerror}") from None
 
 
 def write_whole(path: FilePath, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:

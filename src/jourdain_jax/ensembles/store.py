@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jourdain_jax.calculus.files import FilePath, parsed, read_bytes, shortened, write_whole
+from jourdain_jax.calculus.files import FilePath, name_of, parsed, read_bytes, shortened, write_whole
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked
@@ -99,7 +99,7 @@ class Store:
     """A study's folder, `path`."""
 
     def __init__(self, path: FilePath):
-        self.path = Path(path)
+        self.path = Path(name_of(path))
         self.study = self._read_study()
         self._digests = self._read_manifest()
         self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
@@ -158,11 +158,11 @@ class Store:
 
     def _read_study(self) -> dict:
         """What study this is, its numbers within their ranges."""
-        if not (self.path / "run" / "study.json").exists():
-            if self.path.is_file():
+        if not os.path.exists(self.path / "run" / "study.json"):
+            if os.path.isfile(self.path):
                 raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
-            what = "is not a study: it holds no `run/study.json`" if self.path.exists() else "does not exist"
-            raise ValueError(f"`{self.path}` {what}; give the folder of a study, or a new name")
+            what = "is not a study: it holds no `run/study.json`" if os.path.exists(self.path) else "does not exist"
+            raise ValueError(f"`{shortened(self.path, 300)}` {what}; give the folder of a study, or a new name")
         found = self._json("run/study.json")
         if found.get("format") != FORMAT:
             text = f"has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it, or run the study anew"
@@ -212,8 +212,8 @@ class Store:
     @staticmethod
     def is_taken(path: FilePath) -> bool:
         """Whether something is at `path`; an empty folder does not count."""
-        path = Path(path)
-        return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+        path = name_of(path)
+        return os.path.exists(path) and not (os.path.isdir(path) and not os.listdir(path))
 
     def lock(self):
         """A context in which no other process can run this study."""

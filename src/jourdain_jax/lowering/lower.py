@@ -227,7 +227,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=0.0,  # not known yet
-        sides=0,
+        sides=(),
         **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
 

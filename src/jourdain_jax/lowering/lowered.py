@@ -86,7 +86,7 @@ class Lowered:
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
     fixed: Nodes  # nodes that depend on parameters alone, computed once per motion
-    sides: int  # how many of the last modes and events are of relations
+    sides: tuple[bool, ...]  # of relations, the last modes and events: whether each is of whole numbers
 
     @property
     def graph(self) -> Graph:

@@ -1,16 +1,19 @@
 """Relations that decide between branches of rates and stop events, as numbers whose signs decide: they become
 sides (`sides.py`).
 
-    a < b, max(a, b), ...    a - b          sign(x), |x|    x          floor(x)    sin(pi x)          round(x)    cos(pi x)
+    a < b, max(a, b), ...    a - b          sign(x), |x|    x
+    floor(x), ceil(x)    sin(pi x)          round(x)    sin(pi (x + 1/2))
 
 A relation counts where a rate, or its slope, is another one on either side of where that number vanishes, or where a stop event may have a dip there;
 with it count the relations that its number is made of. Where its branches agree, as those of a guard do, it does not. Both branches are evaluated on
-either side of such places, which are found between the states that are probed; a relation that vanishes between none of these counts.
+either side of such places, which are found between the states that are probed, and there with all decisions
+of relations that have nothing to do with its number: those of `(x > a) & (y > b)` agree where y < b. A
+relation that vanishes between none of these states counts.
 
 A rate jumps where such a number vanishes if it changes as much over a way that is much shorter, and bends there if it does not.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -20,15 +23,19 @@ from jourdain_jax.program.graph import Graph, NodeList
 
 MOST_WATCHED = 32  # of a scene
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
+EQUAL = {"eq": (False, False), "ne": (True, True)}  # these decide nothing by themselves
+COMPARED |= EQUAL
 ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
-WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
+DECISIONS = 512  # of other relations, tried at each place: all, or so many random ones
+Decided = dict[int, list[tuple[int, int]]]  # as `switches` gives it
+WHOLE = ("floor", "ceil", "round", "rem")
 
 
-def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
-    """Return for each number whose sign decides relations these relations. Each has a factor: 1, or -1 if its
-    own number is the negative of the key.
+def switches(graph: Graph, nodes: Iterable[int]) -> Decided:
+    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if its own
+    number is the negative of the key.
     """
-    found: dict[int, list[tuple[int, int]]] = {}
+    found: Decided = {}
     for n in graph.reachable(list(nodes)):
         if graph.varies[n] and (own := _own(graph, n)) is not None and graph.varies[own]:
             number, turned = (graph.args[own][0], -1) if graph.op[own] == "neg" else (own, 1)
@@ -37,18 +44,32 @@ def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, in
             if graph.op[number] == "sub" and graph.args[number][0] > graph.args[number][1]:
                 number, turned = graph.neg(number), -turned
             found.setdefault(number, []).append((n, turned))
-    return found
+    alone = [number for number, nodes in found.items() if all(graph.op[n] in EQUAL for n, _ in nodes)]
+    return {number: nodes for number, nodes in found.items() if number not in alone}
 
 
 def _own(graph: Graph, node: int) -> int | None:
-    op, args = graph.operation(node)
-    if op in COMPARED or op in ("max", "min"):
-        return graph.sub(*args)
+    op, args = graph.op[node], graph.args[node]
+    if op in WHOLE:
+        return graph.call("sin", graph.mul(graph.const(np.pi), counted(graph, op, args)))
     if op in ("abs", "sign"):
-        return args[0]
-    if op not in WHOLE:
+        own = args[0]
+    elif op in COMPARED or op in ("max", "min"):
+        own = graph.sub(*args)
+    else:
         return None
-    return graph.call(WHOLE[op], graph.mul(graph.const(np.pi), graph.div(*args) if op == "rem" else args[0]))
+    if graph.op[own] == "rem":  # rem(a, b) has the sign of a
+        own = graph.args[own][0]
+    return None if any(map(graph.is_truth, args)) else own
+
+
+def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
+    """Return the number whose whole part decides: a/b of rem(a, b), a + 1/2 of round(a), a of floor(a) and
+    ceil(a).
+    """
+    if op == "rem":
+        return graph.div(*args)
+    return graph.add(args[0], graph.const(0.5)) if op == "round" else args[0]
 
 
 def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
@@ -71,6 +92,11 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
     return args[0] if above == (op in ("abs", "max")) else graph.neg(args[0]) if op == "abs" else args[1]
 
 
+def where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
+    """Return a node that is `there` where the condition is true."""
+    return graph.call("select", condition, otherwise, there)
+
+
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
     """Return the outputs for a positive number, and for a negative number, of these relations (of
     `switches`).
@@ -87,32 +113,40 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
     Numbers that depend on `modes` are omitted, since modes have their own events.
     """
     found: list[NodeList] = []
-    for outputs, counts in ((rates, _differ), (events, _may_dip)):
-        of_outputs = {n: nodes for n, nodes in switches(graph, outputs).items() if not set(modes) & set(graph.reachable([n]))}
-        kept = [n for n, nodes in of_outputs.items() if any(graph.op[k] in WHOLE for k, _ in nodes) or _counts(graph, n, nodes, outputs, counts, probes)]
+    for outputs, excess in ((rates, _difference), (events, _dip)):
+        decided = switches(graph, outputs)
+        of_outputs = {n: nodes for n, nodes in decided.items() if not set(modes) & set(graph.reachable([n]))}
+
+        def counts(number: int, decided: Decided = decided, outputs=outputs, excess=excess) -> bool:
+            whole = any(graph.op[k] in WHOLE for k, _ in decided[number])
+            return whole or _counts(graph, number, decided, outputs, excess, probes)
+
+        kept = list(filter(counts, of_outputs))
         needed = set(graph.reachable(kept))
         found.append([n for n in of_outputs if n in kept or any(k in needed for k, _ in of_outputs[n])])
     return tuple(found[0]), tuple(n for n in found[1] if n not in found[0])
 
 
-def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
+def _counts(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], excess, probes) -> bool:
     """Return whether the branches of relations differ near a zero of their number."""
-    if (beside := _beside(number, probes)) is None:
-        return True
-    above, below = branches(graph, nodes, outputs)
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
-    return any(counts(here(outputs), here(above), here(below), least) for here in beside(ASIDE))
+    for beside, here in _beside(graph, number, decided, outputs, probes):
+        above, below = branches(graph, decided[number], here)
+        for at in beside(ASIDE):
+            more = excess(at(here), at(above), at(below))
+            if np.any(more > least) or (here is outputs and np.any(np.isnan(more))):
+                return True
+    values = probes([number])[0]
+    return not (np.any(values > 0) and np.any(values < 0))
 
 
-def _differ(values, above, below, least) -> bool:
-    return not np.all(np.abs(above - below) <= least)
+def _difference(values, above, below):
+    return np.abs(above - below)
 
 
-def _may_dip(values, above, below, least) -> bool:
-    """Return whether a value may fall and rise again at a relation. It may if, on one side of the relation,
-    the value is not the smaller of its two branches.
-    """
-    return not np.all(values <= np.minimum(above, below) + least)
+def _dip(values, above, below):
+    """Return by how much a value is above the lower one of its two branches; where it is, it may dip."""
+    return values - np.minimum(above, below)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
@@ -130,34 +164,66 @@ def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
     """Return the numbers at whose zeros, between probes, an output jumps."""
+    outputs, decided = list(outputs), switches(graph, outputs)
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
 
     def jumps_at(number: int) -> bool:
-        if (beside := _beside(number, probes)) is None:
-            return False
-        closer, wide = (np.abs(behind(outputs) - before(outputs)) for before, behind in map(beside, (1e-9, ASIDE)))
-        return bool(np.any((closer > least) & (closer > 0.5 * wide)))
+        for beside, here in _beside(graph, number, decided, outputs, probes):
+            pairs = map(beside, (1e-9, ASIDE))
+            closer, wide = (np.abs(behind(here) - before(here)) for before, behind in pairs)
+            if np.any((closer > least) & (closer > 0.5 * wide)):
+                return True
+        return False
 
     return tuple(n for n in numbers if jumps_at(n))
 
 
-def _beside(number: int, probes: Probes) -> Callable[[float], tuple[Probes, Probes]] | None:
-    """Return a function that returns states at a given distance on either side of zeros of a number; None if
-    the number has no zero between probes.
+def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], probes: Probes) -> Iterator:
+    """Yield a function of a distance that returns states on either side of zeros of a number, and the
+    outputs; then the same with all decisions of relations whose numbers are not made of this one, nor it of
+    them. Nothing where probes have no zero between them.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
     count = min(len(positive), len(negative), 6)  # places
     if not count:
-        return None
+        return
     a, b = ({name: np.broadcast_to(x, probes.count)[k[:count]] for name, x in probes.inputs.items()} for k in (positive, negative))
 
-    def at(share) -> Probes:
-        return probes.with_inputs({name: a[name] + share * (b[name] - a[name]) for name in a})
+    def at(share) -> dict[str, np.ndarray]:
+        return {name: a[name] + share * (b[name] - a[name]) for name in a}
 
     low, high = np.zeros(count), np.ones(count)
     for _ in range(40):
         middle = 0.5 * (low + high)
-        above = at(middle)([number])[0] > 0
+        above = probes.with_inputs(at(middle))([number])[0] > 0
         low, high = np.where(above, middle, low), np.where(above, high, middle)
-    return lambda aside: (at(low - aside), at(high + aside))
+    sides = [lambda aside: at(low - aside), lambda aside: at(high + aside)]
+    yield lambda aside: [probes.with_inputs(side(aside)) for side in sides], outputs
+    own, nodes = set(graph.reachable([number])), {n for n, _ in decided.get(number, ())}
+
+    def apart(other: int) -> bool:
+        made_of, decides = graph.reachable([other]), (n for n, _ in decided[other])
+        return other != number and nodes.isdisjoint(made_of) and own.isdisjoint(decides)
+
+    free = {k: graph.input(f"decision {k}", True) for k in decided if apart(k)}
+    if not free:
+        return
+    replaced = {}
+    for k, decision in free.items():
+        is_below = graph.call("lt", decision, graph.zero)
+        for n, turned in decided[k]:
+            if graph.op[n] not in EQUAL:
+                there, otherwise = (_branch(graph, n, above) for above in (turned < 0, turned > 0))
+                replaced[n] = where(graph, is_below, there, otherwise)
+    if 2 ** len(free) <= DECISIONS:
+        chosen = 1.0 - 2.0 * (np.arange(2 ** len(free))[:, None] >> np.arange(len(free)) & 1)
+    else:
+        chosen = np.random.default_rng(0).choice([-1.0, 1.0], (DECISIONS, len(free)))
+    decisions = {f"decision {k}": np.repeat(x, count) for k, x in zip(free, chosen.T, strict=True)}
+
+    def decided_freely(aside):
+        tiled = ({name: np.tile(x, len(chosen)) for name, x in side(aside).items()} for side in sides)
+        return [probes.with_inputs(inputs | decisions) for inputs in tiled]
+
+    yield decided_freely, graph.substituted(outputs, replaced)

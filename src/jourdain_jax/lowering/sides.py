@@ -3,14 +3,14 @@
     x = a - b of a < b, max(a, b), ...; x of |x|, sign(x)     s = 1, -1: x counts as positive, negative
     c = s x falls through zero:  s <- -s                      s = 0: x rests at zero, and counts as it is
 
+    n of floor(a) = n, ceil(a) = n + 1, ...                   s = 2 n + 1; s = 0 before the start
+    c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
+
 Within a step no branch changes: the search for events ends the step where x vanishes, and the derivative
-jumps
-there as at any event (`motion/native/transitions.py`). Relations in Modelica are events, too.
-If a branch ends where x vanishes, as `sqrt` does, its relation has the event only. floor(a), whose x is
-sin(pi a), is the nearest even or odd number, by the sign of s.
+jumps there as at any event (`motion/native/transitions.py`). Relations in Modelica are events, too.
+If a branch ends where x vanishes, as `sqrt` does, its relation has the event only.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -19,8 +19,8 @@ import numpy as np
 
 from jourdain_jax.build.trace import Variables
 from jourdain_jax.lowering.lowered import NODES, Lowered
-from jourdain_jax.lowering.relations import COMPARED, WHOLE, switches
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.lowering.relations import COMPARED, WHOLE, counted, switches, where
+from jourdain_jax.program.graph import Graph, NodeList
 
 
 @lru_cache(maxsize=64)
@@ -32,9 +32,10 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     old, graph, numbers = program.graph, Graph(keeps_rules=True), program.watched(has_events)
     given = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
     sides = [graph.input(f"side {k}", True) for k in range(len(numbers))]
-    signs: dict[int, int] = {}
     relations: dict[int, tuple[int, int, int]] = {}
     decided = switches(old, [*program.qdot, *program.ydot, *(program.events if has_events else ())])
+    first = {number: [pair for pair in nodes if old.op[pair[0]] in WHOLE][:1] for number, nodes in decided.items()}
+    wholes = [bool(first.get(number)) for number in numbers]
     for number, side in zip(numbers, sides, strict=True):
         if number in program.sided:
             relations |= {n: (number, side, turned) for n, turned in decided[number]}
@@ -42,15 +43,13 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     for n in sorted(relations):  # each after those that it is made of
         number, side, turned = relations[n]
         new = graph.copied([number, *old.args[n]], old, new)
-        if number not in signs:
-            signs[number] = _where(graph, graph.call("eq", side, graph.zero), new[number], side)
-        sign = signs[number] if turned > 0 else graph.neg(signs[number])
-        new[n] = _by_sign(graph, old.op[n], [new[a] for a in old.args[n]], side, sign)
+        args = [new[a] for a in old.args[n]]
+        new[n] = _by_side(graph, old.op[n], args, turned, side, new[number], bool(first[number]))
     nodes = {name: getattr(program, name) for name in NODES}
     new = graph.copied([program.power, *numbers, *(n for part in nodes.values() for n in part)], old, new)
     copied: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
     copied |= dict.fromkeys(("relations", "event_relations", "jumps"), ())
-    x = [new[n] for n in numbers]
+    x = [_counted(graph, old, first[n][0], new) if whole else new[n] for n, whole in zip(numbers, wholes, strict=True)]
     inputs = np.array([*(new[n] for n in program.traced.inputs.tolist()), *sides], np.int64)
     parts = program.traced.q, program.traced.u
     q, u = (np.array([new.get(n, 0) for n in part.tolist()], np.int64) for part in parts)  # dependent speeds: none
@@ -66,17 +65,25 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # each after those that it is made of
             (moved,) = graph.substituted([x[k]], after)
             if moved != x[k] and sides[k] not in after:
-                after[sides[k]] = graph.call("sign", moved)
+                anew = _odd(graph, graph.call("floor", moved)) if wholes[k] else graph.call("sign", moved)
+                after[sides[k]] = where(graph, graph.call("eq", moved, x[k]), sides[k], anew)
         resets.extend([*(after.get(n, n) for n in (*now, *sides)), rise])
 
     for i in range(len(events)):
         *after, rise = copied["resets"][i * each : (i + 1) * each] or (*now, graph.zero)
         add(dict(zip(now, after, strict=True)), rise)
-    for side, number in zip(sides, x, strict=True):
-        rests = graph.call("eq", side, graph.zero)
-        add({side: _where(graph, rests, graph.call("sign", number), graph.neg(side))}, graph.zero)
-    below = [graph.call("lt", side, graph.zero) for side in sides]
-    falls = [_where(graph, is_below, graph.neg(n), n) for is_below, n in zip(below, x, strict=True)]
+    falls = []
+    for side, number, whole in zip(sides, x, wholes, strict=True):
+        at_rest = graph.call("eq", side, graph.zero)
+        if whole:
+            n = _whole(graph, side)
+            above, left = graph.sub(number, n), graph.sub(graph.add(n, graph.one), number)
+            up = graph.call("lt", left, above)
+            add({side: graph.add(side, where(graph, up, graph.const(2.0), graph.const(-2.0)))}, graph.zero)
+            falls.append(where(graph, at_rest, number, graph.mul(above, left)))
+        else:
+            add({side: where(graph, at_rest, graph.call("sign", number), graph.neg(side))}, graph.zero)
+            falls.append(where(graph, graph.call("lt", side, graph.zero), graph.neg(number), number))
     return replace(
         program,
         traced=Variables(graph, new[program.traced.t], q, u, inputs, []),
@@ -84,47 +91,52 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         fixed=tuple(new[n] for n in program.fixed),
         power=new[program.power],
         **copied | {"events": (*events, *falls), "resets": tuple(resets), "stops": (*stops, *[False] * len(sides)), "z": ()},
-        sides=len(sides),
+        sides=tuple(wholes),
     )
 
 
-def _where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
-    return graph.call("select", condition, otherwise, there)
-
-
-def _by_sign(graph: Graph, op: str, args: Sequence[int], side: int, sign: int) -> int:
-    """Return the value of a relation for this `sign` of its own number. If the relation is a whole number,
-    return it for this `side`.
+def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, int]) -> int:
+    """Return the number a whose whole part decides; `first`: a relation that it decides, and -1 if that is of
+    -a.
     """
+    node, turned = first
+    found = counted(graph, old.op[node], [new[a] for a in old.args[node]])
+    return found if turned > 0 else graph.neg(found)
+
+
+def _whole(graph: Graph, side: int) -> int:
+    """Return n of the side 2 n + 1."""
+    return graph.mul(graph.const(0.5), graph.sub(side, graph.one))
+
+
+def _odd(graph: Graph, n: int) -> int:
+    """Return the side of n."""
+    return graph.add(graph.mul(graph.const(2.0), n), graph.one)
+
+
+def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, number: int, whole: bool) -> int:
+    """Return the value of a relation on this side of its own number or, `turned` by -1, of its negative."""
+    at_rest = graph.call("eq", side, graph.zero)
+    if op in WHOLE:
+        n = _whole(graph, side)
+        plain = graph.call("floor", counted(graph, op, args))
+        n = where(graph, at_rest, plain, n if turned > 0 else graph.neg(graph.add(n, graph.one)))
+        if op == "ceil":
+            return graph.add(n, graph.one)
+        if op == "rem":  # towards zero
+            towards = where(graph, graph.call("lt", n, graph.zero), graph.add(n, graph.one), n)
+            return graph.sub(args[0], graph.mul(args[1], towards))
+        return n
+    sign = graph.call("cos", graph.mul(graph.const(np.pi), _whole(graph, side))) if whole else side
+    sign = where(graph, at_rest, number, sign)
+    sign = sign if turned > 0 else graph.neg(sign)
     if op in COMPARED:
         return graph.call(op, sign, graph.zero)
     if op == "sign":
         return graph.call("sign", sign)
-    if op in WHOLE:
-        return _whole(graph, op, args, side)
     low, high = {
         "abs": (graph.neg(args[0]), args[0]),
         "max": (args[-1], args[0]),
         "min": (args[0], args[-1]),
     }[op]
-    return _where(graph, graph.call("lt", sign, graph.zero), low, high)
-
-
-def _whole(graph: Graph, op: str, args: Sequence[int], side: int) -> int:
-    """Return floor(a), ceil(a), round(a) or rem(a, b) on a given side, where the whole number below a, a/b or
-    a + 1/2 is even or odd.
-
-    `side`: 1 for an even number, -1 for an odd one.
-    """
-    a = graph.div(*args) if op == "rem" else args[0]
-    odd = _where(graph, graph.call("lt", side, graph.zero), graph.one, graph.zero)
-    middle = graph.sub(a, odd if op == "round" else graph.add(odd, graph.const(0.5)))
-    n = graph.add(graph.mul(graph.const(2.0), graph.call("round", graph.mul(graph.const(0.5), middle))), odd)
-    plain = graph.call("round" if op == "round" else "floor", a)
-    n = _where(graph, graph.call("eq", side, graph.zero), plain, n)
-    if op == "ceil":
-        return graph.add(n, graph.one)
-    if op == "rem":  # towards zero
-        towards = _where(graph, graph.call("lt", n, graph.zero), graph.add(n, graph.one), n)
-        return graph.sub(args[0], graph.mul(args[1], towards))
-    return n
+    return where(graph, graph.call("lt", sign, graph.zero), low, high)

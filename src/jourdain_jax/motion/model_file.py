@@ -17,7 +17,7 @@ import numpy as np
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import Variables
-from jourdain_jax.calculus.files import FilePath, parsed, read_bytes, write_whole
+from jourdain_jax.calculus.files import FilePath, check_place, parsed, read_bytes, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.program.graph import Graph
@@ -31,6 +31,7 @@ def write(path: FilePath, scene: Scene, how: dict, found: Mapping[Hashable, Any]
     """Write the findings about a scene and `how` to build it. Findings are keyed by the functions that find
     them and the first part of their key.
     """
+    check_place(path)
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
     except TypeError as error:
@@ -54,7 +55,7 @@ def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
 
 
 def _about(scene: Scene, content: bytes) -> dict:
-    versions = {"format": 2, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
+    versions = {"format": 3, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
     return versions | {"scene": digest((type(scene), scene)), "sha256": hashlib.sha256(content).hexdigest()}
 
 

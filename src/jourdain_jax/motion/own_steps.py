@@ -105,7 +105,7 @@ class OwnSteps(Integrator):
         return native_motion.form_of(setup.field, setup.inputs, **self._events(setup))
 
     def _events(self, setup: Setup) -> dict[str, Any]:
-        sides = setup.field.lowered.sides if setup.field.lowered else 0
+        sides = setup.field.lowered.sides if setup.field.lowered else ()
         return {"has_events": bool(self.event_names or sides), "most": self.most, "stopping": self.stopping}
 
     def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
@@ -190,7 +190,7 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
     are part of its program.
     """
     field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
-    if reason_against_watching(setup) or not isinstance(field, ByProgram):
+    if _reason_against_sides(setup) or not isinstance(field, ByProgram):
         return setup, begun
     has_events = bool(setup.integrator.event_names)
     program, numbers = _relations(field.program, inputs, has_events)
@@ -201,16 +201,23 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
         fixed += tuple(jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel))
         inputs = Inputs(tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)))
     program = with_sides(program, has_events, native_motion.modes_among(inputs))
-    inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * program.sides))
+    inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * len(program.sides)))
     field = replace(field, program=program, stops=program.stops)
     setup = setup._replace(field=field, inputs=inputs)
     return setup, eqx.tree_at(lambda b: b.args, begun, (field, scene, inputs, fixed, origin))
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Return the reason why no step monitors the relations in a scene's loads or stop events. Return nothing
-    if steps monitor them, or if there are none.
+    """Return why steps do not monitor all relations in a scene's loads or stop events; empty if they do, or
+    there are none. A call may hide some.
     """
+    program = setup.field.lowered
+    hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
+    return _reason_against_sides(setup) or ("the scene keeps parts as calls" if hides else "")
+
+
+def _reason_against_sides(setup: Setup) -> str:
+    """Return why no step monitors the relations of the scalar program; empty if steps do, or it has none."""
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
         return "the scene has no scalar program" if jump else ""

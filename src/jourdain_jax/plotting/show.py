@@ -3,7 +3,6 @@
 import base64
 import html
 import json
-import os
 import zlib
 from collections.abc import Sequence
 from importlib import resources
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.files import FilePath, check_place
+from jourdain_jax.calculus.files import FilePath, check_place, name_of, shortened
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -120,7 +119,7 @@ def _file(name: str) -> str:
 
 
 def _check_suffix(path: FilePath) -> None:
-    if not str(path).lower().endswith((".html", ".htm")):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use "
+    if not name_of(path).lower().endswith((".html", ".htm")):
+        raise ValueError(f"cannot write `{shortened(path)}`: a 3D view is a .html file; for a .gif use "
             "`jj.animate`, for figures `jj.plot`")
     check_place(path)

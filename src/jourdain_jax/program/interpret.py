@@ -5,7 +5,9 @@ Integers and booleans that do not depend on inputs (indices, shapes, masks) stay
 """
 
 import os
-from collections.abc import Callable, Collection
+import re
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,6 +21,7 @@ from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
+_LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # in pieces, with the slopes of their values
 _HOME = f"{Path(__file__).parent.parent}{os.sep}"  # where the source of this package lies
 
 
@@ -69,6 +72,10 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
         return interpret(graph, inner, inputs)
     if name == "cond" and not isinstance(inputs[0], Nodes):
         return interpret(graph, equation.params["branches"][int(inputs[0])], inputs[1:])
+    if name == "cond":
+        found = [interpret(graph, branch, inputs[1:]) for branch in equation.params["branches"]]
+        choose = partial(_elementwise, graph, partial(_select, graph, {}))
+        return [Nodes(choose([inputs[0], *cases])) for cases in zip(*found, strict=True)]
     if not equation.outvars:
         raise Unsupported(f"the operation `{name}`")
     symbolic = any(isinstance(x, Nodes) for x in inputs)
@@ -87,12 +94,19 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
         return [Nodes(reduced(graph, as_nodes(graph, inputs[0]), equation.params["axes"], name))]
     if name == "dot_general":
         return [Nodes(product(graph, equation, *(as_nodes(graph, x) for x in inputs)))]
+    if name == "argmax" and equation.invars[0].aval.dtype == bool:
+        first, (axis,) = partial(_first_true, graph), equation.params["axes"]
+        return [Nodes(np.apply_along_axis(first, axis, as_nodes(graph, inputs[0])))]
     if name in _ELEMENTWISE:
-        arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
-        flat = [np.ravel(a).tolist() for a in arrays]
-        result = [_ELEMENTWISE[name](graph, equation.params, *entries) for entries in zip(*flat, strict=True)]
-        return [Nodes(np.array(result, dtype=np.int64).reshape(arrays[0].shape))]
+        return [Nodes(_elementwise(graph, partial(_ELEMENTWISE[name], graph, equation.params), inputs))]
     raise Unsupported(f"the operation `{name}`")
+
+
+def _elementwise(graph: Graph, result: Callable, inputs: Sequence[Value]) -> np.ndarray:
+    arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs))
+    flat = [np.ravel(a).tolist() for a in arrays]
+    found = [result(*entries) for entries in zip(*flat, strict=True)]
+    return np.array(found, dtype=np.int64).reshape(arrays[0].shape)
 
 
 def refuse(equation) -> None:
@@ -117,7 +131,8 @@ def own_rule(name: str, params) -> str:
     if function is None or not name.startswith("custom_"):
         return ""
     info = getattr(function.jaxpr.debug_info, "func_src_info", None) or "a function"
-    return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
+    known = _HOME in info or _LINEAR.match(info)
+    return "" if known else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 
 # Primitives that move entries about. ---------------------------------------------------------------------------------
@@ -201,7 +216,7 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
         raise Unsupported(f"a number in {new}")
     if kinds[0] == kinds[1] or kinds == ("i", "f"):
         return Nodes(ids)
-    if kinds[1] not in ("f", "b"):
+    if kinds[1] not in ("f", "b") and kinds[0] != "b":
         raise Unsupported("an integer that depends on the state")
     one = (lambda n: graph.call("select", n, graph.zero, graph.one)) if old.kind == "b" else (lambda n: graph.call("ne", n, graph.zero))
     return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
@@ -215,11 +230,23 @@ def _call(op: str) -> Callable:
 
 
 def _select(graph: Graph, params, which, *cases):
-    if len(cases) != 2:
-        raise Unsupported("a choice among more than two")
     if graph.is_const(which):
         return cases[int(graph.value[which])]
-    return graph.call("select", which, *cases)
+    if len(cases) == 2:
+        truth = which if graph.is_truth(which) else graph.call("ne", which, graph.zero)
+        return graph.call("select", truth, *cases)
+    found = cases[0]
+    for k, case in enumerate(cases[1:], 1):
+        found = graph.call("select", graph.call("eq", which, graph.const(float(k))), found, case)
+    return found
+
+
+def _first_true(graph: Graph, truths: np.ndarray) -> int:
+    """Return at which place the first of some truths is true; 0 where none is."""
+    found = graph.zero
+    for k in reversed(range(len(truths))):
+        found = graph.call("select", int(truths[k]), found, graph.const(float(k)))
+    return found
 
 
 def _power(graph: Graph, params, x: int, y: int) -> int:

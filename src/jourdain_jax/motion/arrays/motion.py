@@ -59,7 +59,7 @@ def loop_of(
         squares=range(2 * field.near_rank_loss),
         switched=range(len(modes)),
         stops=field.stops if of_events["has_events"] else (),
-        sides=field.lowered.sides if field.lowered else 0,
+        sides=field.lowered.sides if field.lowered else (),
         **of_events,
         compensated=most * eps
         > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits

@@ -194,6 +194,10 @@ class ArrayWriter:
         """Return whether this is known to be the first stage."""
         return False
 
+    def intrinsic(self, name: str, a: Array) -> Array:
+        """Return a function of LLVM that JAX has under the same name."""
+        return getattr(jnp, name)(a)
+
     def at_first(self, i, first, otherwise):
         """Return `first` in the first stage, otherwise the other."""
         return jnp.where(i == 0, first, otherwise)

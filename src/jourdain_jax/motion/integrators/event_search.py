@@ -1,7 +1,6 @@
 """The first stop event of a step and its time: trials of shorter steps from the last state before it.
 
-The formulas are those of arrays of JAX and of values of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events
-are lists, one for each event.
+The formulas are those of arrays of JAX and of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events are lists.
 
 An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it continues
 
@@ -10,18 +9,17 @@ An event happens where its value falls through zero. A motion that starts with a
 if the value is positive after a first step. Where it is not, the step is tried again at half its length, down to that noise; otherwise the search would find
 the zero at the start. Then the event has happened at the start, as it has where the value is lower or does not rise.
 
-All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. NaN is not positive: such a value lies
-beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
-and t_a, is by the cubic through values and rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe,
-otherwise the middle). Where a trial finds another event, all that is after it no longer counts, so that the event found has no other before it, as far as
-values were seen. A value of zero may stay zero beyond the event: it is an end of the bracket like a negative one, which is then halved.
+All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. NaN is not positive: such a value lies beyond its boundary. Of
+the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial is by the cubic through values and
+rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another
+event, all that is after it no longer counts, so that the event found has no other before it, as far as values were seen. A value of zero may stay zero beyond
+the event: it is an end of the bracket like a negative one, which is then halved.
 
 The times tried are constants to differentiation. Near the event, shifts of Newton's method follow,
 
     t <- t - c/cdot,   y <- y + (shift of t) f
 
-Once the event is found, `put_tangents` sets the tangents of its time and of the state there (the saltation term). Where c is not a number beyond the event,
-no Newton shift is taken.
+Once the event is found, `put_tangents` sets the tangents of its time and of the state there. Where c is no number beyond it, no Newton shift is taken.
 
 Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
@@ -329,7 +327,9 @@ def monitored(
         # an event a rounding beyond the end of its step happens there: what is saved there is the state after it
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
-        ends = found & ~goes
+        at_once = over & ~goes & (p["begun"] > 0.0)  # right after a transition, by which its time is set
+        ends = at_once | (found & ~goes)
+        p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
         left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
         p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
@@ -338,12 +338,12 @@ def monitored(
         flat = ~side & (over | is_flat(w, rate, slope))
         quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
         passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
-        stuck, at_once = w.room(), over & any_of(sinks) & (p["begun"] > 0.0)
+        stuck, repeats = w.room(), over & any_of(sinks) & (p["begun"] > 0.0)
         w.store(0.0, stuck)
         w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
-        passed = p["passed"] + w.where(goes & ~side, 1.0, 0.0)
-        too_many = at_once | (w.load(stuck) > 0.0) | (passed > float(form.transitions))
-        why = w.where(w.load(stuck) > 0.0, w.load(stuck), float(results.TOO_MANY_TRANSITIONS))
+        passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
+        too_many = repeats | (why > 0.0) | (passed > float(form.transitions))
+        why = w.where(why > 0.0, why, float(results.TOO_MANY_TRANSITIONS))
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
         changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)  # they count as tries, so that these end

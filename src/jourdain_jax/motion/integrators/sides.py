@@ -7,7 +7,8 @@ from jourdain_jax.motion.native.transitions import slowest
 def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
     """Set the sides of relations at the start of a motion, in lanes that have not yet tried a step.
 
-    A number that vanishes gets the sign that it has after the time d = eps^(1/4) span, by the midpoint rule.
+    A number that vanishes, or is whole, gets the side that it has after the time d = eps^(1/4) span, by the
+    midpoint rule.
     """
     if not form.sides:
         return
@@ -29,11 +30,14 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
         each_row(w, form.integrated, f, lambda row: 0.0)
         w.over_stages(3, stage, ())
-        for k, row in enumerate(list(form.rows["mode"])[form.modes :], first):
+        rows = list(form.rows["mode"])[form.modes :]
+        for k, (row, whole) in enumerate(zip(rows, form.sides, strict=True), first):
             x, later = w.load(values, k), w.load(ahead, k)
+            off = x - w.intrinsic("floor", x + 0.5) if whole else x
             # noise beside what it changes by
-            x = w.where(w.magnitude(x) <= w.eps**0.35 * w.magnitude(later - x), later, x)
+            x = w.where(w.magnitude(off) <= w.eps**0.35 * w.magnitude(later - x), later, x)
             side = w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0))
+            side = w.where(w.equal(x, x), 2.0 * w.intrinsic("floor", x) + 1.0, 0.0) if whole else side
             w.store(w.where(fresh, side, w.load(p.pointer, row)), p.pointer, row)
 
     w.if_any(fresh, begin)
@@ -44,7 +48,10 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
     leaves zero.
     """
     c, rate = (list(part) for part in found)
-    for k, side in enumerate(p.every("mode")[form.modes :], form.stated):
+    sides = p.every("mode")[form.modes :]
+    for k, (side, whole) in enumerate(zip(sides, form.sides, strict=True), form.stated):
+        if whole:
+            continue
         rests, x = w.equal(side, 0.0), c[k]
         c[k] = w.where(rests, slowest(w, p) - w.magnitude(x), x)
         falling = w.where(w.equal(x, 0.0), -w.magnitude(rate[k]) * p["direction"], -rate[k])

@@ -308,13 +308,16 @@ def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Nu
     for i in range(count):
         total = w.fma(w.load(g, i), w.load(f, i), total)
     flat = located & slope_is_flat(w, lanes, rate) & w.differs(total, 0.0)
-    by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
-    usable = usable | flat
+    by_value = w.where(usable & ~flat, -total / rate, 0.0)
     for i in range(form.events):
         w.store(w.where(w.equal(lanes["event"], i), by_value, 0.0), weights, i)
     w.run("pull_events", state, t, state, weights, out, added)
-    each_row(w, count, g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
-    each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
+
+    def with_event(before: Number, more: Number) -> Number:
+        return before + w.where(flat, math.nan, w.where(usable, more, 0.0))
+
+    each_row(w, count, g, lambda i: with_event(w.load(g, i), w.load(out, i)))
+    each_row(w, asked, by_known, lambda i: with_event(w.load(by_known, i), w.load(added, i)))
 
 
 def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:

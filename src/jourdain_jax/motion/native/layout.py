@@ -50,7 +50,7 @@ class Form:
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
     most: int = 0  # transitions of a motion
     stopping: bool = True  # whether events that end a motion do
-    sides: int = 0  # how many of the last modes and events are of relations
+    sides: tuple[bool, ...] = ()  # of relations, the last modes and events: whether each is of whole numbers
 
     @property
     def rates(self) -> list[int]:
@@ -61,12 +61,12 @@ class Form:
     @property
     def modes(self) -> int:
         """Return the number of modes of the scene."""
-        return len(self.switched) - self.sides
+        return len(self.switched) - len(self.sides)
 
     @property
     def stated(self) -> int:
         """Numbers of events that the scene states."""
-        return self.events - self.sides
+        return self.events - len(self.sides)
 
     @property
     def monitored(self) -> list[int]:

@@ -226,11 +226,11 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     for i in range(form.modes):
         mode = w.load(modes, i)
         w.store(w.where(switches & (mode < 0.0), float(results.IMPACT_GAINS_ENERGY - 1) - mode, w.load(stuck)), stuck)
-    for i in range(form.sides):
+    for i, whole in enumerate(form.sides):
         k, mode = form.stated + i, form.modes + i
         this, rate = switches & w.equal(event, float(k)), w.load(slopes, k) * p["direction"]
         rests = w.magnitude(rate * p["last_goal"]) <= slowest(w, p)
-        w.store(w.where(this & rests, 0.0, w.load(modes, mode)), modes, mode)
+        w.store(w.where(this & rests, 0.0, w.load(modes, mode)), modes, mode) if not whole else None
         w.store(w.where(this & ~rests & (rate < 0.0), float(results.STICKS), w.load(stuck)), stuck)
 
 

@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.trace import velocity_quantities
-from jourdain_jax.calculus.files import FilePath, check_depth, check_place, parsed, write_whole
+from jourdain_jax.calculus.files import FilePath, check_depth, check_place, opened, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import at_index, check_kind, described, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import at_index, described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
@@ -220,14 +220,9 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
     """Return header and arrays of a file of this kind, and the class of its scene."""
-    check_kind(path, FilePath, "`path`", "the name of a file")
     what = f"{kind} file written by `save`"
-    try:
-        with open(path, "rb") as file:
-            arrays = parsed(_unpacked, file, f"`{path}`", what)
-    except OSError as error:
-        said = f"there is no file `{path}`" if isinstance(error, FileNotFoundError) else f"`{path}` cannot be read ({error.strerror})"
-        raise ValueError(f"{said}; check the path") from None
+    with opened(path, f"a {what}") as file:
+        arrays = parsed(_unpacked, file, f"`{path}`", what)
     header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
     check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
     if not isinstance(header, dict):
