@@ -45,9 +45,9 @@ def test_measurements_that_count_twice_are_named(fitted):
     _, data = fitted
     assert not jj.fit(TRUTH, data, free=("offset",)).warnings
     twice = jj.fit(TRUTH, [data, data], free=("offset",))
-    assert "`x` of run 0 and `x` of run 1 hold the same numbers" in str(twice.warnings)
+    assert "`x` of run 0 and `x` of run 1 hold equal numbers" in str(twice.warnings)
     both = jj.Experiment(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
-    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold the same numbers")
+    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold equal numbers")
 
 
 def page(path) -> ElementTree.Element:
