@@ -25,7 +25,7 @@ CEILINGS = {
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, the search for an event in it, and the way back over it": 1,
-    "code tokens of tests": 326_861,
+    "code tokens of tests": 326_862,
     "code tokens of bench": 107_012,
     "test files that reach private names": 37,
 }

@@ -30,7 +30,7 @@ def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
     for every_speed in (None, True):
         program = jj.lower(anywhere, every_speed)
         independent = list(program.independent)
-        _, ydot, _, pivots, _ = program.rates_and_pivots(program.fixed_values(anywhere), t, tuple(q.T), tuple(u.T[independent]), jnp.zeros(0))
+        _, ydot, _, pivots, *_ = program.rates_and_pivots(program.fixed_values(anywhere), t, tuple(q.T), tuple(u.T[independent]), jnp.zeros(0))
         assert np.max(np.abs(np.stack(ydot) - expected.T[independent]) / size) <= 1e-9
         if structure_of(anywhere).well_conditioned:
             assert np.all(np.abs(np.array(pivots)) > 0.02)
