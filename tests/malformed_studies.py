@@ -1,6 +1,8 @@
 """Malformed designs and studies, as one table: see `malformed_inputs`."""
 
 PRELUDE = """
+import datetime
+
 import numpy as np
 import jourdain_jax as jj
 
@@ -45,6 +47,8 @@ STUDIES: dict[str, str | tuple[str, str]] = {
     "jj.Study(disc, start={'lean': 0.2}, samples=8)": "nothing varies",
     "by_radius.task(save='everything')": "`save` is 'everything'",
     "by_radius.task(save='trajectories')": "trajectories are kept by `keep_every=1`",
+    "jj.Study(disc, start={'lean': jj.Uniform(0.1, 0.2), 'spin_rate': datetime.date(2020, 1, 1)}, samples=8)": "start `spin_rate` is a date",
+    "by_radius.task(keep_every=10**30)": "`keep_every` is 1000000000000000000000000000000, expected a whole number",
     "by_radius.task(keep_every=0)": "`keep_every` is 0, expected a whole number of at least 1",
     "by_radius.task(every=2)": ("TypeError", "Study.run() takes no `every`: trajectories of every N-th lane are kept by `keep_every=N`"),
     "by_radius.task(t1=-np.inf)": "t1",

@@ -8,9 +8,9 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_real, checked_whole, described, has_unit
+from jourdain_jax.calculus.reals import checked_real, checked_whole, described
 from jourdain_jax.ensembles.cluster import on_cluster
-from jourdain_jax.ensembles.design import Design
+from jourdain_jax.ensembles.design import MOST_SAMPLES, Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.mean_gradients import MeanGradients, mean_gradients
 from jourdain_jax.ensembles.memory import of_each
@@ -108,7 +108,8 @@ class Study(Printed):
             check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed "
                 f"`{name}` to start with")
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
-                constants[name] = checked_real(how, f"start `{name}`", advice="give its value") if has_unit(how) else how
+                checked_real(how, f"start `{name}`", advice="give its value")
+                constants[name] = how
             elif name in groups:
                 raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its "
                     "entries")
@@ -134,7 +135,7 @@ class Study(Printed):
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
-            keep_every = checked_whole(keep_every, "`keep_every`", 1, expected="of at least 1, or None: "
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected="of at least 1, or None: "
                 "trajectories of no lane are kept")
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
