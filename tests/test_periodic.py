@@ -125,7 +125,7 @@ def test_orbits_side_by_side_have_multipliers_of_one():
 
 WRONG = {
     "`until` names `crosing`.*crossing": {"until": "crosing"},
-    "in `Line` loads do; give `period` alone": {"until": "crossing"},
+    "in `Line` loads do; omit `until`": {"until": "crossing"},
     "`period` is 0.0, expected a positive time": {"period": 0.0},
     "no `xx` to hold": {"held": "xx"},
     "`pieces` is 0": {"pieces": 0},
