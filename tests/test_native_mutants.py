@@ -406,7 +406,7 @@ MUTANTS = [
     Mutant("saved states forgotten", back, "_write_added", 'w.load(place, type="double") + more', "more", BACK, WRONG),
     Mutant("no projection on the way back", back, "step_back", 'w.run("project_back", state, t + h, at, g1, added)', "None", PROJECTED_BACK, WRONG),
     Mutant("an event at a number for a time", back, "event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
-    Mutant("the level of an event forgotten", back, "event_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
+    Mutant("the level of an event forgotten", back, "event_back", "w.where(usable, more, 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
     Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
     Mutant("the time of an event fixed", event_search, "put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
     Mutant("the wrong way from an event", event_search, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),

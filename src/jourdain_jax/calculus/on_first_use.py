@@ -56,7 +56,7 @@ def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = Mappin
 
     A name is looked up once; from then on it is an ordinary global of the package.
     """
-    conditions = [statement for statement in ast.parse(Path(package["__file__"]).read_text("utf-8")).body if isinstance(statement, ast.If)]
+    conditions = [statement for statement in ast.parse(Path(package["__file__"]).read_text(encoding="utf-8")).body if isinstance(statement, ast.If)]
     imports = [line for condition in conditions for line in condition.body if isinstance(line, ast.ImportFrom)]
     where = {alias.name: str(line.module) for line in imports for alias in line.names}
 

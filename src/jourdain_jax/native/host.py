@@ -214,6 +214,7 @@ def _against(found: os.stat_result) -> str:
     return ""
 
 
+@functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
         f"the folder `{place}` is not used as cache of machine code, which is therefore compiled in each "
