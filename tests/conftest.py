@@ -29,9 +29,10 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-friction modes linearize identify native_mutants malformed_inputs gpu inertia mutants periodic types result_codes load_jumps sensors study_faults
-plain_numbers sides inputs events feasible_starts native simulate whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32
-derivatives_of_failed diffrax build fit_report quality native_derivatives native_second traced_parameters extremes report
+friction modes sides held_rows linearize identify native_mutants malformed_inputs gpu inertia mutants periodic
+types result_codes load_jumps sensors study_faults plain_numbers inputs events feasible_starts native simulate
+whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32 derivatives_of_failed
+diffrax build fit_report quality native_derivatives native_second traced_parameters extremes report
 """
 
 
