@@ -55,7 +55,7 @@ class Modes(eqx.Module):
 
     @property
     def names(self) -> Labels:
-        """Labels of the modes, in the order of the eigenvalues."""
+        """Return names of the modes, in the order of the eigenvalues."""
         return mode_names(self.scene, self.named, np.asarray(self.eigenvalues))
 
 

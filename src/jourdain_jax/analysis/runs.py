@@ -258,8 +258,13 @@ class Group:
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples "
-        "width"], taus: np.ndarray) -> np.ndarray:
+    def whitened(
+        self,
+        runs: np.ndarray,
+        members: np.ndarray,
+        rows: Float[np.ndarray, "lanes samples width"],
+        taus: np.ndarray,
+    ) -> np.ndarray:
         """Return rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s.
         """
         if self._chains is None:

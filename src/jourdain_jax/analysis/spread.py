@@ -266,8 +266,9 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
 
 
-def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds width "
-    "width"]) -> tuple[np.ndarray, np.ndarray]:
+def _told_by_kind(
+    known: Information, T: Float[np.ndarray, "members runs kinds width width"]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return p_c (members, kinds) and (C A_c C)_ii (members, kinds, places), from triangles in units of
     sigma.
     """
