@@ -37,12 +37,10 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.names import UnknownNameError, check_name, nearest
+from jourdain_jax.scene.names import Sentences, UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-
-Sentences = tuple[str, ...]
 
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentences:

@@ -17,11 +17,11 @@ from jourdain_jax.analysis.fit_page import fit_page, interval_widths
 from jourdain_jax.analysis.problem import LEAST_SQUARES
 from jourdain_jax.analysis.resumed import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
 from jourdain_jax.analysis.spread import FAR_BEYOND
-from jourdain_jax.scene.names import Labels, as_names
+from jourdain_jax.scene.names import Labels, Sentences, as_names
 from jourdain_jax.scene.printing import table
 
 
-def warnings_of(fit: Estimates) -> Labels:
+def warnings_of(fit: Estimates) -> Sentences:
     """Return warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is not a number any more
@@ -223,7 +223,7 @@ class Fit(Estimates):
         return next(iter(self.warnings), "")
 
     @property
-    def warnings(self) -> Labels:
+    def warnings(self) -> Sentences:
         """Return all reasons to doubt estimates or intervals, the most serious first, one sentence each."""
         return warnings_of(self)
 

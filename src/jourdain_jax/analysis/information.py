@@ -37,7 +37,7 @@ from scipy.special import stdtrit
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described, largest, real_type
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.names import Labels, Sentences
 from jourdain_jax.scene.scene import Scene
 
 
@@ -172,7 +172,7 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
     return Vt[S > 1e-6]  # directions of held places alone are none
 
 
-def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Labels:
+def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Sentences:
     """Describe each undetermined direction in words. `directions`: orthonormal rows, each with changes of
     theta divided by the sizes of its entries; parts below `least_part` count as zero.
 

@@ -40,12 +40,12 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_op
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_names
+from jourdain_jax.scene.names import Labels, Sentences, UnknownNameError, as_names, check_names
 from jourdain_jax.scene.printing import Printed, table
 from jourdain_jax.scene.scene import Scene
 
 
-def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Labels:
+def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentences:
     """Return one sentence for each oddity of `checked` runs. Traced numbers are not examined. `repeats`:
     values have a leading axis, of which only the first entry is examined.
     """

@@ -24,7 +24,7 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.reals import Indices, Scalar, compiled_quickly, real_type
-from jourdain_jax.scene.names import Labels, check_name
+from jourdain_jax.scene.names import Labels, Sentences, check_name
 
 PerHanging = Float[Array, "hangings"]
 Values = dict[str, Scalar]
@@ -78,7 +78,7 @@ def _misses(readings: Readings) -> Labels:
     return tuple(f"miss {part}{k}" for part, numbers in readings.hangings.items() for k in numbers)
 
 
-def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Labels:
+def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sentences:
     """Return one sentence for each part whose plumb lines do not meet within their sigmas."""
     names, warnings = _misses(readings), []
     for part in readings.hangings:

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool
 
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.names import Labels, Sentences
 
 # name -> unit, meaning and sign, in the order of the paper's table; arrays of parameters keep this order
 PARAMETERS: dict[str, Mapping] = {field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")}
@@ -38,7 +38,7 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
     return broken
 
 
-def doubts(values: Mapping[str, float]) -> Labels:
+def doubts(values: Mapping[str, float]) -> Sentences:
     """Return one sentence for each oddity of a bicycle's values that does not prevent a simulation.
 
     A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the

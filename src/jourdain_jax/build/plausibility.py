@@ -34,7 +34,7 @@ from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import Cylinder, Sphere
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.names import Sentences
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
@@ -362,7 +362,7 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     return found
 
 
-def impossible_bodies(scene: Scene, q) -> Labels:
+def impossible_bodies(scene: Scene, q) -> Sentences:
     """Return one sentence for each body that no distribution of mass can make. Bodies without thickness whose
     other moments are zero are omitted.
 
@@ -377,7 +377,7 @@ def _weights(scene: Scene, q) -> Numbers:
     return {kind: of for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items() if kind in ("mass", "inertia")}
 
 
-def sentences(scene: Scene, numbers: Numbers, group: str) -> Labels:
+def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:
     """Return one sentence for each fault of a group of the table, about the first of the given states that
     shows it. Numbers that are not finite are reported as such only.
     """

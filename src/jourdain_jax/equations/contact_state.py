@@ -12,7 +12,6 @@ from jourdain_jax.equations.virtual_power import (
     ContactResponse,
     contact_modes,
     contact_response,
-    friction_of,
     switching_forces,
 )
 from jourdain_jax.scene.motion_state import Motion
@@ -40,8 +39,8 @@ class At:
         self.responses += (
             [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
         )
-        self.friction = friction_of(scene, motion)
         rows = switching_rows(scene, motion).values()
+        self.friction = jnp.stack([row.friction.sliding for row in rows])
         self.static = jnp.stack([row.friction.static for row in rows])
         self.restitution = jnp.stack([row.restitution for row in rows])
         self.impacts = [row.impact for row in rows]

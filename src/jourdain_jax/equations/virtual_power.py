@@ -247,14 +247,10 @@ def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coo
     return jnp.append(motion.qdot.array[: -len(turns)], turns)
 
 
-def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
-    """Coefficients of friction of the contacts that switch, while they slip."""
-    return jnp.stack([row.friction.sliding for row in switching_rows(scene, motion).values()])
-
-
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:
     """Return the forces of contacts in their modes, N."""
-    return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction_of(scene, motion))[:, 0]
+    friction = jnp.stack([row.friction.sliding for row in switching_rows(scene, motion).values()])
+    return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction)[:, 0]
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:

@@ -45,36 +45,46 @@ class WhippleBicycle(Scene):
     g: Parameter = parameter(9.81, unit="m/s^2", about="gravity")
     rR: Parameter = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
     mR: Parameter = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
-    IRxx: Parameter = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment "
-        "of inertia")
-    IRyy: Parameter = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of "
-        "inertia")
+    IRxx: Parameter = parameter(
+        0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia"
+    )
+    IRyy: Parameter = parameter(
+        0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia"
+    )
     xB: Parameter = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
     zB: Parameter = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
     mB: Parameter = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
-    IBxx: Parameter = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
-        "about x")
-    IByy: Parameter = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
-        "about y")
-    IBzz: Parameter = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia "
-        "about z")
+    IBxx: Parameter = parameter(
+        9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x"
+    )
+    IByy: Parameter = parameter(
+        11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y"
+    )
+    IBzz: Parameter = parameter(
+        2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z"
+    )
     IBxz: Parameter = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
     xH: Parameter = parameter(0.9, unit="m", about="fork centre of mass, forward")
     zH: Parameter = parameter(-0.7, unit="m", about="fork centre of mass, down")
     mH: Parameter = parameter(4.0, unit="kg", positive=True, about="fork mass")
-    IHxx: Parameter = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia "
-        "about x")
-    IHyy: Parameter = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about "
-        "y")
-    IHzz: Parameter = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia "
-        "about z")
+    IHxx: Parameter = parameter(
+        0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x"
+    )
+    IHyy: Parameter = parameter(
+        0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y"
+    )
+    IHzz: Parameter = parameter(
+        0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z"
+    )
     IHxz: Parameter = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
     rF: Parameter = parameter(0.35, unit="m", positive=True, about="front wheel radius")
     mF: Parameter = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
-    IFxx: Parameter = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral "
-        "moment of inertia")
-    IFyy: Parameter = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of "
-        "inertia")
+    IFxx: Parameter = parameter(
+        0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia"
+    )
+    IFyy: Parameter = parameter(
+        0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia"
+    )
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")

@@ -33,7 +33,7 @@ from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, Vect
 from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import found_before, once_per_values
-from jourdain_jax.scene.names import Labels, check_name
+from jourdain_jax.scene.names import Labels, Sentences, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -167,7 +167,7 @@ class Model(BuiltFor, Printed):
         return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 
     @property
-    def warnings(self) -> Labels:
+    def warnings(self) -> Sentences:
         """Sentences on points to check."""
         said, rows = [], self.rows
         if rows.rank_losses:

@@ -7,6 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 Labels = tuple[str, ...]
+Sentences = tuple[str, ...]  # for a reader
 
 
 class UnknownNameError(KeyError):

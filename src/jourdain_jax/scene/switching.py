@@ -43,6 +43,7 @@ class Switching:
     coordinates: Coordinates | None = None
     inputs: Names | None = None
     modes: Modes | None = None
+    rows: Labels = ()  # the contacts that are rows and hold up to a force
 
     @property
     def events(self) -> Labels:
@@ -119,4 +120,5 @@ def switching_of(scene) -> Switching:
         replace(own, names=Names((*own.names.entries, *directions), own.names.groups)),
         Names((*scene.inputs.entries, *names), scene.inputs.groups),
         Modes((*scene.modes.pairs, *names.items())),
+        tuple(name for name, modes in names.items() if modes == MODES_OF_ROW),
     )

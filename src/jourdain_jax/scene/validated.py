@@ -71,8 +71,7 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
         forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
         torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
         generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
-        potential=None if load.potential is None else checked_real(load.potential, "potential of "
-            f"{where}", ()),
+        potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
     )
     return Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
 
@@ -118,8 +117,9 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
 
 def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
     """Return the velocity rows that hold up to a force, by name."""
-    given = scene.velocity_constraints(motion)
-    return held_rows(given, loads_of(scene, motion))
+    if not scene.switching.rows:
+        return {}
+    return held_rows(scene.velocity_constraints(motion), loads_of(scene, motion))
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:

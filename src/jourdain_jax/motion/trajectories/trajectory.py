@@ -24,7 +24,7 @@ from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import Labels, UnknownNameError, check_name, nearest
+from jourdain_jax.scene.names import Labels, Sentences, UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import state_names
@@ -170,7 +170,7 @@ class Trajectory(Record, Printed):
 
     @property
     @of_known_numbers
-    def warnings(self) -> Labels:
+    def warnings(self) -> Sentences:
         """Return reasons to doubt the motion, the most serious first; empty if there are none. The printed
         summary shows them.
 
@@ -188,7 +188,7 @@ class Trajectory(Record, Printed):
         return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
 
     @property
-    def faults(self) -> Labels:
+    def faults(self) -> Sentences:
         """Return known causes of a failure, as texts for messages.
 
         Parameters that are not finite or have the wrong sign, otherwise impossible values of bodies, contacts
