@@ -142,6 +142,12 @@ def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> P
     return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(u_other)
 
 
+def projected(scene: Scene, t, q) -> Assembled:
+    """Return the configurations on the geometric constraints that are nearest to q; none is tried again."""
+    still, every = np.zeros((len(t), len(scene.speed_names.entries))), np.ones(len(t), bool)
+    return _AtStates(looked_at(scene), scene, t, q, still, np.zeros(len(scene.inputs)), every, tries=0).found
+
+
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
     """Return projected coordinates and speeds, and the accuracy of the coordinates."""
     at = _AtStates(looked_at(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))

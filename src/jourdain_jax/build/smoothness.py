@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import jax
 import numpy as np
 
-from jourdain_jax.build.probed_on_graph import looked_at
+from jourdain_jax.build.probed_on_graph import looked_at, projected
 from jourdain_jax.build.trace import named_values, owned
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.equations.listed import names_of_rows
@@ -61,7 +61,7 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
             found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = "
                 f"{sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
     # three kinks along coordinates make a look-up: a single one may lie where no motion comes
-    for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(q))).items():
+    for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(scene, q))).items():
         if count >= 3:
             found.setdefault(name, _said(scene, name, "at several places on its way"))
     return tuple(found.values())
@@ -87,15 +87,23 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([low, here]), np.column_stack([high, here])
 
 
-def _across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 48 intervals on each of 6 lines across the box that contains some states `q`, at random times.
+def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return intervals on 6 lines across the box that contains some states `q`, 48 on each, at random times.
+
+    The lines are projected onto the geometric constraints: elsewhere, as inside a body that others roll on, a
+    constraint may jump where no motion comes. An interval is omitted if an end does not arrive, or if its ends
+    arrive in different places.
     """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))
     points = ends[0] + np.linspace(0.0, 1.0, across + 1)[:, None, None] * (ends[1] - ends[0])
-    t = np.tile(generator.uniform(0.0, 1.0, lines), across)
-    a, b = (x.reshape(len(t), -1) for x in (points[:-1], points[1:]))
-    return np.column_stack([t, a]), np.column_stack([t, b])
+    t = np.tile(generator.uniform(0.0, 1.0, lines), across + 1)
+    found = projected(scene, t, points.reshape(len(t), -1))
+    on = np.column_stack([t, found.q]).reshape(across + 1, lines, -1)
+    far = np.linalg.norm(on[1:] - on[:-1], axis=2) > 4 * np.linalg.norm(points[1:] - points[:-1], axis=2)
+    good = found.on_rows.reshape(across + 1, lines)
+    near = good[1:] & good[:-1] & ~far
+    return on[:-1][near], on[1:][near]
 
 
 def _said(scene: Scene, what: str, where: str) -> str:
