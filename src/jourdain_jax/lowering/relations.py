@@ -180,8 +180,8 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], probes: Probes) -> Iterator:
     """Yield a function of a distance that returns states on either side of zeros of a number, and the
-    outputs; then the same with all decisions of relations whose numbers are not made of this one, nor it of
-    them. Nothing where probes have no zero between them.
+    outputs; then the same with all decisions of relations that this number does not decide: their numbers are
+    not made of it, nor it of them, and differ between its zeros. Nothing where probes have no zero between them.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
@@ -201,10 +201,12 @@ def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int],
     sides = [lambda aside: at(low - aside), lambda aside: at(high + aside)]
     yield lambda aside: [probes.with_inputs(side(aside)) for side in sides], outputs
     own, nodes = set(graph.reachable([number])), {n for n, _ in decided.get(number, ())}
+    zeros = probes.with_inputs(at(middle))
 
     def apart(other: int) -> bool:
         made_of, decides = graph.reachable([other]), (n for n, _ in decided[other])
-        return other != number and nodes.isdisjoint(made_of) and own.isdisjoint(decides)
+        apart_of_graph = other != number and nodes.isdisjoint(made_of) and own.isdisjoint(decides)
+        return apart_of_graph and (count == 1 or np.ptp(zeros([other])) > ASIDE * np.ptp(probes([other])))
 
     free = {k: graph.input(f"decision {k}", True) for k in decided if apart(k)}
     if not free:
