@@ -13,12 +13,12 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 464_691,
+    "code tokens of src": 464_745,
     "code tokens of docs": 11_431,
     "code tokens of notebooks": 7444,
     "caches": 49,
     "named numbers": 299,
-    "tests for a tracer": 59,
+    "tests for a tracer": 58,
     "functions with more than 8 parameters": 2,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,

@@ -323,9 +323,8 @@ def with_usual_promotion(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be
-# omitted: a first motion of a disc
-# from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
+# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be omitted: a first
+# motion of a disc from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
 _EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 
@@ -373,7 +372,8 @@ _AN_ARRAY = object()
 def _parted(tree) -> tuple[list, tuple]:
     """Split a tree into its arrays and the rest."""
     leaves, treedef = jax.tree.flatten(tree)
-    return [x for x in leaves if is_array_type(type(x))], (treedef, tuple([_AN_ARRAY if is_array_type(type(x)) else x for x in leaves]))
+    others = tuple([_AN_ARRAY if is_array_type(type(x)) else x for x in leaves])
+    return [x for x, other in zip(leaves, others, strict=True) if other is _AN_ARRAY], (treedef, others)
 
 
 def _whole(arrays, treedef, rest):

@@ -112,6 +112,7 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
     check_kind(near, Mapping | None, "`near`", 'a dictionary of coordinates: near={"z": -0.4}')
     t = one_time(t0)
+    _check_finite("t0", t)
     with model.standing_in:
         return named_start(model, {**(given or {}), **values}, t, inputs_at(model.inputs(inputs), t), near=near or {})
 
@@ -130,21 +131,28 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
                 raise ValueError(f"`near` names `{name}`, which is not a coordinate; "
                     f"{nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
-    if is_traced(q, u, t) or not (all_finite(q) and all_finite(u) and np.isfinite(t)):  # one look where all is known, and right
-        for name, value in {**near, **values, "t0": t}.items():
-            if not all_finite(known_numbers(value)):
-                raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it "
-                    "was computed")
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
     guess = Guess(q, u, *held)
 
+    def check_finite() -> None:
+        for name, value in {**near, **values}.items():
+            _check_finite(name, value)
+
     def guesses():
+        check_finite()
         known = structure_of(scene)
         return guesses_of(scene, known.coordinates[: known.random], q, guess.free_q)
 
     state = _consistent(scene, t, guess, inputs, guesses)
-    _check_residual(scene, guess, state, inputs, given)
+    if not (known_numbers(state.residual) < contradiction(q.dtype)).all():
+        check_finite()
+        _refuse(scene, guess, state, inputs, given)
     return _moved_if_near(model, state, inputs) if contradict else state
+
+
+def _check_finite(name: str, value) -> None:
+    if not all_finite(known_numbers(value)):
+        raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
@@ -184,9 +192,8 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
     return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
-def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> None:
-    if (known_numbers(state.residual) < contradiction(start.q.dtype)).all():
-        return
+def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> None:
+    """Raise a ValueError that says which constraint the state violates."""
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
     outside = np.flatnonzero(~np.asarray(start.inside(state.q)))

@@ -114,7 +114,7 @@ def _function(f: FunctionType, of) -> object:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))
 
-    named, around = (tuple(zip(names, map(read, look()), strict=True)) for names, look in names_of(f))
+    named, around = (tuple(zip(names, map(read, map(look, names)), strict=True)) for names, look in names_of(f))
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named

@@ -68,27 +68,26 @@ class NamesRead:
     def _look(self) -> None:
         content: list[tuple] = []
         looks: list[Callable] = []
-        seen: list = []
+        sources: dict[Callable, dict[str, None]] = {}  # the names to read by each: a module is read once for all functions
         functions: list[FunctionType] = []
         for root in self._roots:
             members = vars(root) if isinstance(root, type) else {"": root}
             looks.append(members.values)
-            seen += members.values()
             for name, member in list(members.items()):
                 content.append((name, _key_of(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     functions.append(f)
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`" if self._strict else ""
-                    for names, look in names_of(f):
-                        found = look()
-                        looks += [look] if names else []
-                        seen += found
+                    for names, read in names_of(f):
+                        found = [*map(read, names)]
+                        if names:
+                            sources.setdefault(read, {}).update(dict.fromkeys(names))
                         content += [(n, _key_of(x, n, where)) for n, x in zip(names, found, strict=True)]
                         functions += [x for x in found if isinstance(x, FunctionType)]
-        looks.append(lambda: [*map(attrgetter("__code__"), functions)])
-        codes = looks[-1]()
-        seen += codes
-        content.append(tuple(map(_Same, codes)))
+        looks += [partial(map, read, names) for read, names in sources.items()]
+        looks.append(partial(map, attrgetter("__code__"), functions))
+        seen = [x for look in looks for x in look()]
+        content.append(tuple(map(_Same, looks[-1]())))
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
         self._looks, self._seen = looks, seen  # last: what is refused now is refused at the next call, too
 
@@ -152,14 +151,14 @@ def _attribute(x, name: str):
         return None
 
 
-def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[], list]], ...]:
-    """Return the names that a function itself loads, with their sources: globals, and variables of enclosing
-    functions (None if not yet set).
+def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[str], Any]], ...]:
+    """Return the names that a function itself loads, each set with a function that reads one: globals, and
+    variables of enclosing functions (None if not yet set).
     """
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
     cells = {name: cell for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True) if name not in written}
-    return (own, lambda: [*map(f.__globals__.get, own)]), (tuple(cells), lambda: [_attribute(cell, "cell_contents") for cell in cells.values()])
+    return (own, f.__globals__.get), (tuple(cells), lambda name: _attribute(cells[name], "cell_contents"))
 
 
 @lru_cache(maxsize=4096)

@@ -273,18 +273,19 @@ def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
     """Store a value, or a vector of values, under `name`; return the names of its entries."""
-    if name not in names:
+    groups = [rest for group, *rest in names.groups if group == name]
+    if not groups and name not in names.entries:
         return []
     if type(value) is not float:
         checked_unless_traced(value, f"`{name}`", advice="give its value")
     shape = () if type(value) is float else np.shape(value)
-    if name in names.entries:
+    if not groups:
         if shape != ():
             raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use "
                 "`jax.vmap` or `rollout` for many")
         entries[names.entries.index(name)] = value
         return [name]
-    first, length = next(rest for group, *rest in names.groups if group == name)
+    ((first, length),) = groups
     if shape != (length,):
         raise ValueError(f"`{name}` was given an array of shape {shape}, expected ({length},)")
     entries[first : first + length] = [value[i] for i in range(length)]
