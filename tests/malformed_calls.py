@@ -239,14 +239,14 @@ IMPOSSIBLE = {
 }
 
 PLOTTED = {
-    "jj.plot([moved] * 2, 'heading', units={'heading': 'degrees'})": "`degrees` is no unit of the coordinate `heading` ... did you mean `deg`",
-    "jj.plot(moved, 'heading', units={'heading': 'deg/s'})": "`deg/s` is no unit of the coordinate `heading`",
-    "jj.plot(moved, 'heading', units={'heading_rate': 'deg'})": "`deg` is no unit of the speed `heading_rate`",
+    "jj.plot([moved] * 2, 'heading', units={'heading': 'degrees'})": "`degrees` is not a known unit of the coordinate `heading` ... did you mean `deg`",
+    "jj.plot(moved, 'heading', units={'heading': 'deg/s'})": "`deg/s` is not a known unit of the coordinate `heading`",
+    "jj.plot(moved, 'heading', units={'heading_rate': 'deg'})": "`deg` is not a known unit of the speed `heading_rate`",
     "jj.plot(moved, 'heading', units={'heding': 'deg'})": ("KeyError", "`units` names `heding` ... did you mean `heading`"),
     "jj.plot(moved, 'heading', units='deg')": "`units` is ... , expected a dictionary from names to units, such as {\"lean\": \"deg\"}",
-    "jj.plot([moved] * 2, 'heading', labels='one')": "`labels` is 'one', expected a list with one label for each of 2 motions",
-    "jj.plot([moved] * 2, 'heading', labels=['one'])": "expected a list with one label for each of 2 motions",
-    "jj.plot(moved, 'heading', bands=0.5)": "`bands` is 0.5, expected fractions of the lanes between 0 and 1",
+    "jj.plot([moved] * 2, 'heading', labels='one')": "`labels` is 'one', expected a list of 2 labels, one per motion",
+    "jj.plot([moved] * 2, 'heading', labels=['one'])": "expected a list of 2 labels, one per motion",
+    "jj.plot(moved, 'heading', bands=0.5)": "`bands` is 0.5, expected fractions between 0 and 1",
     "jj.plot(moved, 'heading', bands=(50,))": "`bands` is (50,), expected fractions",
     "jj.plot(moved, 'heading', axes=[None, None])": "`axes` holds 2 axes for 1 names, expected one for each of heading",
     "jj.plot([moved, sleigh], 'x')": "`plot` was given ... in place 1, expected a motion",

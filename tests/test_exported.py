@@ -48,7 +48,7 @@ def test_second_derivatives_are_exported():
 
 
 def test_an_exported_program_says_that_it_has_no_hessian():
-    with pytest.raises(jj.DifferentiationModeError, match="forward mode of forward mode"):
+    with pytest.raises(jj.DifferentiationModeError, match=r"use `jax.jacfwd\(jax.jacfwd"):
         _exported(jax.hessian(_total), 1.0)
 
 

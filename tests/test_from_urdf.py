@@ -233,7 +233,7 @@ WEIGHT = '<link name="c"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ix
 BAD = {
     "no-file": ("nowhere.urdf", r"nowhere.urdf: cannot be read \(No such file"),
     "no-path": (None, r"`path` is `None`, expected the path of a URDF file"),
-    "no-xml": ("<robot", r"is no XML"),
+    "no-xml": ("<robot", r"not valid XML"),
     "another-root": ("<mujoco/>", r"its root is `mujoco`, expected `robot`"),
     "xacro": ('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:property name="x"/></robot>', r"elements of xacro"),
     "no-links": ("<robot/>", r"it has no links"),

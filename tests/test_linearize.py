@@ -399,7 +399,7 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
     assert {text.get_text() for text in axis.get_legend().get_texts()} == {"unstable", "fold", "branch point", "eigenvalues meet or cross"}
     stable = jj.plot(straight, "x_rate", "rear_spin_rate")[1][0].lines[1].get_ydata()
     assert np.isfinite(stable).sum() == straight.stable.sum() > 0
-    with pytest.raises(ValueError, match="1 were given"):
+    with pytest.raises(ValueError, match="got 1 names"):
         jj.plot(turns, "lean")
 
 

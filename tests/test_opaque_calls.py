@@ -95,10 +95,10 @@ LAWS = {
     "iteration": (Acted(law=by_iteration, numbers=np.array([0.3])), "the operation `while`"),
     "recursion": (Acted(law=by_recursion, numbers=np.linspace(0.2, 0.5, 4)), "the operation `scan`"),
     "branches": (Acted(law=by_branches, numbers=np.array([0.3, -0.2])), "an integer that depends on the state"),
-    "network": (Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)), "a product of matrices with 1024 multiplications"),
-    "matrix": (Acted(law=by_matrix, numbers=np.array([2.0])), "a product of matrices with 39999 multiplications"),
+    "network": (Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)), "a matrix product with 1024 multiplications"),
+    "matrix": (Acted(law=by_matrix, numbers=np.array([2.0])), "a matrix product with 39999 multiplications"),
     "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
-    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a derivative of its own"),
+    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a custom derivative"),
 }
 SMOOTH_ENOUGH = ["table", "callback with a rule", "network", "recursion", "branches"]
 
@@ -126,7 +126,7 @@ def rates_of(scene):
 )
 def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law, kept):
     scene = Acted(law=law)
-    assert ["which has a derivative of its own" in call for call in jj.lower(scene).calls] == [True] * kept
+    assert ["which has a custom derivative" in call for call in jj.lower(scene).calls] == [True] * kept
     (by_program, dense), (q, y) = rates_of(scene), (jnp.zeros(3), jnp.zeros(2))
     first, second = ([jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)] for d in (jax.jacfwd, jax.hessian))
     assert_allclose(*first, rtol=1e-12, atol=1e-12)
@@ -216,7 +216,7 @@ class Mixed(OnCam):
 
 
 class Softly(OnCam):
-    """A bead on a ramp that begins softly, by a function with a derivative of its own."""
+    """A bead on a ramp that begins softly, by a function with a custom derivative."""
 
     def bodies(self, t, q):
         return {"bead": jj.Particle(self.mass, [q.x, 0.0, jax.nn.softplus(q.x)])}
@@ -224,7 +224,7 @@ class Softly(OnCam):
 
 @pytest.mark.parametrize(
     ("scene", "reason"),
-    [(Mixed(), "a product of matrices with 1600 multiplications"), (Softly(), "`logaddexp`, which has a derivative of its own,")],
+    [(Mixed(), "a matrix product with 1600 multiplications"), (Softly(), "`logaddexp`, which has a custom derivative,")],
     ids=["product", "rule"],
 )
 def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, reason):
@@ -272,7 +272,7 @@ def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources
     why = "the operation `while` has no scalar form: kept as a call; not to machine code: a part of it is kept as a call of JAX"
     assert said == f"a scalar program of {program.operations} operations; {why}"
     for printed in (program.python_source, program.c_source):
-        with pytest.raises(ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as text"):
+        with pytest.raises(ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as source"):
             printed()
 
 

@@ -98,7 +98,7 @@ WIDE = {
     "many": (FILE.replace("samples = 100", "samples = 1e30"), "`samples` is 1e+30, expected a whole number"),
     "long": (FILE.replace("samples = 100", "samples = 1" + "0" * 30), "expected a whole number of at least 1 and at most 9007199254740992"),
     "date": (FILE.replace("samples = 100", "samples = 2020-01-01"), "`samples` is datetime.date(2020, 1, 1), expected a whole number"),
-    "longer": (FILE.replace("samples = 100", "samples = 1" + "0" * 5000), "longer: is no TOML"),
+    "longer": (FILE.replace("samples = 100", "samples = 1" + "0" * 5000), "longer: not valid TOML"),
     "zero": (FILE + "\0", "zero: a binary file"),
     "latin": ("model = 'd\xefsc'", "latin: not UTF-8 text"),
 }

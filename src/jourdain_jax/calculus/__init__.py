@@ -1,1 +1,1 @@
-"""Mathematics without physics: rotations, pseudo-inverses, null spaces, guards on the mode of differentiation."""
+"""Mathematics without physics: rotations, matrices, roots, derivatives, scalar operations, files."""

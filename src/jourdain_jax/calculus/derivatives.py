@@ -1,19 +1,19 @@
-"""Functions with values from one computation and derivatives from another: from JAX, of an equivalent
-function, or from rules.
+"""Functions whose values and derivatives come from separate computations: an equivalent function or explicit
+rules.
 
-Derivatives of f(x) in both modes, to the second order, come from two functions that JAX differentiates forward:
+First and second derivatives of f(x) in both modes come from two functions that JAX differentiates forward:
 
     pushes   w -> f'(x) w                          pulls   g -> g f'(x)
     turns    v -> f''(x)(v, w)                     bends   v -> g f''(x)(., v)
 
-Pulls transpose pushes. As f'' is symmetric, bends along v transpose bends, and turns, whose w is that v. What f(x) is counts as a number at which these
-are taken, beside x: a derivative along x is the whole one.
+Pulls transpose pushes. Because f'' is symmetric, bends along v transpose bends, and they transpose turns
+along w = v. The maps depend on x and on f(x) as separate arguments; a derivative along x accounts for both.
 
-Each is a linear map: one function computes its values, another one those of its transpose. JAX meets such a
-map where a derivative was taken. Forward mode
-evaluates it, reverse mode transposes it, and neither traces what only the other one needs.
+Each is a linear map: one function computes its values, another the values of its transpose. Forward mode
+evaluates the map, reverse mode transposes it, and neither traces what only the other needs.
 
-A function and its rule of differentiation must agree on which results have lanes and where: JAX takes that from the one that it batches first.
+A function and its rule must agree on which results have a batch axis and where, because JAX assumes the
+layout of whichever is batched first.
 """
 
 import operator
@@ -34,57 +34,60 @@ from jourdain_jax.calculus.markers import lanes_first, lanes_of, with_lanes_firs
 from jourdain_jax.calculus.reals import with_usual_promotion
 
 SECOND_ORDER_MESSAGE = (
-    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which machine "
-    "code alone has; where XLA, dense matrices or a solver of diffrax integrate, take forward mode of "
-    "forward mode, `jax.jacfwd(jax.jacfwd(f))`"
+    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which only "
+        "machine code supports; with XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
 )
 THIRD_ORDER_MESSAGE = (
-    "`simulate` was differentiated three times, and not in forward mode alone; pass backend='xla' and take "
-    "forward mode of any order, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
+    "`simulate` was differentiated three times, not in forward mode alone; pass backend='xla' and use "
+        "forward mode, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
 )
 
 
 class DifferentiationModeError(TypeError):
     """A motion has no derivative of the requested mode and order; the text names a supported one.
 
-    Raised where the derivative is taken, evaluated or compiled; and by functions that need numbers, such as `fit`, inside `jit`, `vmap` or a derivative.
+    Raised where the derivative is taken, evaluated or compiled, and by functions that need concrete numbers,
+    such as `fit`, inside `jit`, `vmap` or a derivative.
     """
 
 
 class OtherDeviceError(RuntimeError):
-    """Raised where machine code would become part of a program for another process, or for a device without machine code."""
+    """Raised if machine code would become part of a program for another process or for an unsupported device.
+    """
 
     def __init__(self, program: str) -> None:
-        super().__init__(f'machine code of this process cannot be part of a program {program}; give '
-            '`backend="xla"` to `jj.simulate`, or to `jj.build`')
+        super().__init__(f"machine code of this process cannot be part of a program {program}; pass "
+            '`backend="xla"` to `jj.simulate` or `jj.build`')
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """A linear map between arrays that depends on other arrays, `at`."""
+    """Linear map between arrays that depends on other arrays, `at`."""
 
     apply: Callable[[Sequence, Sequence], list]  # (at, arrays)
-    shapes: Sequence[jax.ShapeDtypeStruct]  # of its values
-    transposed: Callable[[], "LinearMap"] | None = None  # at the same; None: an error says that this is no derivative of the first two orders
-    along: Callable[[list[int]], Optional["LinearMap"]] = lambda _: None  # those of `at` that change -> derivative, also at the arrays; None: JAX's
+    shapes: Sequence[jax.ShapeDtypeStruct]  # shapes of its values
+    # at the same point; None: raises an error, as beyond second order
+    transposed: Callable[[], "LinearMap"] | None = None
+    # (indices of `at` that change) -> derivative, which also depends on the arrays; None: use JAX's
+    along: Callable[[list[int]], Optional["LinearMap"]] = lambda _: None
 
     def __call__(self, at: Sequence, arrays: Sequence) -> list:
-        """Its values."""
+        """Return the values of the map."""
         return linear_map_p.bind(*at, *arrays, linear=self, count=len(at))
 
 
 def shapes(arrays: Sequence) -> list[jax.ShapeDtypeStruct]:
-    """Return shapes of arrays, with their types."""
+    """Return the shapes and types of arrays."""
     return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
 
 
 def no_further(*_):
-    """Tells that there is no such third derivative."""
+    """Raise the error for an unsupported third derivative."""
     raise DifferentiationModeError(THIRD_ORDER_MESSAGE)
 
 
 def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
-    """Return the values, with new ones at some places."""
+    """Return the values with new ones at some indices."""
     found = list(values)
     for i, x in zip(which, new, strict=True):
         found[i] = x
@@ -92,9 +95,7 @@ def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
 
 
 def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
-    """Return the derivative of a map with respect to the first `count` arrays of its arguments, in forward
-    mode.
-    """
+    """Return the forward derivative of a map with respect to some of its first `count` arguments."""
 
     def pushed(at, arrays):
         return jax.jvp(lambda *new: own.apply(put(at[:count], which, new), at[count:]), tuple(at[i] for i in which), tuple(arrays))[1]
@@ -103,9 +104,7 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """Return the derivative for a batch. Each argument has its batch axis at the stated place; tangents have
-    it first.
-    """
+    """Return the map for a batch. `axes`: batch axis of each array of `at`; tangents have it first."""
     transposed = own.transposed
 
     def along(which: list[int]) -> LinearMap | None:
@@ -121,8 +120,8 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
 
 
 def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
-    """Return a second derivative for arrays whose lanes lie along these axes, or that all lanes share, from
-    one for arrays with lanes first.
+    """Return a second derivative with batch axes at the given places (None: shared by all samples), from one
+    with the batch axis first.
     """
     transposed = own.transposed
 
@@ -177,19 +176,24 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """A linear map for forward and reverse mode. Its argument has the form of `leaves`, its value the form of
-    `found`, with numbers at the `places`.
+    """Linear map for both modes of differentiation. Its argument has the form of `leaves`, its value the form
+    of `found`, with real numbers at the `places`.
     """
 
-    rates: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves and of their tangents: tangents of numbers
-    pulled: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves, of what is found, and of cotangents of numbers: those of the leaves
-    reason_against_second: Callable[[list[int]], str]  # which leaves move -> why JAX does not differentiate `pulled`, in words; empty where it does
+    # indices of moving leaves -> function of the leaves and their tangents that returns tangents of the
+    # numbers
+    rates: Callable[[list[int]], Callable]
+    # indices of moving leaves -> function of leaves, results and cotangents of the numbers that returns
+    # cotangents of the leaves
+    pulled: Callable[[list[int]], Callable]
+    # indices of moving leaves -> why JAX cannot differentiate `pulled`; empty if it can
+    reason_against_second: Callable[[list[int]], str]
     leaves: Sequence[jax.ShapeDtypeStruct]
     found: Sequence[jax.ShapeDtypeStruct]
     places: list[int]
 
     def pushes(self, moving: list[int]) -> LinearMap:
-        """Return the map of tangents of leaves, at the leaves and the result."""
+        """Return the map of tangents of the leaves, at the leaves and the result."""
 
         def pushed(at, along):
             return self.rates(moving)(list(at[: len(self.leaves)]), *along)
@@ -239,13 +243,16 @@ class Rules(NamedTuple):
     not apply raises an error with the reason.
     """
 
-    push: Callable  # (arguments, tangents): the result and its tangents; JAX differentiates it forward
-    pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; JAX differentiates it forward
-    reason_against_second: Callable[..., str] = lambda *_: ""  # (*perturbed): why JAX does not differentiate `pull`, in words; empty where it does
+    push: Callable  # (arguments, tangents) -> result and its tangents; JAX differentiates it forward
+    # (perturbed, arguments, result, cotangents) -> cotangents of the arguments that vary; JAX differentiates
+    # it forward
+    pull: Callable
+    # (*perturbed) -> why JAX cannot differentiate `pull`; empty if it can
+    reason_against_second: Callable[..., str] = lambda *_: ""
 
 
 class _Leaves(NamedTuple):
-    """The arguments of a function, split into arrays and the rest."""
+    """Arguments of a function, split into arrays and the rest."""
 
     treedef: jax.tree_util.PyTreeDef
     rest: tuple
@@ -262,7 +269,7 @@ def _parted(arguments: tuple) -> tuple[list, _Leaves]:
 
 
 def is_zero(tangent) -> bool:
-    """Return whether a tangent is zero, as for a rule with symbolic zeros."""
+    """Return whether a tangent is zero, as passed to a rule with symbolic zeros."""
     return isinstance(tangent, SymbolicZero) or tangent.dtype == jax.dtypes.float0
 
 
@@ -272,8 +279,8 @@ def filled(tangent):
 
 
 def _with_rates(run: Callable, rates: Callable) -> Callable:
-    """Return `run` with a derivative. `rates`: (arguments as leaves, leaves, which of them move, how, result)
-    -> tangents of the result.
+    """Return `run` with a derivative. `rates`: (structure of the arguments, leaves, indices of moving leaves,
+    tangents, result) -> tangents of the result.
     """
 
     def called(*arguments):
@@ -295,7 +302,7 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
     """Return `run` with the derivatives of `differentiable`, which computes the same values and can be
     differentiated by JAX.
 
-    Both take trees of arrays and of other objects, and return trees of arrays.
+    Both take trees of arrays and other objects, and return trees of arrays.
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
@@ -305,7 +312,7 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
 
 
 def pushed_by_jax(run: Callable) -> Callable:
-    """Return the `push` of a function that JAX differentiates forward."""
+    """Return the `push` rule of a function that JAX differentiates forward."""
 
     def push(arguments: tuple, tangents: tuple):
         moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
@@ -315,10 +322,10 @@ def pushed_by_jax(run: Callable) -> Callable:
 
 
 def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -> Callable:
-    """Return `forward`, which JAX differentiates in forward mode, with the reverse mode of `reverse`, which
-    computes the same values.
+    """Return `forward`, differentiated by JAX in forward mode, with the reverse mode of the equivalent
+    `reverse`.
 
-    `reason_against_second`: why there is no second derivative with reverse mode, in words.
+    `reason_against_second`: why there is no second derivative with reverse mode.
     """
 
     def pull(perturbed: tuple, arguments: tuple, found, g):
@@ -330,10 +337,9 @@ def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -
 
 
 def with_rules(run: Callable, rules: Rules) -> Callable:
-    """Return `run`, which JAX cannot differentiate, with derivatives by rules, for forward and reverse mode
-    and to the second order.
+    """Return `run`, which JAX cannot differentiate, with derivatives by rules: both modes, to second order.
 
-    It takes trees of arrays and of other objects, and returns trees of arrays.
+    It takes trees of arrays and other objects, and returns trees of arrays.
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
@@ -346,15 +352,15 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
             return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
 
         def pulled(moving: list[int]) -> Callable:
-            """Return cotangents of the moving leaves, as a function of the leaves, the result and the
-            cotangents of its numbers.
+            """Return cotangents of the moving leaves as a function of leaves, result and cotangents of its
+            numbers.
             """
             varies = perturbed(moving)
 
             def cotangents(leaves, ends, given):
                 g = jax.tree.unflatten(structure, put([None] * len(ends), places, given))
                 by_rules = rules.pull(varies, of.whole(leaves), jax.tree.unflatten(structure, ends), g)
-                return jax.tree.leaves(eqx.filter(by_rules, varies))  # rules may give more
+                return jax.tree.leaves(eqx.filter(by_rules, varies))  # rules may return more
 
             return cotangents
 
@@ -368,7 +374,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 
 
 def _without_gaps(found, rates: list):
-    """Return the tangents of the whole result, given those of its numbers."""
+    """Return the tangents of the whole result from the tangents of its numbers."""
     left = iter(rates)
     return jax.tree.map(lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found)
 

@@ -1,4 +1,4 @@
-"""Figures by matplotlib within HTML."""
+"""Matplotlib figures within HTML."""
 
 import base64
 import html
@@ -14,8 +14,8 @@ DATA, MODEL, QUIET = "#d1495b", "#1b4f72", "#888888"
 
 
 def figure(draw: Callable[[Any], None], width: float, height: float, caption: str = "") -> str:
-    """Return HTML of the matplotlib figure that `draw` fills, `width` by `height` pixels; a sentence if
-    matplotlib is not installed.
+    """Return HTML of the matplotlib figure that `draw` fills, `width` by `height` pixels, or of the error
+    message if matplotlib is missing.
     """
     try:
         # a pixel of a page is 1/96 inch

@@ -1,10 +1,10 @@
-"""Reading files of others (limited in size, nested, with numbers as text), and writing our own, which are
-whole or absent.
+"""Reading of foreign files with limits on size, nesting and numbers, and atomic writing of this package's
+files.
 
-Every fault of what others wrote is a ValueError that names its source: the path of a file, with a line or an element where that is known.
+Any fault in a foreign file raises a ValueError that names the path and, if known, the line or element.
 
-Our own are written beside their place under another name and moved there in one step. A process that is killed leaves files whole. A machine that loses power
-may leave torn ones, unless the writer waits until they are on the disk.
+Files are written under a temporary name and renamed in one step, so a killed process never leaves a partial
+file. After a power failure files may be incomplete unless `write_whole` waits for the disk.
 """
 
 import contextlib
@@ -21,13 +21,13 @@ from typing import BinaryIO
 from jourdain_jax.calculus.reals import described
 
 FilePath = str | os.PathLike
-DEEPEST = 250  # levels of what is nested: a chain of so many bodies, as elements of MJCF
+DEEPEST = 250  # maximum nesting depth: bodies of a chain, as elements of MJCF
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
 
 def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
-    """Return the content of the file `path`, at most `limit` bytes; `what`: its kind, for the error, such as
-    "a URDF file".
+    """Return the content of the file `path`, at most `limit` bytes. `what`: kind of file for error messages,
+    such as "a URDF file".
     """
     with opened(path, what) as file:
         content = file.read(limit + 1)
@@ -38,20 +38,20 @@ def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
 
 @contextlib.contextmanager
 def opened(path: FilePath, what: str) -> Iterator[BinaryIO]:
-    """Open the file `path` for reading; `what` as of `read_bytes`. ValueError where it cannot be read, or no
-    path is given.
+    """Open the file `path` for reading; `what` as in `read_bytes`. Raises ValueError if it cannot be read or
+    `path` is not a path.
     """
     try:
         with open(name_of(path), "rb") as file:
             yield file
     except OSError as error:
         said = error.strerror or type(error).__name__
-        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of "
+        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); pass the path of "
             f"{what}{_near(Path(path), error)}") from None
 
 
 def name_of(path) -> str:
-    """Return the path of a file or folder as a text; a ValueError where it is none."""
+    """Return the path of a file or folder as a string. Raises ValueError if it is not a path."""
     try:
         found = os.fsencode(path)
     except (TypeError, UnicodeError):
@@ -63,7 +63,7 @@ def name_of(path) -> str:
 
 
 def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
-    """Return the text of the file `path`, which must be UTF-8 without zero bytes; arguments as of
+    """Return the text of the file `path`, which must be UTF-8 without zero bytes; arguments as in
     `read_bytes`.
     """
     content = read_bytes(path, limit, what)
@@ -78,10 +78,10 @@ def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
 
 
 def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> float:
-    """Convert `text` to a number: ASCII digits, a point, an exponent; with `finite=False` also inf and nan.
+    """Convert `text` (ASCII digits, point, exponent) to a number; with `finite=False` also inf and nan.
 
-    `what`: source and name of the number, for the error; `advice`: the end of the message. Digits in groups
-    (`1_0`) and digits of other scripts are refused.
+    `what`: source and name of the number for error messages; `advice`: end of the message. Raises ValueError
+    also for grouped digits (`1_0`) and digits of other scripts.
     """
     plain = text.strip(" \t\r\n")
     value = float(plain) if _NUMBER.fullmatch(plain) else None
@@ -93,7 +93,7 @@ def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> fl
 
 
 def whole_number(text: str, what: str, high: int) -> int:
-    """Return the whole number from 1 to `high` in `text`; `what` as in `number`."""
+    """Return the integer from 1 to `high` in `text`; `what` as in `number`."""
     plain = text.strip(" \t\r\n")
     if not re.fullmatch(r"[+-]?\d{1,30}", plain, re.ASCII) or not 1 <= int(plain) <= high:
         raise ValueError(f"{what} is `{shortened(plain)}`, expected a whole number from 1 to {high}")
@@ -101,20 +101,20 @@ def whole_number(text: str, what: str, high: int) -> int:
 
 
 def parsed(parse: Callable, content, source: str, what: str):
-    """Return the result of `parse` on the content of `source`. Any error of a parser (for XML a SyntaxError,
-    for archives half a dozen kinds) becomes a ValueError that names the source and `what` was expected.
+    """Return `parse(content)`. Any error of the parser becomes a ValueError that names the source and the
+    expected format `what`.
     """
     try:
         return parse(content)
     except RecursionError:
         raise _too_deep(source) from None
     except Exception as error:
-        raise ValueError(f"{source}: is no {what} "
+        raise ValueError(f"{source}: not valid {what} "
             f"({shortened(error, 200) or type(error).__name__})") from None
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
-    """Raise a ValueError for nesting deeper than `DEEPEST`. `inner`: value -> its inner values."""
+    """Raise a ValueError for nesting deeper than `DEEPEST`. `inner` returns the inner values of a value."""
     level = [root]
     for _ in range(DEEPEST):
         level = [thing for holder in level for thing in inner(holder)]
@@ -124,7 +124,7 @@ def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
 
 
 def shortened(text: object, length: int = 60) -> str:
-    """Return a text of others for an error, of at most `length` letters."""
+    """Return foreign text truncated for an error message."""
     text = str(text)
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
@@ -134,7 +134,7 @@ def _too_deep(source: str) -> ValueError:
 
 
 def _near(path: Path, error: Exception) -> str:
-    """Return the nearest name in the folder, where the file is missing."""
+    """Return a suggestion for a missing file: the nearest name in its folder."""
     found: list[str] = []
     with contextlib.suppress(OSError):
         if isinstance(error, FileNotFoundError):
@@ -142,28 +142,28 @@ def _near(path: Path, error: Exception) -> str:
     return f". Did you mean `{found[0]}`?" if found else ""
 
 
-_BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for every one that is a line feed
+_BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes a line feed as two bytes
 
 
 def check_place(path: FilePath) -> None:
-    """Raise ValueError where no file can be written at `path`: its folder does not exist, or it is a folder.
+    """Raise ValueError if no file can be written at `path`: its folder is missing, or it is a folder itself.
     """
     place = name_of(path)
     folder = os.path.dirname(place) or "."
     try:
         if not os.path.basename(place) or stat.S_ISDIR(os.stat(place).st_mode):
-            raise ValueError(f"cannot write `{place}`: it is a folder; give the name of a file in it")
+            raise ValueError(f"cannot write `{place}`: it is a folder; pass the name of a file in it")
     except FileNotFoundError:
         if not os.path.isdir(folder):
-            said = f"cannot write `{place}`: there is no folder `{folder}`; make it first"
+            said = f"cannot write `{place}`: there is no folder `{folder}`; create it first"
             raise ValueError(said) from None
     except OSError as error:
         raise ValueError(f"cannot write `{shortened(place, 300)}`: {error.strerror}") from None
 
 
 def write_whole(path: FilePath, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:
-    """Write a file with this `content` to `path` as a whole; `wait`: until it is on the disk; `mode`: its
-    permissions, as of `open`.
+    """Write `content` to `path` atomically. `wait`: return only when it is on the disk; `mode`: permissions
+    as in `open`.
     """
     path = Path(path)
     beside = f"{path.parent}/.{path.name[:200]}.{secrets.token_hex(8)}"

@@ -1,4 +1,4 @@
-"""Analysis of traced programs: operations that results need, targets of calls, and loops."""
+"""Analysis of jaxprs: evaluation, dead code, inner functions and loops."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -8,14 +8,14 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
 LOOPS = ("while", "scan")
-# Where an operation that only calls a function keeps it, by the name of the operation.
+# Parameter that holds the called function, by name of the primitive.
 _CALLS = dict.fromkeys(("jit", "pjit", "remat", "remat2", "checkpoint"), "jaxpr")
 _CALLS |= dict.fromkeys(("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
 
 
 def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, number: Callable = lambda x, aval: np.asarray(x, aval.dtype)) -> list:
-    """Return outputs at the given arguments: `results(equation, inputs)` evaluates one operation, `number(x,
-    aval)` a constant.
+    """Evaluate a jaxpr. `results(equation, inputs)` evaluates one equation, `number(x, aval)` converts a
+    constant.
     """
     jaxpr = closed.jaxpr
     values = {v: number(x, v.aval) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
@@ -29,8 +29,8 @@ def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, numbe
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """Return `closed` with only the operations that its `outputs` need (by index, in order; default: all),
-    also inside calls.
+    """Return `closed` reduced to the equations that its `outputs` need, also inside calls (`outputs`:
+    indices; default: all).
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
@@ -38,9 +38,7 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
-    """Return the function that an operation of this name calls, if the operation does nothing else; None for
-    other operations.
-    """
+    """Return the function called by a primitive that only calls a function; None for other primitives."""
     if name not in _CALLS:
         return None
     found = params[_CALLS[name]]
@@ -48,10 +46,10 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 
 
 def parts_of_scan(equation) -> tuple[int, int]:
-    """Return the numbers of constant and of carried inputs of a scan. These inputs have the same axes inside
-    the body as outside; all others have one axis less inside.
+    """Return the numbers of constant and of carried inputs of a scan.
 
-    The names of these parameters differ between versions of JAX.
+    They are counted by rank, because parameter names differ between versions of JAX: only scanned inputs lose
+    an axis inside the body.
     """
     body = equation.params["jaxpr"].jaxpr
     whole, carried = (
@@ -61,17 +59,17 @@ def parts_of_scan(equation) -> tuple[int, int]:
 
 
 def is_jaxpr(x) -> bool:
-    """Return whether this is a traced function, closed or not."""
+    """Return whether `x` is a jaxpr, closed or open."""
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
 def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
-    """Return the traced functions among the parameters of an operation."""
+    """Return the jaxprs among the parameters of a primitive."""
     return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(params.values()), is_leaf=is_jaxpr) if is_jaxpr(x)]
 
 
 def loops(jaxpr: Jaxpr) -> Iterator[str]:
-    """Return the names of its loops, in order, also inside calls."""
+    """Yield the names of all loops in order, also inside calls."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in LOOPS:
             yield equation.primitive.name

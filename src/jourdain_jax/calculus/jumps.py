@@ -1,5 +1,5 @@
-"""Jumps of functions along a line: intervals with differing end values are halved until the difference
-vanishes or is a jump.
+"""Jumps of functions along a line. Intervals with differing end values are bisected until the difference
+either vanishes or proves to be a jump.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,16 +12,16 @@ from jaxtyping import Float
 def jumps(
     values: Callable[[np.ndarray], np.ndarray], a: Float[np.ndarray, "intervals variables"], b: Float[np.ndarray, "intervals variables"]
 ) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
-    """Return, for every interval from `a` to `b` that holds a jump, the entry that jumps most and the points
-    before and behind the jump.
+    """Yield, for every interval from `a` to `b` with a jump, the entry that jumps most and the points just
+    before and after.
 
-    `values`: of many points, (points, entries).
+    `values`: maps points (points, variables) to (points, entries).
     """
     least, floor = (1e-2, 1e-3) if jnp.result_type(float) == jnp.float32 else (1e-6, 1e-9)
     at_a, at_b = values(a), values(b)
     largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
     size = np.maximum(largest, floor * np.max(largest, initial=0.0)) + np.finfo(largest.dtype).tiny
-    # 24 halvings after which a smooth function shows no jump that counts, 48 after which an interval has no width
+    # after 24 bisections a smooth function shows no relevant jump, after 48 an interval has no width
     for turn in range(48):
         middle = (a + b) / 2
         at_middle = values(middle)
@@ -37,7 +37,7 @@ def jumps(
 
 
 def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return differences of entries, relative to their sizes."""
+    """Return differences of entries relative to their sizes."""
     with np.errstate(invalid="ignore", over="ignore"):
         difference = np.abs(b - a) / size
     return np.where(np.isfinite(difference), difference, 0.0)

@@ -1,16 +1,21 @@
-"""Markers: operations of JAX that change no number, and act where they are batched or differentiated.
+"""Markers: JAX primitives that return their operands unchanged and act when batched or differentiated.
 
-`lanes_first` puts the lanes of `vmap` first, and `entries_of` last. Taps, which act outside of `jit` only, call a Python function with the derivatives that
-pass through them: no compiled program calls back to Python. Between `entered` and `left`, derivatives are NaN where a computation failed, and zero where
-nobody asks for what it found: `jnp.where(failed, nan, x)` has derivatives of zero where it is NaN, which pass for those of a minimum; and
-what was computed from numbers that are lost has derivatives such as 0 NaN, also where it is omitted.
-A computation y(x) in between has, with a zero that counts the derivatives that enter,
+`lanes_first` moves the batch axis of `vmap` to the front, `entries_of` to the end. `tap_tangents` and
+`tap_cotangents` pass derivatives to a Python function; they act only outside `jit`, so no compiled program
+calls Python.
+
+Between `entered` and `left`, derivatives are NaN where a computation failed, and zero where the failed result
+is not used. Plain `jnp.where(failed, nan, x)` would fail on both: its derivative is zero where it is NaN, as
+if at a minimum, and omitted values contribute derivatives such as 0 NaN.
+
+For a computation y(x) in between, with a zero that counts the incoming derivatives,
 
     forward     dy = NaN where y failed and any dx is not zero
-    reverse     dx = 0 where no dy is requested, NaN where one that failed is
+    reverse     dx = 0 where no dy is requested, NaN where the dy of a failed y is
 
-Both count as linear maps, whose own derivatives are such maps. In reverse mode of these, cotangents come to x
-past `left`, by what the first derivative was taken at: therefore that zero counts as such, too.
+Both are linear maps whose derivatives are maps of the same kind. In their reverse mode, cotangents reach x
+without passing `left`, through the point at which the first derivative was taken. That zero therefore counts
+as such a point, too.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,8 +33,8 @@ from jourdain_jax.calculus.reals import Flag, Scalar
 
 
 def identity(name: str) -> Primitive:
-    """Return a primitive `name` that returns several arrays unchanged and may have parameters. Under `vmap`
-    their batch axes stay in place. It has no derivative yet.
+    """Return a primitive `name` that returns several arrays unchanged, with optional parameters and batch
+    axes kept in place. It has no derivative yet.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -41,8 +46,8 @@ def identity(name: str) -> Primitive:
 
 
 def lanes_first(tree):
-    """Return the tree unchanged; under `vmap` the axis of lanes of all its arrays becomes the first. Values
-    without a tangent space pass through.
+    """Return the tree unchanged, except that under `vmap` the batch axis of every array becomes the first.
+    Values without a tangent space pass through.
     """
     leaves, treedef = jax.tree.flatten(tree)
     moved = [i for i, x in enumerate(leaves) if x.dtype != jax.dtypes.float0]
@@ -52,8 +57,8 @@ def lanes_first(tree):
 
 
 def lanes_of(values, axes) -> int:
-    """Return the size of the batch, from the batch axes that JAX gives to a batching rule. An array without a
-    batch has None.
+    """Return the batch size from the axes that JAX passes to a batching rule (None for an array without a
+    batch axis).
     """
     return next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
 
@@ -78,8 +83,8 @@ def entries_of(v: Shaped[Array, "entries *rest"]) -> tuple[Shaped[Array, "*rest"
     """Split a vector into scalars, with the batch axis last. With the batch axis first, XLA would compile one
     slice per entry.
 
-    Measured, for 111 entries of 26 lanes that are reassembled: 1.3 to 1.8 s of compilation with lanes first,
-    0.05 s with lanes last.
+    Measured for 111 entries of a batch of 26: 1.3 to 1.8 s of compilation with the batch axis first, 0.05 s
+    with it last.
     """
     return tuple(_entries_p.bind(v))
 
@@ -126,7 +131,7 @@ def _seen(*tangents, look: Callable):
 
 
 def _seen_in_batch(tangents, dims, *, look: Callable):
-    """Several directions at once, of `jacfwd`."""
+    """Process several directions at once, from `jacfwd`."""
     if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
         look([np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0) for x, dim in zip(tangents, dims, strict=True)])
     return list(tangents), dims
@@ -140,38 +145,38 @@ ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p
 
 
 def tap_tangents(values: tuple, look: Callable) -> tuple:
-    """Return `values`, a tuple of arrays. When they are differentiated in forward mode with known numbers,
-    `look` is called with their tangents, which have a leading axis of directions.
+    """Return `values`, a tuple of arrays. Forward-mode differentiation with concrete numbers calls `look`
+    with their tangents, which have a leading axis of directions.
     """
     return tuple(_forwards_p.bind(*values, look=look))
 
 
 def tap_cotangents(values: tuple, look: Callable) -> tuple:
-    """Return `values`, a tuple of arrays. When they are differentiated in reverse mode with known numbers,
-    `look` is called with their cotangents.
+    """Return `values`, a tuple of arrays. Reverse-mode differentiation with concrete numbers calls `look`
+    with their cotangents.
     """
     return tuple(_shown_p.bind(*values, look=look))
 
 
 @jax.custom_jvp
 def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
-    """These arrays, and the zero to be handed to `left`."""
+    """Return these arrays and the zero to pass to `left`."""
     *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
     return each, asked
 
 
 @jax.custom_jvp
 def left(asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]) -> list[Array]:
-    """Return `each` of some arrays, whose lanes may have `failed`, along its first axes; `asked`: the zero
-    that was added to the inputs.
+    """Return `each` of some arrays. `failed` marks failed samples along their first axes; `asked` is the zero
+    from `entered`.
     """
     return lanes_first([*each, *failed, asked])[: len(each)]
 
 
 @jnp.vectorize
 def nan_where(failed: Flag, x: Scalar) -> Scalar:
-    """Return `x`, with NaN in values and derivatives where `failed` is true. Derivatives that are
-    structurally zero stay zero.
+    """Return `x`, with NaN in values and derivatives where `failed` is true. Structurally zero derivatives
+    stay zero.
     """
     (x,), asked = entered(x)
     return left(asked, [failed], [x + jnp.where(failed, jnp.nan, 0.0)])[0]
@@ -197,8 +202,8 @@ def _leaving(primals, tangents):
     return left(*primals), list(map(lost, failed, each, rates))
 
 
-# The maps, by NumPy or JAX's NumPy as `m`. Numbers of a lane are those after the leading axes of lanes; `before`:
-# what was counted where this is the derivative of a derivative.
+# The maps, with NumPy or jax.numpy as `m`. `lanes` is the number of leading batch axes; `before` is the
+# earlier count in a derivative of a derivative.
 
 
 def _any(m, x, lanes):
@@ -206,7 +211,7 @@ def _any(m, x, lanes):
 
 
 def _over(counts, x):
-    """Return the batch sizes beside these numbers."""
+    """Return the counts, shaped to broadcast over x."""
     count = sum(map(abs, counts))
     return count.reshape((*count.shape, *[1] * (x.ndim - count.ndim)))
 
@@ -253,7 +258,7 @@ def _lost_and_counted_back(cotangents, failed, asked, x, *, lanes):
 
 
 def _map(function: Callable, back: Callable, at: int) -> Primitive:
-    """Return a map as a primitive of JAX that is linear in all arrays except the first `at`; `back`: its
+    """Return a map as a JAX primitive that is linear in all arrays except the first `at`; `back`: its
     transpose.
     """
     p = Primitive(f"jourdain_nan{function.__name__}")
@@ -269,7 +274,7 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
 
     def pushed(primals, tangents, *, lanes):
         taken_at = list(primals[:at])
-        if function in (_masked, _lost):  # the last is what was counted before
+        if function in (_masked, _lost):  # the last of these is the earlier count
             taken_at[-1] = jnp.abs(taken_at[-1]) + jnp.abs(primals[-2])
         along = map(ad.instantiate_zeros, tangents[at:])
         return p.bind(*primals, lanes=lanes), p.bind(*taken_at, *along, lanes=lanes)

@@ -1,16 +1,19 @@
-"""The truncated pseudo-inverse, and orthonormal bases of the null space of a wide matrix, with derivatives
-that are exact where the rank is constant.
+"""Truncated pseudo-inverse, and orthonormal null-space bases of wide matrices, with exact derivatives at
+constant rank.
 
     dA+ = -A+ dA A+  +  A+ A+' dA' (1 - A A+)  +  (1 - A+ A) dA' A+' A+
     A Z = 0,   dZ = -A+ dA Z
 
-Source of the first: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. (4.12). Differentiating the factorisation itself
-divides by differences of singular values, which are equal for the orthonormal rows of rolling and skating.
+The first is from G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. (4.12). Differentiating the
+factorisation would divide by differences of singular values, which are zero for the orthonormal rows of
+rolling and skating.
 
-The second leaves out the rotation of the basis within the null space (its gauge), which LAPACK chooses as it likes; results that do
-not change under Z -> Z R never see it. It is wrong for Z itself: do not let a basis leave the function that uses it.
-To keep shapes static where the rank is not known in advance, a basis has as many columns as `A`; the columns that are not in
-the null space are zero, and `present` says which are.
+The second omits the rotation of the basis within the null space (its gauge), which LAPACK chooses
+arbitrarily. Results that are invariant under Z -> Z R do not depend on it, but the derivative of Z itself is
+wrong: do not let a basis leave the function that uses it.
+
+For static shapes, a basis has as many columns as `A`. Columns outside the null space are zero, and `present`
+identifies the others.
 """
 
 from functools import partial
@@ -24,15 +27,14 @@ from jourdain_jax.calculus.reals import Count, rank_cutoff, with_usual_promotion
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
-    """Return the Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.
-
-    Differentiable to any order in forward and reverse mode where the rank does not change.
+    """Return the Moore-Penrose inverse of `A`, dropping singular values below `cutoff` times the largest. It
+    is differentiable to any order in both modes where the rank is constant.
     """
     if 0 in A.shape:
         return jnp.zeros(A.shape[::-1], A.dtype)
     cutoff = rank_cutoff(A.dtype) if cutoff is None else cutoff
     left, sigma, right = jnp.linalg.svd(A, full_matrices=False)
-    keep = ~(sigma <= cutoff * sigma[0])  # written so that NaN is kept and shows
+    keep = ~(sigma <= cutoff * sigma[0])  # written so that NaN is kept
     inverse = jnp.where(keep, 1 / jnp.where(keep, sigma, 1), 0)
     return (right.T * inverse) @ left.T
 
@@ -48,16 +50,14 @@ def _pseudo_inverse_jvp(cutoff, primals, tangents):
 
 
 def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Singular values of `A`, largest first, as a diagnostic: no derivative passes through them."""
+    """Return the singular values of `A`, largest first. They are a diagnostic without derivative."""
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)
     return jnp.linalg.svd(jax.lax.stop_gradient(A), compute_uv=False)
 
 
 def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Count:
-    """Return the number of singular values above `cutoff` times the largest (default: the cut-off of their
-    dtype).
-    """
+    """Return the number of singular values above `cutoff` times the largest (default: `rank_cutoff`)."""
     if sigma.shape[0] == 0:
         return jnp.zeros((), jnp.int32)
     cutoff = rank_cutoff(sigma.dtype) if cutoff is None else cutoff
@@ -81,8 +81,8 @@ def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) 
 
 
 def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Return magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first. They
-    serve as a diagnostic and have no derivative.
+    """Return the magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first. They
+    are a diagnostic without derivative.
     """
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)

@@ -1,12 +1,13 @@
-"""Modules imported on first use, so that a first motion does not pay for what it does not need.
+"""Modules imported on first use, so that a first motion loads only what it needs.
 
-There are two ways, both for names that are imported under `if TYPE_CHECKING:`, where static tools see them.
+Both functions serve names that are imported under `if TYPE_CHECKING:`, where static tools see them.
 
-    diffrax = module_on_first_use("diffrax")                      in a module: stands for another one; its attributes are those of that
-    __getattr__, __dir__ = names_on_first_use(globals())          in a package: names that it imports under `if TYPE_CHECKING:` (PEP 562)
+    diffrax = module_on_first_use("diffrax")                      in a module: a placeholder with the attributes of another module
+    __getattr__, __dir__ = names_on_first_use(globals())          in a package: names imported under `if TYPE_CHECKING:` (PEP 562)
 
-A class that derives from one of such a module is defined in a module that is imported on first use too. `isinstance(x, diffrax.AbstractSolver)` imports
-diffrax, so `x` is compared with what needs no import first: with None, and with what is ours.
+A class derived from a placeholder's class belongs in a module that is itself imported on first use.
+`isinstance(x, diffrax.AbstractSolver)` imports diffrax, so test `x` first for None and for classes of this
+package.
 """
 
 import ast
@@ -19,7 +20,7 @@ from typing import Any
 
 
 class _OnFirstUse(ModuleType):
-    """Stands for the module of its name."""
+    """Placeholder for the module of its name."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(import_module(self.__name__), name)
@@ -34,10 +35,10 @@ def module_on_first_use(name: str) -> Any:
 
 
 def needed(module: str, purpose: str, extra: str = "") -> Any:
-    """Return an optional package, or a `module` of one; if it is missing, raise an ImportError with its
-    purpose and the command that installs it.
+    """Import an optional package or `module`; if it is missing, raise an ImportError with its purpose and the
+    command that installs it.
 
-    `extra`: the extra of this package that installs it.
+    `extra`: the extra of this package that contains it.
     """
     try:
         return import_module(module)
@@ -50,11 +51,10 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
 
 def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = MappingProxyType({})) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return `__getattr__` and `__dir__` of a package with these globals. On first use they import the names
-    that the source imports under a condition only.
+    that its source imports only under a condition.
 
-    `gone`: former names -> their replacements.
-
-    A name is looked up once; from then on it is an ordinary global of the package.
+    `gone`: former names -> their replacements. Each name is looked up once and then becomes an ordinary
+    global of the package.
     """
     conditions = [statement for statement in ast.parse(Path(package["__file__"]).read_text(encoding="utf-8")).body if isinstance(statement, ast.If)]
     imports = [line for condition in conditions for line in condition.body if isinstance(line, ast.ImportFrom)]
@@ -74,7 +74,7 @@ def names_on_first_use(package: dict[str, Any], gone: Mapping[str, str] = Mappin
 
 
 def version_of(package: str) -> str:
-    """Return the installed version of a package; "unknown" where it runs without being installed."""
+    """Return the installed version of a package, or "unknown" if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -1,8 +1,9 @@
-"""Numbers from users (plain, NumPy, nested lists) as floating-point arrays; and functions of arrays, compiled
-or run in JAX's default modes.
+"""Conversion and checks of users' numbers (plain, NumPy, nested lists), and functions compiled or run in
+JAX's default modes.
 
-Compiled functions have a tenth of the overhead of `equinox.filter_jit`, and options of XLA where compiling takes longer than running. Types and ranks of
-arrays combine as JAX's defaults have it in this package's own lines, also where the user has set stricter modes for theirs.
+Compiled functions have a tenth of the overhead of `equinox.filter_jit`, and cheaper XLA options where
+compiling takes longer than running. Inside the package, types and ranks promote by JAX's defaults even if the
+user has set stricter modes.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,11 +24,11 @@ from jaxtyping import Array, Bool, Float, Int, Real
 
 Entries: TypeAlias = Array | np.ndarray
 Number = ArrayLike  # one number
-Numbers = Real[Array | np.ndarray, "_"] | Sequence[ArrayLike]  # any count of them
+Numbers = Real[Array | np.ndarray, "_"] | Sequence[ArrayLike]  # any number of them
 Vector = Real[Array | np.ndarray, "3"] | Sequence[ArrayLike]  # three numbers
-# what annotations of all layers name most often
+# most frequent annotations
 Scalar = Float[Array, ""]
-Parameter = Scalar | float  # of a scene, as it is given; there it is an array
+Parameter = Scalar | float  # parameter as the user gives it; the scene stores an array
 Flag = Bool[Array, ""]
 Count = Int[Array, ""]
 Vector3 = Float[Array, "3"]
@@ -35,51 +36,48 @@ Matrix3 = Float[Array, "3 3"]
 Speeds = Float[Array, "speeds"]
 PerLane = Float[Array, "*lanes"]
 Shape = tuple[int, ...]
-Indices = tuple[int, ...]  # places in an array, or numbers of rows, coordinates or speeds
+Indices = tuple[int, ...]  # indices into an array, or of constraints, coordinates or speeds
 
 
 def real_type() -> np.dtype:
     """Return the default floating-point type: double precision if enabled."""
-    return dtypes.canonicalize_dtype(float)  # at a fortieth of the time of `jnp.result_type(float)`
+    return dtypes.canonicalize_dtype(float)  # a fortieth of the time of `jnp.result_type(float)`
 
 
 def rank_cutoff(dtype: jnp.dtype) -> float:
-    """Return the fraction of the largest singular value below which others count as zero: 4096 units of
-    round-off of `dtype`.
-    """
+    """Return the relative cutoff below which singular values count as zero: 4096 eps of `dtype`."""
     return 4096 * float(jnp.finfo(dtype).eps)
 
 
 def passing_cutoff(dtype: jnp.dtype) -> float:
-    """Return the cut-off for motions *through* a loss of rank, with rows that are well conditioned elsewhere:
-    the root of the round-off of `dtype`.
+    """Return the relative cutoff for motions *through* a loss of rank: sqrt(eps) of `dtype`.
 
-    A round-off e in a row of size sigma is a velocity e/sigma and an acceleration e/sigma^2; the step size
-    resolves them down to about sqrt(e).
+    Round-off e in a row of size sigma causes a velocity e/sigma and an acceleration e/sigma^2; adaptive steps
+    resolve these down to sigma of about sqrt(e).
     """
     return max(rank_cutoff(dtype), float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def undecided(dtype: jnp.dtype) -> float:
-    """Return the relative size of a row below which round-off decides the branch of a motion: 8 roots of the
-    round-off of `dtype`.
+    """Return the relative row size below which round-off decides the branch of a motion: 8 sqrt(eps) of
+    `dtype`.
 
-    Where two branches of g = 0 cross, g = e is a hyperbola that leads from one branch to the other, at a
+    Where two branches of g = 0 cross, g = e is a hyperbola that leads from one branch to the other at a
     distance of about sqrt(e) from the crossing.
     """
     return 8 * float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def is_array(x) -> bool:
-    """Return whether x is an array, of JAX, of NumPy or of another kind."""
+    """Return whether x is an array of JAX, NumPy or another library."""
     return hasattr(x, "__array__") and not isinstance(x, type)
 
 
 def as_real(x) -> Float[Array, "*shape"]:
-    """Return `x` as a floating-point array. Integers become the default float; floats keep their type. It is
-    never weakly typed, which would cause a second trace.
+    """Return `x` as a floating-point array. Integers become the default float; floats keep their type. The
+    result is never weakly typed, which would cause a second trace.
 
-    Raises TypeError for complex numbers, whose imaginary parts are not dropped, and for truth values.
+    Raises TypeError for complex numbers and booleans.
     """
     array = _of_jax(x)
     if jnp.issubdtype(array.dtype, jnp.floating):
@@ -90,7 +88,7 @@ def as_real(x) -> Float[Array, "*shape"]:
 
 
 def _of_jax(x) -> Array:
-    """Return `x` as an array of JAX, which has no extended precision. Raises TypeError for a quantity with a
+    """Return `x` as a JAX array; extended precision becomes double. Raises TypeError for a quantity with a
     unit.
     """
     if isinstance(x, jax.Array):
@@ -99,23 +97,25 @@ def _of_jax(x) -> Array:
         raise TypeError(f"real numbers are expected, but this is {described(x)}")
     try:
         x = np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x
-        # without a type, JAX compiles a program for each shape of NumPy's arrays
+        # without a dtype, JAX compiles a program for each shape of a NumPy array
         return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if isinstance(x, np.ndarray) and x.dtype.kind == "f" else None)
     except OverflowError:
-        raise ValueError("an integer is too large for a floating-point number; give a smaller one") from None
+        raise ValueError("an integer is too large for a floating-point number; use a smaller one") from None
 
 
-def checked_real(value, what: str, shape: Shape | None = None, *, advice: str = "check how it is "
-    "put together") -> Array:
+def checked_real(value, what: str, shape: Shape | None = None, *, advice: str = "check how it was "
+    "built") -> Array:
     """Return `value` as a floating-point array.
 
     **Arguments**
-    - `value`: a number, an array, or a list of numbers; integers and extended precision are converted, other floating-point arrays keep their type.
-    - `what`: the thing in words, for the error.
-    - `shape`: the shape it must have; None: any. Shapes are known while a function is traced: the check costs nothing at run time.
-    - `advice`: what to do, for the error.
 
-    **Raises** ValueError: no real numbers, or another shape.
+    - `value`: a number, an array, or a list of numbers; integers and extended precision are converted, other
+      floats keep their type.
+    - `what`: name of the value in error messages.
+    - `shape`: required shape; None: any. Shapes are static, so the check costs nothing at run time.
+    - `advice`: what to do, for error messages.
+
+    **Raises** ValueError for values that are not real numbers, or for another shape.
     """
     try:
         array = _of_jax(value)
@@ -127,18 +127,18 @@ def checked_real(value, what: str, shape: Shape | None = None, *, advice: str = 
     return as_real(array)
 
 
-def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str = "give it in m") -> Array:
-    """Check as `checked_real`, for numbers above zero. ValueError for known values that are not."""
+def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str = "use metres") -> Array:
+    """Check as `checked_real` and raise ValueError for concrete numbers that are not positive."""
     found = checked_real(value, what, shape, advice=advice)
     if not np.all(known_numbers(found) > 0):
-        raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected more than zero; {advice}")
+        raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected positive numbers; {advice}")
     return found
 
 
-def checked_known(value, what: str, shape: Shape | None = None, *, advice: str = "check how it is "
-    "put together") -> np.ndarray:
-    """Return `value`, which is not traced, as a NumPy array of the default float, also inside `jit`.
-    Arguments and errors: as of `checked_real`.
+def checked_known(value, what: str, shape: Shape | None = None, *, advice: str = "check how it was "
+    "built") -> np.ndarray:
+    """Return a concrete `value` as a NumPy array of the default float, also inside `jit`. Arguments and
+    errors as for `checked_real`.
     """
     if type(value) is float and not shape:
         return np.array(value, real_type())
@@ -153,8 +153,8 @@ def checked_known(value, what: str, shape: Shape | None = None, *, advice: str =
 
 
 def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advice: str):
-    """Return `value` in the default float: a NumPy array if known, also inside `jit`; a JAX array if traced.
-    Raises ValueError as `checked_real` does.
+    """Return `value` in the default float: a NumPy array if concrete, also inside `jit`; a JAX array if
+    traced. Raises ValueError as `checked_real`.
     """
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())
@@ -162,22 +162,20 @@ def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advic
 
 
 def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
-    """Return a whole number from `low` to `high`. Raises ValueError with the `expected` range for anything
-    else.
-    """
+    """Return an integer from `low` to `high`, or raise ValueError with the `expected` range."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low or (high is not None and value > high):
         raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
     return int(value)
 
 
 def holds(condition: Callable, *numbers) -> bool:
-    """Return whether a condition holds for all numbers. Traced numbers count as satisfying it."""
+    """Return whether a condition holds for all numbers; traced numbers count as satisfying it."""
     return is_traced(*numbers) or bool(np.all(condition(*map(np.asarray, numbers))))
 
 
 def has_unit(x) -> bool:
-    """Return whether `value` is a quantity with a unit, or a list that holds one. As a plain number it would
-    lose the unit: 1,300 g would become 1,300 kg.
+    """Return whether `x` is a quantity with a unit, or a list that contains one. Conversion to a number would
+    drop the unit, so 1,300 g would become 1,300 kg.
     """
     if isinstance(x, list | tuple):
         return any(has_unit(part) for part in x if type(part) is not float)
@@ -185,12 +183,12 @@ def has_unit(x) -> bool:
 
 
 def as_array(x, dtype):
-    """Return an array of this type: on NumPy if its numbers are known, of JAX if they are traced."""
+    """Return an array of this type: a NumPy array if concrete, a JAX array if traced."""
     return array_module(x).asarray(x, dtype)
 
 
 def in_default_precision(tree):
-    """Return the tree with its floating-point arrays in the default type."""
+    """Return the tree with floating-point arrays converted to the default type."""
     return jax.tree.map(lambda x: x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
@@ -203,13 +201,13 @@ def _check(array, what: str, shape: Shape | None, advice: str) -> None:
 
 
 def static(**default) -> Any:
-    """Declare a field of a module that belongs to its structure: no number, and part of the key of what is compiled."""
+    """Declare a static field of a module, which is part of the compilation key."""
     return eqx.field(static=True, **default)
 
 
 def check_kind(value, kind, what: str, expected: str) -> None:
-    """Raise a ValueError that describes the `value`, unless it is an instance of `kind`, a class or a union
-    of classes.
+    """Raise a ValueError that describes `value` unless it is an instance of `kind`, a class or union of
+    classes.
     """
     if not isinstance(value, kind):
         raise ValueError(f"{what} is {described(value)}, expected {expected}")
@@ -236,30 +234,29 @@ def described(value) -> str:
 
 
 def is_traced(*trees) -> bool:
-    """Return whether any leaf is being traced, so that its number is not known."""
-    unknown = [tree for tree in trees if not isinstance(tree, float | int | np.ndarray)]  # no trees, and this takes a tenth of the time
+    """Return whether any leaf is traced."""
+    # other values are leaves; this check takes a tenth of the time
+    unknown = [tree for tree in trees if not isinstance(tree, float | int | np.ndarray)]
     return bool(unknown) and any(map(is_traced_type, map(type, jax.tree.leaves(unknown))))
 
 
 def known_numbers(x) -> np.ndarray:
-    """Return the numbers if they are known, for a check; an empty array if they are traced, so that the check
-    passes.
-    """
+    """Return concrete numbers for a check, or an empty array if they are traced, so that the check passes."""
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 
 def largest(x, axis: int | Indices | None = None, keepdims: bool = False):
-    """Return the largest magnitude in an array (JAX or NumPy), or along its axes; zero if it is empty."""
+    """Return the largest magnitude of an array (JAX or NumPy) or along its axes; zero if empty."""
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
 
 
 def all_finite(x, axis: int | Indices | None = None):
-    """Return whether numbers that are known are finite: all, or those along axes."""
+    """Return whether concrete numbers are finite, all of them or along axes."""
     return np.isfinite(x).all(axis)
 
 
 def eps_of(x):
-    """Return the round-off of an array's type."""
+    """Return the machine epsilon of an array's type."""
     return jnp.finfo(x.dtype).eps
 
 
@@ -269,40 +266,36 @@ def tiny_of(x):
 
 
 def at_index(tree, index):
-    """Return `x[index]` of all arrays `x` of a tree."""
+    """Return the tree with `x[index]` for each array `x`."""
     return jax.tree.map(lambda x: x[index], tree)
 
 
 def array_module(x) -> ModuleType:
-    """Return `jax.numpy` where something in `x` is traced, otherwise NumPy."""
+    """Return `jax.numpy` if anything in `x` is traced, otherwise NumPy."""
     return jnp if is_traced(x) else np
 
 
 def nothing_is_traced() -> bool:
-    """Return whether this call is outside of every transformation: no function around it is traced, and so no
-    argument is.
-    """
+    """Return whether this call is outside all JAX transformations."""
     return jax.extend.core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
 
 
 def at_once():
-    """Return a context in which known numbers are evaluated immediately, even if a surrounding function is
-    traced.
-    """
+    """Return a context that evaluates concrete numbers immediately, even inside a trace."""
     return nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval()
 
 
 with jax.ensure_compile_time_eval():
     _NOTHING_TRACED = jax.extend.core.get_opaque_trace_state(convention="flax")
 
-_UNITS = "units", "unit", "magnitude"  # as pint, astropy, unyt and others call what is more than a number
+_UNITS = "units", "unit", "magnitude"  # attributes of quantities with units in pint, astropy, unyt and others
 _PLAIN = bool, int, float, complex, np.ndarray
 _NEVER = np.generic | jax.Array | jax.core.Tracer | type
 _may_have_unit: Callable[[type], bool] = lru_cache(maxsize=1024)(
     lambda kind: kind not in _PLAIN and not issubclass(kind, _NEVER) and (hasattr(kind, "__float__") or hasattr(kind, "__array__"))
 )
 
-# Whether what is of this type is being traced, or is an array of JAX or NumPy: looked up, at a tenth of the time of asking the classes of JAX.
+# Cached by type, at a tenth of the time of an isinstance check against the classes of JAX.
 is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.core.Tracer))
 is_array_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.Array | jax.core.Tracer | np.ndarray | np.generic))
 
@@ -311,9 +304,7 @@ F = TypeVar("F", bound=Callable)
 
 
 def with_usual_promotion(function: F) -> F:
-    """Return the function so that it always runs, and is traced, in JAX's default modes of type promotion,
-    whoever calls it.
-    """
+    """Return `function` wrapped so that it always runs and is traced with JAX's default type promotion."""
 
     @wraps(function)
     def called(*args, **kwargs):
@@ -323,21 +314,22 @@ def with_usual_promotion(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-# Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be omitted: a first
-# motion of a disc from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
+# For functions whose cost is mostly compilation. Before jaxlib 0.11.1, XLA's new emitters can be disabled: a
+# first motion of a disc from cached object code then takes 1.55 s instead of 1.75. Later versions have only
+# these emitters.
 _EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 
 
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
-    """Compile as `equinox.filter_jit` does; compiled programs live as long as the returned function.
+    """Compile like `equinox.filter_jit`; compiled programs live as long as the returned function.
 
-    `options`: for XLA on a CPU, or a function that chooses them, called once for arguments of one structure
-    with a placeholder for each array. They have no effect inside another transformation, since JAX takes
-    options for whole programs only.
+    `options`: XLA options for CPUs, or a function that returns them, called once per structure of arguments
+    with a placeholder for each array. They are ignored inside another transformation, because JAX accepts
+    options only for whole programs.
     """
 
-    @lru_cache(maxsize=1024)  # structures of arguments, arrays left out
+    @lru_cache(maxsize=1024)  # structures of arguments without arrays
     def program(treedef, others, with_options: bool) -> Callable:
         def on_arrays(arrays):
             found, kept = _parted(f(*_whole(arrays, treedef, others)))
@@ -361,7 +353,7 @@ compiled_quickly = partial(compiled, options=RUN_SELDOM)
 
 
 class _Kept(eqx.Module):
-    """The parts of a result that are no arrays."""
+    """Static parts of a result."""
 
     value: tuple = eqx.field(static=True)
 
@@ -377,18 +369,18 @@ def _parted(tree) -> tuple[list, tuple]:
 
 
 def _whole(arrays, treedef, rest):
-    """Put a tree together from its parts."""
+    """Rebuild a tree from its parts."""
     left = iter(arrays)
     return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])
 
 
 def nan_is_a_mark():
-    """Return a context in which JAX does not look for NaN."""
+    """Return a context in which `jax_debug_nans` is off, for NaN that marks failures."""
     return jax.debug_nans(False)
 
 
 def with_nan_as_a_mark(f: F) -> F:
-    """Return `f`, run without checks for NaN."""
+    """Return `f` wrapped to run with `jax_debug_nans` off."""
 
     @wraps(f)
     def run(*arguments, **named):

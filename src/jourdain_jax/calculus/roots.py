@@ -1,21 +1,23 @@
-"""Roots of residuals: by Newton's method, by damped least squares where it diverges, by fixed-point
-iteration, and on NumPy at many states at once.
+"""Roots of residuals: Newton's method, damped least squares, fixed-point iteration, and Gauss-Newton in NumPy
+at many states at once.
 
     F(x, theta) = 0   =>   dx = - (dF/dx)^-1 (dF/dtheta) dtheta                                             `newton_root`
     min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx                                          `damped_search`
     x <- step(a, x):   D <- d step/da + d step/dx D,   D = dx/d(a, x_0)                                      `fixed_point`
     x <- x - G+ g(x),   G = dg/dx                                                                           `nearest_root`
 
-`newton_root` is never differentiated itself, nor unrolled: `jax.lax.custom_root` linearises F once, at the root. Derivatives of any order, in
-either mode, cost one linear solve each. No derivative passes through `damped_search`: take it at the root; it runs under `jit` and `vmap`, where all lanes go
-on until the last has ended (J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3).
+`newton_root` is differentiated by `jax.lax.custom_root`, which linearises F once, at the root. Derivatives of
+any order, in either mode, cost one linear solve each. `damped_search` has no derivative: differentiate at the
+root. Under `vmap` it runs until the last sample has converged (J. Nocedal and S. Wright, Numerical
+Optimization (2006), section 10.3).
 
-`fixed_point` carries the derivative along with x, for those entries of a and x_0 that vary, so that both modes of differentiation run one loop. Where the
-iteration converges quadratically, each further step doubles the order of derivatives that are right: two steps that change nothing give those up to the
-third. Steps left out cost nothing, under `vmap` neither once all lanes have settled.
+`fixed_point` carries the derivative along with x for the entries of a and x_0 that vary, so both modes of
+differentiation run one loop. If the iteration converges quadratically, each further step doubles the correct
+order of derivatives; two steps without change give derivatives up to the third. Once all samples have
+settled, the remaining steps are skipped, also under `vmap`.
 
-In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows reports it; then
-small singular values are omitted.
+`nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal; it
+then drops small singular values.
 """
 
 from collections.abc import Callable
@@ -37,19 +39,18 @@ Unknowns = Float[Array, "unknowns"]
 
 
 class Root(eqx.Module):
-    """The end of an iteration, and whether it is a root."""
+    """End of an iteration, and whether it is a root."""
 
     x: Unknowns
     converged: Flag
 
 
 def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
-    """Return x with `residual(x) = 0` near `guess`; `residual` may close over anything, including traced
-    numbers.
+    """Return x with `residual(x) = 0` near `guess`; `residual` may close over traced numbers.
 
-    `scale`: the size of each unknown, relative to which round-off is judged; infinite for an unknown to
-    ignore. It iterates until the corrections no longer shrink; if they are then still larger than round-off
-    to the power 0.6, it has not converged.
+    `scale`: size of each unknown, relative to which round-off is judged; infinite for an unknown to ignore.
+    The iteration stops when the corrections no longer shrink. It has converged if they are then at most
+    eps^0.6.
     """
 
     eps = eps_of(guess)
@@ -65,7 +66,7 @@ def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
             dx = jnp.linalg.solve(_matrix(derivative, x), value)
             new_size = jnp.max(jnp.abs(dx) / scale, initial=0.0)
             at_round_off = new_size <= 4.0 * eps  # units of round-off
-            # an iteration that no longer shrinks the correction to a tenth has met round-off
+            # a correction that no longer shrinks tenfold has reached round-off
             stalled = (new_size <= eps**0.6) & (new_size > 0.1 * size)
             return x - dx, new_size, at_round_off | stalled | ~jnp.isfinite(new_size), k + 1
 
@@ -83,18 +84,18 @@ def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
 
 
 class Nearest(eqx.Module):
-    """The end of a search, and the residual there."""
+    """End of a search and the residual there."""
 
     x: Unknowns
-    left: Scalar  # largest of the rows
+    left: Scalar  # largest residual
 
 
 class Search(eqx.Module):
-    """The best point so far, and the next to try."""
+    """Best point so far, and the next trial point."""
 
     trial: Unknowns
     best: Unknowns
-    f: Float[Array, "rows"]  # at the best, and their slopes
+    f: Float[Array, "rows"]  # residuals at the best point, and their Jacobian
     J: Float[Array, "rows unknowns"]
     damping: Scalar
     steps: Count
@@ -102,17 +103,17 @@ class Search(eqx.Module):
 
     @property
     def left(self) -> Scalar:
-        """The largest of the rows at the best point."""
+        """Return the largest residual at the best point."""
         left = largest(self.f)
         return jnp.where(jnp.isfinite(left), left, jnp.inf)
 
 
 def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
-    """Search for x near `guess`, between `low` and `high`, at which no residual exceeds the `tolerance`;
-    otherwise end at the smallest residual. J has derivatives with respect to x in units of `size`.
+    """Search near `guess`, within `low` to `high`, for x with no residual above `tolerance`; otherwise return
+    the smallest residual found. J has derivatives with respect to x in units of `size`.
 
-    `rows`: x -> f and J. `size`: the unit of the steps of each unknown; zero for a held one. Rows should be
-    of order one where unknowns change by their size.
+    `rows`: x -> f and J. `size`: unit of the steps of each unknown; zero for a fixed one. Scale `rows` to be
+    of order one when unknowns change by their size.
     """
 
     def look(x):
@@ -121,13 +122,14 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
 
     def once(search: Search) -> Search:
         f, J = look(search.trial)
-        better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))  # never where it is not a number
+        # never accept a Jacobian that is not finite
+        better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))
         best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
-        # at most a quarter of the size of the unknowns in one step
+        # limit a step to a quarter of the size of the unknowns
         step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(largest(step), tiny_of(f)))
-        # a damping of 1e7: no step makes the rows smaller
+        # at a damping of 1e7 no step reduces the residuals
         going = (largest(f) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
         return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
@@ -138,11 +140,11 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
 
 
 def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80) -> Unknowns:
-    """Return the root near a guess, differentiable to any order. A search without derivatives is followed by
-    steps `x <- x - J+ R(x)` with a constant J, each of which makes one more order correct.
+    """Return the root near a guess, differentiable to any order. After a search without derivatives come
+    three steps `x <- x - J+ R(x)` with constant J, each of which makes one more order of derivatives correct.
 
-    `look`: x -> R and J, for numbers without derivatives; `rows`: x -> R; `x`: values of held unknowns (size
-    zero), with their derivatives; `cutoff`: of J+. Other arguments: as of `damped_search`.
+    `look`: x -> R and J, without derivatives; `rows`: x -> R; `x`: values of the fixed unknowns (size zero)
+    with their derivatives; `cutoff`: of J+. Other arguments as for `damped_search`.
     """
     found = jax.lax.stop_gradient(damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps))
     inverse = size[:, None] * pseudo_inverse(found.J, cutoff)
@@ -150,16 +152,18 @@ def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolera
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Count]:
-    """Return the root from the first successful one of the `guesses`, and the index of that guess; without a
+    """Return the root from the first of the `guesses` that succeeds, and the index of that guess; without a
     root, the nearest approach.
 
-    A root has residuals of at most `good`. Other arguments, including the `bounds`: as of `damped_search`.
+    A root has residuals of at most `good`. Other arguments, including the `bounds`, as for `damped_search`.
     """
     count = guesses.shape[0]
-    # 50_000 slopes are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
+    # limit of Jacobian entries held at once per sample: all guesses of 96 trailers, times 17 samples, took 57
+    # GB
     block = max(1, min(count, 50_000 // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
     blocks = -(-count // block)
-    places = np.minimum(np.arange(blocks * block), count - 1).reshape(blocks, block)  # the last one may stand there several times
+    # the last guess fills the last block
+    places = np.minimum(np.arange(blocks * block), count - 1).reshape(blocks, block)
 
     def next_block(carried):
         k, best, number = carried
@@ -174,12 +178,12 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
     return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), next_block, (jnp.zeros((), jnp.int32), *nothing))[1:]
 
 
-QUIET = 2  # steps in a row
-ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
+QUIET = 2  # number of steps without change after which the iteration has settled
+ROUND_OFF = 1e3  # a change exceeds this many eps, relative to 1 + |x|
 
 
 def fixed_point(step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None) -> Float[Array, "entries"]:
-    """Return x after at most `most` steps; a NaN counts as settled.
+    """Return x after at most `most` steps of `x <- step(a, x)`; a NaN counts as settled.
 
     `prepare`: turns a into the argument of the steps, a pair whose second part is not differentiated.
     """
@@ -218,7 +222,7 @@ def _iterated_jvp(primals, tangents, *, step, most, prepare):
 
 
 def _loop(step: Callable, carry: tuple, most: int) -> tuple:
-    """Take at most `most` steps of a tuple whose first entry says whether it has settled."""
+    """Iterate `step` at most `most` times on a tuple whose first entry decides whether it has settled."""
     if most <= QUIET:
         return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=most)[0]
 
@@ -234,7 +238,7 @@ def _loop(step: Callable, carry: tuple, most: int) -> tuple:
     return jax.lax.scan(once, (carry, jnp.zeros((), jnp.int32)), length=most)[0][0]
 
 
-# x of some states, and their numbers -> g, G in the form that `solve` takes
+# x of some states and their indices -> g, G in the form that `solve` takes
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -242,10 +246,10 @@ def nearest_root(
     look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: np.ndarray | float = np.inf, within: tuple = (-np.inf, np.inf)
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
-    1 + |x|, infinite where they are NaN.
+    1 + |x|, infinite for NaN.
 
-    `solve`: returns the shortest d with G d = g, from G and g. No step exceeds `longest` in an entry or
-    leaves the bounds `within`.
+    `solve`: returns the shortest d with G d = g. No step exceeds `longest` in an entry or leaves the bounds
+    `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):
@@ -265,15 +269,15 @@ def nearest_root(
 
 
 def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return the shortest d with G d = g at every state; a least-squares solution where rows are (nearly)
-    dependent, or shorter than typical.
+    """Return the shortest d with G d = g at every state; a least-squares solution if rows are nearly
+    dependent or shorter than `typical`.
     """
     return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]
 
 
 def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return G+ at every state, with rows scaled to unit length, or less where they are shorter than typical;
-    NaN where G is.
+    """Return G+ at every state, NaN where G is NaN. Rows are first scaled to unit length, or to less if
+    shorter than `typical`.
     """
     lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
     d = 1 / np.where(lengths > 0, lengths, 1.0)
@@ -282,7 +286,7 @@ def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndar
     places = np.flatnonzero(finite)
     if G.shape[1] <= G.shape[2]:
         Q, R = np.linalg.qr(np.swapaxes(scaled[finite], 1, 2))  # D G = R' Q'
-        # where the triangular factor has a smaller diagonal, singular values decide
+        # with a smaller diagonal, decide by singular values
         regular = np.min(np.abs(np.diagonal(R, axis1=1, axis2=2)), axis=1, initial=1.0) > 1e-6
         found[places[regular]] = Q[regular] @ np.swapaxes(np.linalg.inv(R[regular]), 1, 2)
         places = places[~regular]
@@ -294,5 +298,5 @@ def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndar
 def _by_singular_values(G: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.pinv(G, rcond=1e-9)
-    except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
+    except np.linalg.LinAlgError:  # entries too far apart for a decomposition
         return np.full(G.shape[::-1], np.nan)

@@ -1,10 +1,12 @@
 """Rotation matrices, quaternions and the cross-product matrix.
 
-A rotation matrix `R` takes body components to space components, `r_space = R r_body`. Its body angular velocity is
-`omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`. Quaternions are `(w, x, y, z)`.
+A rotation matrix `R` maps body components to space components, `r_space = R r_body`. Its body angular
+velocity is `omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`.
+Quaternions are `(w, x, y, z)`.
 
-Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, a positive angle of `rot_z` turns to the left, one of `rot_x` leans
-to the right, and one of `rot_y` pitches the nose down and rolls a wheel ahead.
+Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, a positive angle
+of `rot_z` turns to the left, of `rot_x` leans to the right, and of `rot_y` pitches the nose down and rolls a
+wheel ahead.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +22,7 @@ Attitude = Float[Array, "4"]
 
 def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the shortest rotation from z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x
-    k, s = |v|, c = z.k; for -z half a turn about x.
+    k, s = |v|, c = z.k. For k = -z, return half a turn about x.
     """
     k = direction / np.linalg.norm(direction)
     v = np.cross([0.0, 0.0, 1.0], k)
@@ -31,12 +33,12 @@ def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _angle(angle: Number) -> Scalar:
-    return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for "
+    return checked_real(angle, "angle of a rotation", (), advice="pass one angle in rad; use `jax.vmap` for "
         "many")
 
 
 def _turned(angle: Number, rows: Callable) -> Matrix3:
-    """Return the matrix of these rows of cosine, sine, zero and one."""
+    """Return the matrix with these rows, functions of (cosine, sine, zero, one)."""
     angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([jnp.stack(row) for row in rows(c, s, jnp.zeros_like(c), jnp.ones_like(c))])
@@ -79,17 +81,18 @@ def vee(S: Matrix3) -> Vector3:
 
 
 def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> Matrix3:
-    """Return the rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero
-    (the formula divides by the squared norm).
+    """Return the rotation matrix (3, 3), body to space, of a nonzero `quaternion` (w, x, y, z). Its norm does
+    not matter.
 
-    Raises ValueError for a known zero quaternion; a traced one gives NaN.
+    Raises ValueError for a concrete zero quaternion; a traced one gives NaN.
     """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
     if not holds(np.any, quaternion):
-        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; give (w, x, y, z) of nonzero "
+        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; pass (w, x, y, z) of nonzero "
             "length, such as (1, 0, 0, 0) for no rotation")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
+    # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v), independent of the norm, so a drifting norm never scales an
+    # inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)
     return jnp.stack(
         [
@@ -101,9 +104,10 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
 
 
 def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Float[np.ndarray, "matrices 4"]:
-    """Return unit quaternions (w, x, y, z) of known rotation matrices, body to space, with either sign.
+    """Return unit quaternions (w, x, y, z), with either sign, of concrete rotation matrices, body to space.
 
-    The largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2 is found from the diagonal, the others by dividing by its root (Shepperd 1978).
+    The largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2 follows from the diagonal, the others after division by its root
+    (Shepperd 1978).
     """
     R = np.asarray(rotations, float)
     trace = np.trace(R, axis1=1, axis2=2)
@@ -118,14 +122,12 @@ def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Flo
 
 
 def quaternion_rate(quaternion: Attitude, omega_body: Vector3) -> Attitude:
-    """Return `d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body`
-    (rad/s).
-    """
+    """Return `d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity (rad/s)."""
     return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))
 
 
 def quaternion_product(p: Attitude, q: Attitude) -> Attitude:
-    """Hamilton's product of two quaternions `(w, x, y, z)`."""
+    """Return Hamilton's product of two quaternions `(w, x, y, z)`."""
     pw, px, py, pz = p[0], p[1], p[2], p[3]
     qw, qx, qy, qz = q[0], q[1], q[2], q[3]
     return jnp.stack(
@@ -139,8 +141,8 @@ def quaternion_product(p: Attitude, q: Attitude) -> Attitude:
 
 
 def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
-    """Return the unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a rotation by `angle`
-    (rad) about the unit vector `axis`.
+    """Return the quaternion (w, x, y, z) = `(cos(angle/2), sin(angle/2) axis)`, a rotation by `angle` (rad)
+    about the unit vector `axis`.
     """
     half = _angle(angle) / 2
     axis = checked_real(axis, "axis of a quaternion", (3,), advice="give a unit vector")

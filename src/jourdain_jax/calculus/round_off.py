@@ -1,9 +1,9 @@
-"""Scalar functions of values with bounds of their round-off (Higham, 2002, 3.3), stored beside the values in
-one array.
+"""Scalar functions with bounds of their round-off (Higham, 2002, 3.3). Values and bounds share one array,
+values first.
 
     a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
 
-A bound is infinite where a divisor, or what a root is taken of, is not told from zero.
+The bound is infinite if a divisor or radicand may be zero within its own bound.
 """
 
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 EPS = float(np.finfo(float).eps)
-LOST = 1e3  # bounds of round-off below which a divisor, or what a root is taken of, is not told from zero
+LOST = 1e3  # a divisor or radicand smaller than this many bounds may be zero
 
 
 def with_bound(value: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return a value, with the bound from its arguments and its own rounding."""
+    """Return a value with the bound `error` plus its own rounding."""
     error += EPS * np.abs(value)
     return np.concatenate([value, error])
 
@@ -59,8 +59,8 @@ def quotient(x, y):
 
 
 def root(x):
-    """Return the square root of a. Its derivative is 1/(2 sqrt(a)); twice this derivative bounds the error
-    even if a is smaller than its own error.
+    """Return the square root of a. Twice its derivative 1/(2 sqrt(a)) bounds the error even if a is smaller
+    than its own error.
     """
     a, ea = halves(x)
     value = np.sqrt(a)
@@ -68,8 +68,8 @@ def root(x):
 
 
 def wave(function: Callable) -> Callable:
-    """Return an operation that bounds errors like a sine or cosine: it changes no faster than its argument
-    and lies between -1 and 1.
+    """Return an operation that bounds errors as for sine and cosine: Lipschitz constant 1, values between -1
+    and 1.
     """
 
     def bounded(x):

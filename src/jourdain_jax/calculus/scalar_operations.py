@@ -1,6 +1,6 @@
-"""The table of scalar functions that a scene may use: value, derivative, round-off, and code of each.
+"""Table of the scalar functions that a scene may use: value, derivative, round-off and source code of each.
 
-Whatever works on scalars looks here: values on NumPy arrays, code for JAX, derivatives, proofs of identities, source code. A new function is a new entry.
+It is the only definition of these functions; a new function is a new entry.
 """
 
 import functools
@@ -18,34 +18,38 @@ from jourdain_jax.calculus import round_off
 
 @dataclass(frozen=True)
 class Operation:
-    """A function of scalars."""
+    """Scalar function."""
 
     name: str
-    value: Callable  # of NumPy arrays, entry by entry
-    # (g, n, *args, *rates) -> the rate of node n = f(*args) of a graph g, given those of its arguments; None: constant between jumps
+    value: Callable  # of NumPy arrays, elementwise
+    # (g, n, *args, *rates) -> rate of node n = f(*args) of a graph g, from the rates of its arguments; None:
+    # piecewise constant
     derivative: Callable[..., int] | None = None
-    # "flat": analytic, but of one value, to the last digit, over some range; "branch": its arguments decide between branches; "choice": made of such decisions
+    # "flat": analytic, but constant to the last digit over some range; "branch": chooses a branch by
+    # comparing its arguments; "choice": combines such decisions
     kind: Literal["analytic", "flat", "branch", "choice"] = "analytic"
-    bounded: Callable | None = None  # value and bound of its round-off, see `round_off`; None: proofs of identities do not know the function
-    traced: Callable | None = None  # of JAX arrays; None: the function of `jax.numpy` with the name of `value`
-    python: str = ""  # as written: a format of the arguments, or a name; nothing: the name in `math`
-    c: str = ""  # nothing: the name in C's library
+    # value and round-off bound, see `round_off`; None: identity proofs do not cover this function
+    bounded: Callable | None = None
+    # of JAX arrays; None: the function of `jax.numpy` with the name of `value`
+    traced: Callable | None = None
+    python: str = ""  # Python source: a format of the arguments, or a name; empty: the name in `math`
+    c: str = ""  # empty: the name in C's library
     sympy: Callable[..., Any] | None = None  # (sympy, *args); None: the function of this name
-    infix: tuple[str, int] | None = None  # as written between its arguments, and how tightly it binds
+    infix: tuple[str, int] | None = None  # infix symbol and precedence
     commutes: bool = False
 
     @property
     def in_jax(self) -> Callable:
-        """The function of JAX arrays."""
+        """Return the function of JAX arrays."""
         return self.traced or getattr(jnp, self.value.__name__)
 
     @property
     def is_number(self) -> bool:
-        """Whether arguments and value are numbers, none of them true or false."""
+        """Return whether arguments and value are numbers rather than booleans."""
         return self.kind != "choice" and self.name not in COMPARISONS
 
 
-# Derivatives that take more than a line. -----------------------------------------------------------------------------
+# Longer derivatives. -----------------------------------------------------------------------------
 
 
 def _quotient(g, n, a, b, da, db):
@@ -61,8 +65,8 @@ def _smaller(g, n, a, b, da, db):
 
 
 def _halved_where_equal(g, a, b, otherwise, da, db):
-    """Return half of each derivative where both arguments are equal, as JAX does: max(x, 0) - max(-x, 0) is
-    smooth at x = 0.
+    """Return the mean of both derivatives where the arguments are equal, as JAX does: max(x, 0) - max(-x, 0)
+    is smooth at x = 0.
     """
     return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
 
@@ -80,7 +84,7 @@ def _real_power(g, n, a, b, da, db):
 
 
 def _unless_zero(g, nodes: tuple[int, ...], value):
-    """Return the value, and 1 where all of the nodes are zero."""
+    """Return the value, or 1 where all of the nodes are zero."""
     if any(g.is_const(n) and g.value[n] for n in nodes):
         return value
     vanish = [g.call("eq", n, g.zero) for n in nodes]
@@ -88,7 +92,7 @@ def _unless_zero(g, nodes: tuple[int, ...], value):
 
 
 def _remainder(g, n, a, b, da, db):
-    return g.sub(da, g.mul(g.div(g.sub(a, n), b), db))  # a = k b + n with a whole k
+    return g.sub(da, g.mul(g.div(g.sub(a, n), b), db))  # a = k b + n with integer k
 
 
 def _arctangent(g, n, y, x, dy, dx):
@@ -104,7 +108,8 @@ def _of_acosh(g, n, a, da):
 
 
 def _of_abs(g, n, a, da):
-    return g.mul(g.call("select", g.call("ge", a, g.zero), g.const(-1.0), g.one), da)  # 1 at zero: so powers of |x| are smooth
+    # 1 at zero, so that powers of |x| are smooth
+    return g.mul(g.call("select", g.call("ge", a, g.zero), g.const(-1.0), g.one), da)
 
 
 def _whole_quotients(sympy, a, b):
@@ -173,7 +178,7 @@ _ALL = [
     Operation("and", np.logical_and, None, "choice", python="({0}) and ({1})", c="({0}) && ({1})", sympy=lambda s, a, b: s.And(a, b)),
     Operation("or", np.logical_or, None, "choice", python="({0}) or ({1})", c="({0}) || ({1})", sympy=lambda s, a, b: s.Or(a, b)),
     Operation("not", np.logical_not, None, "choice", python="not ({0})", c="!({0})", sympy=lambda s, a: s.Not(a)),
-    Operation(  # the third argument where the first holds, otherwise the second
+    Operation(  # the third argument if the first is true, otherwise the second
         "select",
         lambda c, a, b: np.where(c, b, a),
         lambda g, n, c, a, b, dc, da, db: g.call("select", c, da, db),

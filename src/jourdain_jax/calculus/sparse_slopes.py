@@ -1,9 +1,9 @@
-"""Derivatives of constraints at many states by their entries; with few coordinates per constraint, as in a
-long chain, linear systems are sparse.
+"""Sparse Jacobians of constraints at many states. With few coordinates per constraint, as in a long chain,
+the linear systems are sparse.
 
     G G' y = f,   x = G' y
 
-Dense matrices take a time that grows with the cube of the rows, sparse ones of a chain one that grows with the rows.
+Dense solution time grows with the cube of the number of rows, sparse solution time of a chain linearly.
 """
 
 import contextlib
@@ -18,28 +18,26 @@ from jourdain_jax.calculus.roots import shortest
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Positions of the structurally nonzero entries of matrices, by rows. Their values have a leading axis of
-    states.
-    """
+    """Positions of the structurally nonzero entries of a matrix. Values have a leading axis of states."""
 
-    rows: np.ndarray  # of each entry
+    rows: np.ndarray  # row index of each entry
     columns: np.ndarray
     shape: tuple[int, int]
-    fewest: int = 64  # rows of a matrix that may be sparse
+    fewest: int = 64  # number of rows from which a matrix may be treated as sparse
 
     @classmethod
     def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int]) -> "Pattern":
-        """Return the pattern with entries at these places."""
+        """Return the pattern with entries at these (row, column) pairs."""
         rows, columns = np.array(list(entries), int).reshape(-1, 2).T
         return cls(rows, columns, shape)
 
     @property
     def is_sparse(self) -> bool:
-        """Whether there are many rows, and few entries in them."""
+        """Return whether the matrix is large and sparse enough for sparse solution."""
         return self.shape[0] >= self.fewest and 16 * len(self.rows) <= self.shape[0] * self.shape[1]
 
     def dense(self, values: np.ndarray) -> np.ndarray:
-        """Return the matrices."""
+        """Return the dense matrices, (states, rows, columns)."""
         found = np.zeros((len(values), *self.shape))
         found[:, self.rows, self.columns] = values
         return found
@@ -49,10 +47,10 @@ class Pattern:
         return np.sqrt(_summed(self.rows, self.shape[0], values**2))
 
     def shortest(self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return the shortest x with `G x = right` at every state; where the sparse solution fails, by dense
-        matrices as `gauss_newton.shortest` does.
+        """Return the shortest x with `G x = right` at every state. Where the sparse solution fails, use dense
+        matrices as `roots.shortest` does.
 
-        `typical`: lengths of the rows, if some may be shorter.
+        `typical`: typical row lengths, which limit the scaling of short rows.
         """
         if not self.is_sparse:
             return shortest(self.dense(values), right, typical)
@@ -68,8 +66,8 @@ class Pattern:
         return found
 
     def solved(self, values: np.ndarray, f: np.ndarray) -> np.ndarray:
-        """Return `(G G')^-1 f` at every state, from one sparse system for all; NaN where it is singular or
-        not finite.
+        """Return `(G G')^-1 f` at every state from one block-diagonal sparse system; NaN if singular or not
+        finite.
         """
         from scipy import sparse
         from scipy.sparse.linalg import splu
@@ -78,13 +76,13 @@ class Pattern:
         states, (rows, columns) = np.arange(np.count_nonzero(known))[:, None], self.shape
         places = (states * rows + self.rows).ravel(), (states * columns + self.columns).ravel()
         G = sparse.csr_array((values[known].ravel(), places), shape=(states.size * rows, states.size * columns))
-        with contextlib.suppress(RuntimeError):  # a pivot of zero
+        with contextlib.suppress(RuntimeError):  # zero pivot
             factors = splu((G @ G.T).tocsc())
             found[known] = factors.solve(f[known].ravel()).reshape(-1, rows)
         return found
 
     def transposed_times(self, values: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """`G' y` at every state."""
+        """Return `G' y` at every state."""
         return _summed(self.columns, self.shape[1], values * y[:, self.rows])
 
 

@@ -1,4 +1,4 @@
-"""The command line `jourdain-jax`: thin, on top of everything else."""
+"""Command line `jourdain-jax`."""
 
 from jourdain_jax.cli.command import main
 

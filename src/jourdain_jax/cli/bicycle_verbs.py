@@ -1,4 +1,4 @@
-"""The verbs about bicycles: `bicycle FILE...` and `demo`."""
+"""Commands about bicycles: `bicycle FILE...` and `demo`."""
 
 import json
 import os
@@ -10,13 +10,13 @@ from jourdain_jax.bicycle.job import Refused, Study, run, table, write_results
 from jourdain_jax.bicycle.parameter_files import shipped_bicycles, shipped_measurements
 from jourdain_jax.plotting.bicycle_figures import animate_ride, draw_eigenvalues, draw_rides
 
-DEMO = "Rigid"  # a measured bicycle with all sigmas and a stable range
+DEMO = "Rigid"  # a measured bicycle with all standard errors and a stable speed range
 
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    job = verbs.add_parser("bicycle", help="stability speeds with uncertainty, and rides, of measured "
-        "bicycles")
+    job = verbs.add_parser("bicycle", help="stability speeds of measured bicycles with uncertainties, and "
+        "simulated rides")
     job.add_argument(
         "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements "
             "(*Measured.txt), or names of shipped bicycles"
@@ -24,16 +24,16 @@ def add(verbs) -> None:
     _options(job, "bicycle-results")
     job.set_defaults(run=_job)
 
-    demo = verbs.add_parser("demo", help=f"the same for a shipped bicycle ({DEMO})")
+    demo = verbs.add_parser("demo", help=f"run `bicycle` for a shipped bicycle ({DEMO})")
     _options(demo, "demo-results")
     demo.set_defaults(run=_job, files=[str(shipped_bicycles()[DEMO])])
 
 
 def _options(parser, folder: str) -> None:
     parser.add_argument("--out", default=folder, help=f"folder for tables and figures (default: {folder})")
-    parser.add_argument("--samples", type=int, default=2000, help="bicycles in the Monte Carlo (default "
+    parser.add_argument("--samples", type=int, default=2000, help="number of Monte Carlo samples (default "
         "2000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the Monte Carlo (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the Monte Carlo (default 0)")
     parser.add_argument("--no-figures", action="store_true", help="numbers only")
     parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
 
@@ -47,7 +47,7 @@ def _job(options) -> bool:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"cannot make the folder `{out}`: {error.strerror}; choose another with "
+        raise ValueError(f"cannot create the folder `{out}`: {error.strerror}; choose another with "
             "--out") from None
     studies = run(paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr))
     write_results(studies, out / "result.json")
@@ -62,8 +62,7 @@ def _job(options) -> bool:
 
 
 def prefixes(names: list[str]) -> list[str]:
-    """Return prefixes of file names of figures: empty for one bicycle, otherwise the bicycles' names,
-    numbered if they repeat.
+    """Return file name prefixes for the figures, numbered where bicycle names repeat; empty for one bicycle.
     """
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     return (
@@ -74,7 +73,7 @@ def prefixes(names: list[str]) -> list[str]:
 
 
 def _figures(study: Study, out: Path, prefix: str) -> list[Path]:
-    """`eigenvalues.png`, `ride.png`, `ride.gif`."""
+    """Draw `eigenvalues.png`, `ride.png` and `ride.gif`; return their paths."""
     written = []
     for name, draw in (("eigenvalues.png", draw_eigenvalues), ("ride.png", draw_rides), ("ride.gif", animate_ride)):
         path = out / f"{prefix}{name}"

@@ -1,7 +1,7 @@
-"""Parsing of the command line, and its exit codes.
+"""Argument parser, entry point and exit codes of the command line.
 
-Exit codes: 0 all went well; 1 something ran and failed its check (a verification, a motion that did not reach its end, a file refused);
-2 the command was wrong (unknown verb, name or option, unreadable file, bad number).
+Exit codes: 0 success; 1 a failed check (verification, incomplete motion, rejected file); 2 wrong usage
+(unknown verb, name or option, unreadable file, bad number).
 """
 
 import argparse
@@ -24,12 +24,12 @@ VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of all verbs."""
+    """Return the parser of all commands."""
     top = argparse.ArgumentParser(
         prog="jourdain-jax",
         description="Dynamics of holonomic and nonholonomic mechanical systems.",
-        epilog="exit codes: 0 well; 1 a check failed, a motion did not reach its end, or a file was refused; "
-            "2 wrong usage or unknown name",
+        epilog="exit codes: 0 success; 1 failed check, incomplete motion or rejected file; 2 wrong usage or "
+            "unknown name",
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version_of('jourdain-jax')}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -40,8 +40,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
-    if arguments is None:  # as a process of its own. Tracing makes millions of objects that live for a moment: garbage is looked for rarely
+    """Run one command and return its exit code."""
+    # run as a process: tracing makes millions of short-lived objects, so collect garbage rarely
+    if arguments is None:
         gc.freeze()
         gc.set_threshold(50_000, 20, 20)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -49,7 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
         return USAGE
     options = parser().parse_args(arguments)
-    if jaxlib.__version__.startswith("0.10."):  # less effort on programs that run once; another series may not know the flags
+    # cheaper compilation for programs that run once; other series may not know the flags
+    if jaxlib.__version__.startswith("0.10."):
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false "
             "--xla_backend_optimization_level=0")
     try:
@@ -57,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, InUseError, ImportError) as error:
         print(f"jourdain-jax: {error}", file=sys.stderr)
         return USAGE
-    except BrokenPipeError:  # the reader of our output (head, less) has gone
+    except BrokenPipeError:  # the process that reads our output (head, less) has exited
         sys.stderr.close()
         return OK
     except OSError as error:

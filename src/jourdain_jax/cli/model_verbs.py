@@ -1,4 +1,4 @@
-"""The verbs about models: `models`, `report`, `verify`, `simulate`."""
+"""Commands about models: `models`, `report`, `verify`, `simulate`."""
 
 import json
 from collections.abc import Mapping
@@ -25,17 +25,17 @@ from jourdain_jax.scene.scene import Scene
 def add(verbs) -> None:
     """Add the verbs to the parser."""
     listing = verbs.add_parser("models", help="list the models, or describe one: parameters, coordinates, "
-        "speeds, a typical start")
-    listing.add_argument("model", nargs="?", help="name of the one to describe (default: list all)")
-    listing.add_argument("--json", action="store_true", help="machine-readable: a list of objects")
+        "speeds, example start")
+    listing.add_argument("model", nargs="?", help="model to describe (default: list all)")
+    listing.add_argument("--json", action="store_true", help="print JSON")
     listing.set_defaults(run=_models)
 
-    about = verbs.add_parser("report", help="report on a model: freedoms, constraints, integrability, cyclic "
+    about = verbs.add_parser("report", help="degrees of freedom, constraints, integrability, cyclic "
         "coordinates")
     _model_options(about)
     about.set_defaults(run=_report)
 
-    checking = verbs.add_parser("verify", help="check a model's equations against each other")
+    checking = verbs.add_parser("verify", help="cross-check a model's equations")
     _model_options(checking)
     _start_options(checking)
     checking.set_defaults(run=_verify)
@@ -43,25 +43,26 @@ def add(verbs) -> None:
     running = verbs.add_parser("simulate", help="integrate a model's motion")
     _model_options(running)
     _start_options(running)
-    running.add_argument("--t1", type=float, help="end of the span, s (default: the model's example)")
-    running.add_argument("--samples", type=int, default=201, help="times saved (default 201)")
+    running.add_argument("--t1", type=float, help="end time in s (default: the model's example)")
+    running.add_argument("--samples", type=int, default=201, help="number of saved times (default 201)")
     running.add_argument("--rtol", type=float, default=1e-8, help="relative tolerance (default 1e-8)")
     running.add_argument("--atol", type=float, default=1e-8, help="absolute tolerance (default 1e-8)")
-    running.add_argument("--out", help="trajectory file to write (.npz)")
-    running.add_argument("--plot", metavar="FILE", help="plot of all coordinates to write (.png, .svg, .pdf)")
-    running.add_argument("--animate", metavar="FILE", help="animation to write (.gif)")
+    running.add_argument("--out", help="write the trajectory to this file (.npz)")
+    running.add_argument("--plot", metavar="FILE", help="write a plot of all coordinates to this file (.png, "
+        ".svg, .pdf)")
+    running.add_argument("--animate", metavar="FILE", help="write an animation to this file (.gif)")
     running.set_defaults(run=_simulate)
 
 
 def _model_options(parser) -> None:
-    parser.add_argument("model", help="name, see `jourdain-jax models`")
-    about = "parameters (see `jourdain-jax models MODEL`), and counts such as links=7"
+    parser.add_argument("model", help="model name, see `jourdain-jax models`")
+    about = "parameters (see `jourdain-jax models MODEL`) and counts such as links=7"
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=about)
     parser.add_argument("--json", action="store_true", help="machine-readable")
 
 
 def _start_options(parser) -> None:
-    about = "coordinates and speeds at the start; those not named begin at zero and are put onto the constraints (default: the model's example)"
+    about = "initial coordinates and speeds; others start at zero and are projected onto the constraints (default: the model's example)"
     parser.add_argument("--start", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=about)
 
 
@@ -69,7 +70,7 @@ def _pairs(words: list[str], what: str) -> dict[str, float]:
     values = {}
     for word in words:
         name, _, text = word.partition("=")
-        advice = f"; it takes NAME=VALUE with a number, for example {what} mass=2.5"
+        advice = f"; write NAME=VALUE with a number, for example {what} mass=2.5"
         values[name] = number(text, f"{what} `{word}`: the value", finite=False, advice=advice)
     return values
 
@@ -121,7 +122,7 @@ def _model_row(name: str) -> dict:
 
 
 def _description(row: dict) -> str:
-    """Return the description of a model, for readers."""
+    """Return the printed description of a model."""
     values = {key: f"{key}={entry['value']:g} {entry['unit'] or ''}".strip() for key, entry in row["parameters"].items()}
     lines = {
         "parameters (--set)": ", ".join([*values.values(), *(f"{key}={entry['value']}" for key, entry in row["counts"].items())]),
@@ -174,7 +175,7 @@ def _simulate(options) -> bool:
 
 
 def _check_files(options) -> None:
-    """Before a long run, not after it: the files can be written."""
+    """Check before the run that the output files can be written."""
     for check, path in ((check_place, options.out), (check_format, options.plot), (check_suffix, options.animate)):
         if path:
             check(path)
@@ -183,7 +184,8 @@ def _check_files(options) -> None:
 def _motion_row(name: str, trajectory: Trajectory) -> dict:
     found, scene = diagnose(trajectory), trajectory.scene
     names = (*scene.coordinate_names, *scene.speed_names)
-    of_contact = ("lowest_normal", "highest_normal", "friction_needed", "pulls", "determined")  # friction_needed: none where it is infinite
+    # friction_needed: null where infinite
+    of_contact = ("lowest_normal", "highest_normal", "friction_needed", "pulls", "determined")
     contacts = {key: {what: getattr(contact, what) for what in of_contact} for key, contact in found.contacts.items()}
     row = {
         "model": name,
@@ -204,7 +206,7 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
 
 
 def plain(x):
-    """Return numbers, texts and lists of them for JSON; values that are no JSON number become null."""
+    """Convert to JSON values; non-finite numbers become null."""
     if isinstance(x, Mapping):
         return {key: plain(value) for key, value in x.items()}
     if isinstance(x, tuple | list):

@@ -52,15 +52,17 @@ KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "keep_every", "chun
 
 def add(verbs) -> None:
     """Add the verb to the parser."""
-    sweep = verbs.add_parser("sweep", help="many motions: run a study that a TOML file describes; `sweep "
+    sweep = verbs.add_parser("sweep", help="run a study described by a TOML file, or `sweep "
         "status|resume|export|merge FOLDER`")
-    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="a TOML file; or one of " + ", ".join(ACTIONS) + ", and folders of studies")
-    sweep.add_argument("--out", help="folder of the study to create or continue; for `export`, the file to "
-        "write (.nc)")
-    sweep.add_argument("--workers", type=int, default=1, help="processes that compute (default 1)")
-    sweep.add_argument("--memory", help="memory for all of them together, such as 2GB")
-    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for "
-        "`sweep merge` later")
+    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="TOML file, or one "
+        "of " + ", ".join(ACTIONS) + ", "
+        "followed by folders of studies")
+    sweep.add_argument("--out", help="folder of the study (created or continued); for `export`, the .nc file "
+        "to write")
+    sweep.add_argument("--workers", type=int, default=1, help="number of worker processes (default 1)")
+    sweep.add_argument("--memory", help="total memory, such as 2GB")
+    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute only the K-th of N shares; "
+        "join them with `sweep merge`")
     sweep.add_argument("--quiet", action="store_true", help="no bar")
     sweep.add_argument("--json", action="store_true", help="machine-readable")
     sweep.set_defaults(run=_sweep)
@@ -70,9 +72,9 @@ def _sweep(options) -> bool:
     action, *paths = options.words
     if action not in ACTIONS:
         if paths:
-            raise ValueError(f"`{action}` is not a verb of `sweep`; {nearest(action, ACTIONS)} To run a "
+            raise ValueError(f"`{action}` is not an action of `sweep`; {nearest(action, ACTIONS)} To run a "
                 "study: jourdain-jax sweep FILE.toml --out FOLDER")
-        # bytes of a file, whose tables may have a row for each sample
+        # size limit in bytes; tables may have one row per sample
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
@@ -81,7 +83,7 @@ def _sweep(options) -> bool:
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
-            raise ValueError(f"`{paths[0]}` was begun from Python; run the same program again to continue")
+            raise ValueError(f"`{paths[0]}` was started from Python; run that program again to continue")
         return _run(text, f"{paths[0]}/run/study.json", paths[0], options)
     found = merge_studies(paths[0], paths[1:]) if action == "merge" else load_study(paths[0])
     if action == "export":
@@ -112,16 +114,16 @@ def _run(text: str, source: str, out: str, options) -> bool:
 
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
-    """Return the study that a file describes, with its bound on memory, and the arguments of its run."""
+    """Return the study described by a file and the arguments of its `run`; `memory` bounds the build."""
     check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):
             raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with "
                 "entries below it")
     known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
-    check_names(asked.get("options", {}), known_options, "`{}` is no entry of [options]")
+    check_names(asked.get("options", {}), known_options, "`{}` is not an entry of [options]")
     if "model" not in asked:
-        raise ValueError("the file names no `model`; write, for example, model = 'tilting-disc'")
+        raise ValueError("the file has no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))
     vary = {name: _varying(name, how) for name, how in asked.get("vary", {}).items()}
     start = {name: _varying(name, how) if isinstance(how, Mapping) else how for name, how in asked["start"].items()} if "start" in asked else None
@@ -169,7 +171,7 @@ def _shard(text: str) -> tuple[int, int]:
 def _export(found: StudyResult, options) -> bool:
     out = options.out or str(found.store.path.with_suffix(".nc"))
     if Path(out).suffix != ".nc":
-        raise ValueError(f"cannot export to `{out}`: expected a name that ends in .nc")
+        raise ValueError(f"cannot export to `{out}`: the name must end in .nc")
     found.to_netcdf(out)
     print(f"wrote {out}")
     return True

@@ -1,5 +1,6 @@
-"""Evaluation of traced functions on NumPy without compilation, for single evaluations.
+"""Evaluation of traced functions with NumPy, without compilation.
 
-In a copy of this code with XLA at its quickest in its place (optimisation level 0), a first result took 67 % longer for a tilting disc and 63 % for a bicycle
-(`bench/compile_time.py`): comparing a scalar program with dense matrices means running what is never run again.
+Replacing it by XLA at optimisation level 0 lengthened a first result by 67 % for a tilting disc and 63 % for
+a bicycle (`bench/compile_time.py`): checking a scalar program against dense matrices would compile code that
+runs only once.
 """

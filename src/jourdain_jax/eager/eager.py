@@ -1,4 +1,6 @@
-"""Functions traced and run on NumPy, one operation after another: a first call takes a tenth of the time of compilation."""
+"""Functions traced and evaluated operation by operation in NumPy. A first call takes a tenth of the time of a
+compilation.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache, wraps
@@ -15,10 +17,9 @@ from jourdain_jax.eager.numpy_backend import applied
 
 
 def eval_numpy(f: Callable) -> Callable:
-    """Run `f` immediately on concrete arguments, uncompiled. Return NumPy arrays, even if something else is
-    being traced.
+    """Run `f` uncompiled on concrete arguments and return NumPy arrays, even during another trace.
 
-    `lanes`: further arguments whose first axis is that of lanes; `f` receives those of one lane.
+    `lanes`: further arguments with a leading batch axis; `f` receives one sample of each.
     """
 
     @lru_cache(maxsize=32)
@@ -27,7 +28,7 @@ def eval_numpy(f: Callable) -> Callable:
 
     @wraps(f)
     def run(*arguments, lanes=()):
-        # a truth value is not a number here: it decides what is traced
+        # booleans stay static, because they decide which code is traced
         arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=lambda x: x is None)
@@ -38,11 +39,11 @@ def eval_numpy(f: Callable) -> Callable:
 
 
 def eager_if_concrete(f: Callable) -> Callable:
-    """Run `f` uncompiled if its arguments are numbers, so that a first call at a prompt takes a tenth of the
-    time. If they are traced, run it as usual.
+    """Run `f` uncompiled if its arguments are concrete, which makes a first call at a prompt ten times
+    faster. Otherwise trace it as usual.
 
-    Inside `f` the scene's numbers are traced. Decisions that depend on them (rank, privileged speeds) must
-    therefore be arguments.
+    Inside `f` the scene's numbers are traced, so choices that depend on them (rank, independent speeds) must
+    be arguments.
     """
     known, parameters = eval_numpy(f), signature(f)
 
@@ -58,10 +59,9 @@ def eager_if_concrete(f: Callable) -> Callable:
 
 
 def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
-    """Run `f`, a function of trees of arrays of one lane, on NumPy for arrays whose first axis is that of
-    lanes.
+    """Run `f`, a function of trees of arrays, in NumPy over a leading batch axis.
 
-    All lanes share the first `shared` arguments (None: they share all, and there are no lanes).
+    All samples share the first `shared` arguments (None: all of them, without a batch axis).
     """
 
     @lru_cache(maxsize=64)
@@ -74,7 +74,7 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
         def of_all(*leaves):
             return jax.vmap(one, [None if i < first else 0 for i in range(len(leaves))])(*leaves) if count else one(*leaves)
 
-        def one_by_one(*leaves):  # callbacks that take one lane at a time
+        def one_by_one(*leaves):  # for callbacks that take one sample at a time
             return jax.lax.map(lambda lane: one(*leaves[:first], *lane), leaves[first:])
 
         try:

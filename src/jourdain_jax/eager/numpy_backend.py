@@ -1,6 +1,6 @@
-"""Operations of JAX on NumPy arrays, for single evaluations, where compiling takes longer than running.
+"""JAX primitives on NumPy arrays, for single evaluations that take less time than a compilation.
 
-Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
+Primitives without a rule here run one by one in JAX, which takes tens of milliseconds each to compile.
 """
 
 import os
@@ -15,12 +15,12 @@ from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
 from jourdain_jax.calculus.markers import MAPS
 from jourdain_jax.calculus.scalar_operations import VALUES
 
-MOST_TURNS = 5000  # of a loop that states none: more of them are for ever
+MOST_TURNS = 5000  # iteration limit of a `while_loop`, beyond which it counts as endless
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
 
 
 def applied(equation, inputs) -> list[np.ndarray]:
-    """Results of one equation of a traced function."""
+    """Return the results of one equation of a jaxpr."""
     name, params = equation.primitive.name, equation.params
     inner = called(name, params)
     if inner is not None:
@@ -39,7 +39,7 @@ def applied(equation, inputs) -> list[np.ndarray]:
     return [np.asarray(x) for x in (result if equation.primitive.multiple_results else [result])]
 
 
-# Control flow: everything is known, so branches are taken and loops are run.
+# Control flow: all values are known, so branches are taken and loops are run.
 
 
 def _scan(equation, inputs) -> list[np.ndarray]:
@@ -47,12 +47,12 @@ def _scan(equation, inputs) -> list[np.ndarray]:
     constants, carry, xs = inputs[:fixed], inputs[fixed : fixed + carried], inputs[fixed + carried :]
     outs: list[list] = [[] for _ in range(len(params["jaxpr"].jaxpr.outvars) - carried)]
     order = range(params["length"])
-    before: list[np.ndarray] = []  # what was carried one turn ago
+    before: list[np.ndarray] = []  # carry of the previous iteration
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
         result = evaluated(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)], applied)
         before_last, before, carry = before, carry, result[:carried]
         if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
-            return carry  # an iteration that has converged, or goes back and forth: the rest changes nothing
+            return carry  # a fixed point or a cycle of two: further iterations change nothing
         for out, y in zip(outs, result[carried:], strict=True):
             out.append(y)
     avals = [v.aval for v in params["jaxpr"].jaxpr.outvars[carried:]]
@@ -76,15 +76,15 @@ def _while(equation, inputs) -> list[np.ndarray]:
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
-            f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; bound the "
-            "number of iterations, such as `lambda state: (state[0] < 50) & ...`, and check its condition"
+            f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; check its "
+                "condition or bound it, such as `lambda state: (state[0] < 50) & ...`"
         )
-    # where some lanes have ended, what the others would have found is not known
+    # some samples have ended; the results of the others are unknown, so NaN
     return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]
 
 
 def _where(equation) -> str:
-    """Return the function of the user's that an equation comes from."""
+    """Return the user's function from which an equation comes."""
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         if not any(part in frame.file_name for part in _NOT_THE_USERS):
@@ -144,8 +144,8 @@ def _round(equation, x):
 
 
 def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
-    """Return the operands of `dot_general` as matrices whose product is its result except for the shape;
-    batch axes come first.
+    """Return the operands of `dot_general` as matrices with batch axes first. Their product is its result up
+    to shape.
     """
     (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
@@ -175,9 +175,7 @@ def _select(equation, which, *cases):
 
 
 def _window(x, starts, sizes) -> tuple[slice, ...]:
-    """Return the part of an array that has these sizes and begins at `starts`, moved inside the array if
-    necessary.
-    """
+    """Return slices of these sizes starting at `starts`, shifted into the array if necessary."""
     begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
     return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 
@@ -223,7 +221,7 @@ def _triangular_solve(equation, A, b):
 
 def _lu(equation, A):
     """Return the LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their
-    permutation, for all matrices at once.
+    permutation. Leading axes are a batch.
     """
     *lanes, rows, columns = A.shape
     LU = np.array(A).reshape(-1, rows, columns)
@@ -240,7 +238,7 @@ def _lu(equation, A):
 
 
 def _platform(equation):
-    """Return the index of an implementation: that for CPUs, or that for all platforms."""
+    """Return the index of the CPU implementation, or of the one for all platforms."""
     return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
 
 
@@ -263,7 +261,7 @@ def _reshaped(equation, x, *dynamic):
 
 
 def gathered(equation, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
-    """`x[..., indices, ...]`."""
+    """Return `x[..., indices, ...]`, or None for an unsupported gather."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, lanes = _integers(numbers.start_index_map), _integers(numbers.operand_batching_dims)
     whole = all(size == (1 if axis in (*axes, *lanes) else x.shape[axis]) for axis, size in enumerate(sizes))
@@ -275,7 +273,7 @@ def gathered(equation, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
 
 
 def _places(x: np.ndarray, axes, lanes, lanes_of_indices, indices: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Return index arrays for the axes `(*lanes, *axes)` of x; None where one is out of bounds."""
+    """Return index arrays for the axes `(*lanes, *axes)` of x, or None if an index is out of bounds."""
     sizes = np.array([x.shape[axis] for axis in axes], int)
     if not np.all((indices >= 0) & (indices < sizes)):
         return None

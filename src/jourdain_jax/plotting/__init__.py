@@ -1,1 +1,3 @@
-"""Pictures of motions: quantities against time, bodies in space (by matplotlib, the extra `plot`), and 3D views for a browser."""
+"""Plots of quantities over time, pictures and animations (matplotlib, extra `plot`), and 3D views for a
+browser.
+"""

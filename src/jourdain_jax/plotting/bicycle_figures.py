@@ -1,4 +1,6 @@
-"""The figures of the bicycle job: eigenvalues against speed with uncertainty bands, rides against time, a ride in space."""
+"""Figures of the bicycle command: eigenvalues over speed with uncertainty bands, rides over time, a ride in
+space.
+"""
 
 
 import numpy as np
@@ -9,14 +11,14 @@ from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.plotting.pictures import animate
 from jourdain_jax.plotting.quantities import plot
 
-# columns of the eigenvalues; weave is a pair, two real ones below the double root
+# columns of the eigenvalues; weave is a complex pair, or two real ones below the double root
 _MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("weave", (2, 3), "tab:blue"))
-_CEILING = 12.0  # 1/s; castering goes far below what matters
+_CEILING = 12.0  # 1/s; castering falls far below the range of interest
 
 
 def draw_eigenvalues(study: Study, path: FilePath) -> None:
-    """Draw real and imaginary parts against forward speed. Bands lie between the 2.5 and 97.5 % quantiles of
-    the samples; the speeds of stability have such bands as well. The stable range is green.
+    """Draw real and imaginary parts of the eigenvalues over forward speed. Bands span the 2.5 to 97.5 %
+    quantiles of the samples, also for the weave and capsize speeds. The stable range is green.
     """
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")
@@ -31,8 +33,8 @@ def draw_eigenvalues(study: Study, path: FilePath) -> None:
     imaginary.set(ylabel="imaginary part in rad/s", xlabel="forward speed in "
         "m/s", xlim=(study.grid[0], study.grid[-1]))
     imaginary.set_ylim(bottom=0.0)
-    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands, grey for the speeds, hold "
-        f"95 % of {len(samples)} samples", fontsize=10)
+    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands (grey for the speeds) "
+        f"contain 95 % of {len(samples)} samples", fontsize=10)
     real.legend(loc="lower right", fontsize=9)
     for axis in (real, imaginary):
         axis.grid(alpha=0.3)
@@ -48,7 +50,7 @@ def _band(axis, speed, nominal, samples, colour, name) -> None:
 
 
 def _mark_range(study: Study, axes) -> None:
-    """The stable range in green, and the two speeds with their limits."""
+    """Mark the stable range in green and the weave and capsize speeds with their confidence limits."""
     speeds = {name: study.speeds[f"{name}_speed"] or {"value": np.inf, "low": None, "high": None} for name in ("weave", "capsize")}
     weave, last = speeds["weave"]["value"], study.grid[-1]
     end = speeds["capsize"]["value"] if speeds["capsize"]["value"] > weave else last
@@ -70,7 +72,7 @@ def _mark_range(study: Study, axes) -> None:
 
 
 def draw_rides(study: Study, path: FilePath) -> None:
-    """Lean and steer against time for the three rides."""
+    """Draw lean and steer over time for the three rides."""
     rides = study.rides
     lanes = [rides.lanes.lane(i) for i in range(len(rides.labels))]
     labels = [f"{speed:.2f} m/s, {label}" for label, speed in zip(rides.labels, rides.speeds, strict=True)]
@@ -89,7 +91,7 @@ def draw_rides(study: Study, path: FilePath) -> None:
 
 
 def animate_ride(study: Study, path: FilePath) -> None:
-    """The first ride (below the stable range) in space, the view following the bicycle."""
+    """Animate the first ride (below the stable range), with the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)
     animate(lane, path, follow=True, paths=[], title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, "

@@ -1,6 +1,5 @@
-"""The drawing of a motion: bodies with their looks at all reached saved times, and their contacts with the
-ground. Bodies without a look of their own have one from their constructor, their outline, their contacts, or
-their inertia.
+"""Drawing of a motion: shapes of the bodies and their contacts at all saved times reached. Bodies without
+visuals take a shape from their constructor, outline, contacts or inertia.
 """
 
 from dataclasses import dataclass
@@ -24,54 +23,54 @@ from jourdain_jax.scene.validated import contacts_of, visuals_of
 from jourdain_jax.scene.visuals import Visual
 
 PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
-PLAIN = "#8a8a86"  # of what belongs to no body
+PLAIN = "#8a8a86"  # colour of visuals that belong to no body
 
 
 @dataclass(frozen=True)
 class DrawnBody:
-    """A body at all times. The inertial frame is a body at rest with the name `""`."""
+    """Body at all times. The inertial frame is a body at rest named `""`."""
 
     name: str
     colour: str
     positions: np.ndarray  # (times, 3), m
     orientations: np.ndarray  # (times, 3, 3)
     angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
-    looks: list[Visual]  # all arrays with a leading axis of times; sizes are those at the first
+    looks: list[Visual]  # all arrays with a leading axis of times; sizes are taken at the first time
 
     def extents(self) -> np.ndarray:
-        """Return points (times, points, 3) in space, m, whose box holds the body."""
+        """Return points (times, points, 3) in space, m, whose bounding box contains the body."""
         local = [np.broadcast_to(points, (len(self.positions), *points.shape[-2:])) for points in map(_corners_of, self.looks)]
         return np.einsum("tij,tpj->tpi", self.orientations, np.concatenate(local, axis=1)) + self.positions[:, None]
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """The drawing of one motion."""
+    """Drawing of one motion."""
 
-    ts: np.ndarray  # (times,), s; those that were reached
-    reached: np.ndarray  # their numbers among all saved times
+    ts: np.ndarray  # (times,), s; only times that were reached
+    reached: np.ndarray  # indices of `ts` among all saved times
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
-    sized: bool  # whether any body has a size of its own; particles are drawn as large as the picture asks
+    sized: bool  # whether any body has a known size; otherwise particles are sized to suit the picture
 
     @property
     def size(self) -> float:
-        """Return the longest side (m) of the box that holds all bodies at the first time."""
+        """Return the longest side (m) of the bounding box of all bodies at the first time."""
         return float(max(np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(), 1e-3))
 
     @property
     def thin(self) -> float:
-        """Radius of a line that has none, m."""
+        """Return the default radius of lines, m."""
         return 0.011 * self.size
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
-    """Return the drawing of a motion, with at most `most` of its saved times, evenly spaced. Raises
-    ValueError if it reached none of them.
+    """Return the drawing of a motion at up to `most` evenly spaced saved times. Raises ValueError if it
+    reached none.
     """
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
-        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; give "
+        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; pass "
             "earlier `ts`")
     if most is not None and most < reached.size:
         reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
@@ -88,8 +87,7 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     bodies, velocities, visuals, contacts = seen
     paths = np.concatenate([np.asarray(body.position) for body in bodies.values()])
     first = {name: _at(body, 0) for name, body in bodies.items()}
-    # a particle that moves far is small in the picture: what has no size is measured by the whole motion, if there is nothing else
-    # radius of a particle, of the size of what is drawn
+    # radius of particles, relative to the extent of the whole motion
     dot = 0.02 * max(float(np.ptp(paths, axis=0).max()), 1e-3)
     stated = {name: list(looks) for name, looks in visuals.items()}
     sized = any(isinstance(body, RigidBody) or name in stated for name, body in first.items())
@@ -120,9 +118,7 @@ def _seen(scene, t, q, u, inputs):
 
 
 class Curved(eqx.Module):
-    """A placeholder for a ground that is a function of one instant: the scene is evaluated again where the
-    ground is drawn.
-    """
+    """Placeholder for a ground given by a function of a point, which is evaluated again when it is drawn."""
 
 
 def _at(tree, index):
@@ -130,8 +126,8 @@ def _at(tree, index):
 
 
 def _corners_of(visual: Visual) -> np.ndarray:
-    """Return points (points, 3) in the frame of the body, m, whose box holds the shape at the first time. For
-    a line these are its own points, with a leading axis of times.
+    """Return points (points, 3) in the body frame, m, whose bounding box contains the shape at the first
+    time. For a line, return its points with a leading axis of times.
     """
     if visual.kind == "line":
         return np.asarray(visual.size)
@@ -147,8 +143,8 @@ def _corners_of(visual: Visual) -> np.ndarray:
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
-    """Return the shapes of a `body` that rolls on `shapes`, at one time. `dot` (m): radius of a body without
-    size.
+    """Guess the shapes of a `body` without visuals that rolls on `shapes`. `dot`: radius (m) of a body
+    without size.
     """
     if isinstance(body, Particle):
         return [Visual.ball(dot)]
@@ -162,15 +158,14 @@ def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list
 
 
 def _solid(kind: str, corner: np.ndarray) -> Visual:
-    """Return the solid within a box, from its corner."""
+    """Return the solid of this kind that fills a box centred at the mass centre, with this corner."""
     if kind == "wheel":
         return Visual.wheel(corner.max(), 2 * corner.min(), axis="xyz"[int(np.argmin(corner))])
     return Visual.box(2 * corner) if kind == "box" else Visual.ellipsoid(corner)
 
 
 def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
-    """Return the rolling shape, in the frame of the body; a shape knows its own place in the inertial frame.
-    """
+    """Return the rolling shape in the body frame; `shape` is given in the inertial frame."""
     to_body = np.asarray(body.orientation).T
     at = to_body @ (np.asarray(shape.centre) - np.asarray(body.position))
     if isinstance(shape, Ball):
@@ -183,8 +178,8 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
-    """Return the uniform box of this mass and inertia: `a^2 = 6 (B + C - A)/m` from its principal moments A,
-    B, C; none if one of its sides is not positive.
+    """Return the uniform box of this mass and inertia, empty if its largest side is not positive. Its sides
+    follow from the principal moments A, B, C by `a^2 = 6 (B + C - A)/m`.
     """
     moments, axes = np.linalg.eigh(np.asarray(body.inertia))
     mass = float(body.mass)

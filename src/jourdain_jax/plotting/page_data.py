@@ -1,4 +1,4 @@
-"""Motions as data for the 3D page: a description in JSON, and an array of 32-bit floats that it refers to."""
+"""Data of the 3D page: a description in JSON and the array of 32-bit floats to which it refers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from jourdain_jax.scene.visuals import Visual
 
 @dataclass(frozen=True)
 class Display:
-    """Settings of `show`."""
+    """Display settings of `show`."""
 
     title: str
     follow: bool | None = None
@@ -30,32 +30,32 @@ class Display:
 
 @dataclass
 class Numbers:
-    """A list of 32-bit floats, and the location of arrays in it: pairs of first index and count."""
+    """Buffer of 32-bit floats. Arrays in it are located by pairs (first index, count)."""
 
     parts: list[np.ndarray] = field(default_factory=list)
     count: int = 0
 
     def add(self, array) -> tuple[int, int]:
-        """Store a flat array; return its place."""
+        """Append an array and return its location."""
         flat = np.asarray(array, np.float32).ravel()
         self.parts.append(flat)
         self.count += flat.size
         return self.count - flat.size, flat.size
 
     def bytes(self) -> bytes:
-        """Return all of them, little-endian."""
+        """Return the buffer as little-endian bytes."""
         return np.concatenate(self.parts).astype("<f4").tobytes()
 
 
 def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Numbers]:
-    """Return the description of the page, and its numbers."""
+    """Return the description of the page and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
     everywhere = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
     near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), everywhere))
     size, reach = (float(np.ptp(box, axis=0).max()) for box in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    # by itself, where the whole motion is five times as long as its bodies
+    # follow by default if the motion spans more than five times the size of its bodies
     follow = first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
     shown = size if follow else max(size, reach / 3)
     arrows, longest = _arrows(motions, drawn, shown) if display.forces else ([[] for _ in drawn], "")
@@ -130,8 +130,8 @@ def _ground(numbers: Numbers, ground: dict) -> dict:
 
 
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
-    """Return quaternions (times, 4), x y z w, of rotation matrices (times, 3, 3). Each has the sign that
-    brings it nearest to the one before.
+    """Convert rotation matrices (times, 3, 3) to quaternions (times, 4) in the order x y z w, with signs that
+    make them continuous in time.
     """
     found = matrices_to_quaternions(rotations)[:, [1, 2, 3, 0]]
     signs = np.sign(np.sum(found[1:] * found[:-1], axis=1))
@@ -140,8 +140,8 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """Return the whole turns of a body between saved times, which fast wheels make in addition to the
-    shortest rotation.
+    """Return the whole turns of a body between saved times, in addition to the shortest rotation; fast wheels
+    need them.
     """
     if len(ts) < 2:
         return np.zeros(1)
@@ -157,12 +157,12 @@ def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray
 
 
 def _still(values: np.ndarray) -> np.ndarray:
-    """Return values at all times; at one time if they are constant."""
+    """Return the values at all times, or only at the first if they are constant."""
     return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + largest(values)) else values
 
 
 def _at_rest(drawn: Drawn) -> bool:
-    """Return whether something stands in the inertial frame, such as a table."""
+    """Return whether the scene has fixed visuals in the inertial frame, such as a table."""
     return "" in drawn.bodies and any(len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks)
 
 
@@ -171,8 +171,8 @@ def _moves(body: DrawnBody) -> bool:
 
 
 def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
-    """Return points (points, 3), m, relative to the middle of the bodies at each time. Their box holds the
-    bodies at every time.
+    """Return points (points, 3), m, relative to the centre of the bodies at each time. Their bounding box
+    contains the bodies at every time.
     """
     points = []
     for one in drawn:
@@ -183,11 +183,11 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
-    """Return name, point and scaled force of every contact of all motions at all times, and the force that
-    the longest arrow represents.
+    """Return (name, point, scaled force) of every contact of each motion, and a note on the force of the
+    longest arrow.
 
-    If a few forces are far larger than the others (a fall, a nearly singular configuration), all of them have
-    the longest arrow, so that the others remain visible.
+    If a few forces are far larger than the others (a fall, a nearly singular configuration), their arrows are
+    truncated so that the others remain visible.
     """
     found = []
     for motion, one in zip(motions, drawn, strict=True):
@@ -202,7 +202,8 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
     strongest = float(sizes.max())
     usual = 2.0 * float(np.quantile(sizes[1:], 0.9)) if strongest else 0.0
     longest = usual if 0.0 < 2.0 * usual <= strongest else strongest
-    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} N" if longest < strongest else "") if strongest else ""
+    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} "
+        "N" if longest < strongest else "") if strongest else ""
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         return 0.4 * size * vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest or 1.0)

@@ -1,6 +1,4 @@
-"""Pictures by matplotlib from a scene's bodies: animations, stills at a few times, and the view of a scene in
-a notebook.
-"""
+"""Pictures of a scene's bodies with matplotlib: animations, stills, and the view of a scene in a notebook."""
 
 from collections.abc import Sequence
 
@@ -16,11 +14,12 @@ from jourdain_jax.plotting.looks import Drawn, looks_at, looks_of
 from jourdain_jax.plotting.space import axes_in_space, box_of, draw, legend, painted
 from jourdain_jax.scene.arguments import of_known_numbers
 
-VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
+# elevation and azimuth, degrees
+VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}
 
 
 def check_suffix(path: FilePath) -> None:
-    """ValueError where an animation cannot be written to a file of this name."""
+    """Raise ValueError if an animation cannot be written to this path."""
     check_place(path)
     if not str(path).lower().endswith(".gif"):
         raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
@@ -39,14 +38,15 @@ def animate(
 ) -> None:
     """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
 
-    - `frames`: their largest number; frames are evenly spaced saved times. The playing time is the motion's
-      own, between 2 and 12 s.
+    - `frames`: maximum number of frames, taken at evenly spaced saved times. The playing time is that of the
+      motion, between 2 and 12 s.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
     - `follow`: move the view with the bodies instead of showing the whole path. `view`: elevation and azimuth
       in degrees.
     - `title`: a line above the drawing (default: none).
 
-    ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
+    Raises ValueError for a suffix other than .gif or a motion that reached none of its times, and ImportError
+    without matplotlib.
     """
     _check_one(trajectory, "`animate`", "jj.animate(rollout.lane(0), 'lane-0.gif')")
     frames = checked_whole(frames, "`frames`", 1, expected="of at least 1")
@@ -59,7 +59,7 @@ def animate(
     bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
     boxes = np.stack([box_of(faces[:1]) for faces in bodies])
     whole = box_of([*boxes, *traces])
-    half = np.ptp(boxes, axis=1).max() * 0.62  # of the side of the square that follows the bodies
+    half = np.ptp(boxes, axis=1).max() * 0.62  # half the side of the square that follows the bodies
     figure = plt.figure(figsize=(6.0, 5.0))
     axes = axes_in_space(figure, view, (0.03, 0.02, 0.9, 0.88))
     clock = figure.text(0.03, 0.91, "", family="monospace")
@@ -94,7 +94,8 @@ def draw_still(
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
     - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
 
-    ValueError for a rollout, an unknown view or body, or a motion that reached none of its times; ImportError without matplotlib.
+    Raises ValueError for a rollout, an unknown view or body, or a motion that reached none of its times, and
+    ImportError without matplotlib.
     """
     _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
     if isinstance(view, str) and view not in VIEWS:
@@ -115,15 +116,15 @@ def draw_still(
 
 
 def scene_picture(scene) -> str:
-    """Return HTML of a scene's bodies at its `example`, in space, on a floor with their shadows; empty if
-    there are no bodies.
+    """Return HTML with a picture of a scene's bodies and their shadows at its `example`; empty if there are
+    none.
 
-    A scene that cannot be started has no picture, since a notebook also displays unfinished scenes;
-    `jj.start` reports their faults.
+    A scene that cannot start has no picture, because notebooks also display unfinished scenes. `jj.start`
+    reports their faults.
     """
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
-    except Exception:  # whatever the user's methods raise, and that numbers are not known
+    except Exception:  # user methods may raise anything, and the parameters may be traced
         return ""
     return figure_in_html(lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200)
 
@@ -131,9 +132,9 @@ def scene_picture(scene) -> str:
 def _check_one(trajectory, where: str, example: str) -> None:
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
         raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a rollout "
-            f"give one lane: {example}")
+            f"pass one lane: {example}")
 
 
 def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:
-    """Paths (times, 3) of points of bodies, m."""
+    """Return the paths (times, 3) of body points, m."""
     return [np.asarray(trajectory.point(*end))[drawn.reached] for end in ends]

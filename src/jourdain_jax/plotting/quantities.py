@@ -1,5 +1,4 @@
-"""Named quantities of motions against time, and of families against each other; for many motions, bands that
-hold given fractions of them.
+"""Plots of named quantities over time, with quantile bands for rollouts, and of families against a parameter.
 """
 
 import os
@@ -19,7 +18,7 @@ from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
-UNITS = {  # by what is measured in them, in those of SI
+UNITS = {  # size in SI units, by kind of quantity
     "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
     "coordinate": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi},
     "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "rad/s": 1.0, "deg/s": np.pi / 180, "turn/s": 2 * np.pi, "rpm": np.pi / 30},
@@ -28,13 +27,13 @@ UNITS = {  # by what is measured in them, in those of SI
 
 
 def check_format(path: FilePath) -> None:
-    """ValueError where matplotlib knows no picture with the suffix of this path."""
+    """Raise ValueError if matplotlib cannot write a picture to this path."""
     known = pyplot().FigureCanvasBase.get_supported_filetypes()
     check_place(path)
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
-        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows "
-            f"no `{suffix or 'file without suffix'}`")
+        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file; matplotlib cannot "
+            f"write `{suffix or 'file without suffix'}`")
 
 
 @of_known_numbers
@@ -48,22 +47,24 @@ def plot(
     path: FilePath | None = None,
     axes: Any = None,
 ) -> tuple[Any, Any]:
-    """Plot named quantities of a `motion` against time, one panel each.
+    """Plot named quantities of a `motion` over time, one panel each.
 
     - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour;
       `labels`: their names in the legend.
-    - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"`, `"energy"`, their sum (default:
-      all coordinates of the first motion). For a rollout, coordinates and speeds only: the median of all
-      lanes that are still under way, and a band for each fraction of the lanes in `bands`.
+    - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"` or their sum `"energy"` (default:
+      all coordinates of the first motion). A rollout allows coordinates and speeds only. It is drawn as the
+      median of the samples still running and a band for each fraction in `bands`.
     - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians).
       Coordinates: m, km, cm, mm, rad, mrad, deg, turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s,
-      rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h. - A family (`jj.family`) is drawn against its own
-      values: `jj.plot(turns, "x_rate", "lean")`, stable parts as full lines, special points marked.
-    - `title`: default: for a rollout, the results of its lanes. `path`: of a file to write (.png, .svg,
-      .pdf); `axes`: existing axes, one per name.
+      rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
+    - A family (`jj.family`) is drawn against one of its quantities, named first:
+      `jj.plot(turns, "x_rate", "lean")`. Stable parts are solid lines; special points are marked.
+    - `title`: default for a rollout: the number of samples that stopped or failed. `path`: file to write
+      (.png, .svg, .pdf); `axes`: existing axes, one per name.
 
-    Returns the matplotlib figure and an array of its axes, shape (names,). KeyError for an unknown name, with the nearest valid one; ValueError for an
-    unknown unit, bands outside 0 to 1, or anything that is not a motion; ImportError without matplotlib.
+    Returns the matplotlib figure and an array of its axes, shape (names,). Raises KeyError for an unknown
+    name, ValueError for an unknown unit, bands outside 0 to 1 or an invalid motion, and ImportError without
+    matplotlib.
 
     **Examples**
 
@@ -102,19 +103,18 @@ def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands:
     if title:
         axes[0].set_title(title, fontsize="medium", loc="left")
     handles, texts = axes[0].get_legend_handles_labels()
-    if texts:  # above all panels of a figure of our own, where it hides nothing: a column for each motion, or for each entry where there is one motion
+    # legend above all panels of a new figure: one column per motion, or per entry for a single motion
+    if texts:
         row: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(motions) if len(motions) > 1 else len(texts), 4)}
         (axes[0].figure if own else axes[0]).legend(handles, texts, fontsize="small", **(row if own else {}))
     return axes[0].figure, axes
 
 
 def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
-    """Draw every further name against the first one: stable parts as full lines, others dashed, special
-    points marked.
-    """
+    """Draw every further name against the first: stable parts solid, others dashed, special points marked."""
     if len(names) < 2:
-        raise ValueError("`plot` of a family takes the name on the horizontal axis and at least one name on "
-            f"the vertical axis, but {len(names)} were given")
+        raise ValueError("`plot` of a family needs a name for the horizontal axis and at least one for the "
+            f"vertical axis, got {len(names)} names")
     scene = family.equations.scene
     sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
     label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
@@ -136,13 +136,13 @@ def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
 
 
 def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
-    """Return one panel for each name, below each other; the user's axes if given."""
+    """Return one panel per name in a column, or the user's axes if given."""
     if axes is None:
         size = 7.0, 1.2 + height * len(names)
         axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
     axes = np.atleast_1d(axes)
     if len(axes) != len(names):
-        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names, expected one for each of "
+        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names; pass one for each of "
             f"{', '.join(names)}")
     for axis in axes:
         axis.grid(alpha=0.3)
@@ -150,17 +150,17 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
 
 
 def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
-    """Return name -> unit and its size in SI. Raises KeyError for an unknown name, ValueError for an unknown
-    unit or one of another quantity.
+    """Return name -> (unit, size in SI). Raises KeyError for an unknown name, ValueError for an unknown or
+    unsuitable unit.
     """
     check_kind(units, Mapping | None, "`units`", 'a dictionary from names to units, such as {"lean": "deg"}')
     kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
     kinds |= dict.fromkeys(ENERGIES, "energy") | {"t": "time"}
     found = {"t": ("s", 1.0)}
     for name, unit in (units or {}).items():
-        check_name(name, kinds, f"`units` names `{name}`, which is nothing to plot", UnknownNameError)
+        check_name(name, kinds, f"`units` names `{name}`, which cannot be plotted", UnknownNameError)
         known = UNITS[kinds[name]]
-        check_name(unit, known, f"`{unit}` is no unit of the {kinds[name]} `{name}` that is known here")
+        check_name(unit, known, f"`{unit}` is not a known unit of the {kinds[name]} `{name}`")
         found[name] = unit, known[unit]
     return found
 
@@ -182,8 +182,7 @@ def _checked_labels(labels, count: int) -> list[str]:
     if labels is None:
         return [""] if count == 1 else [f"motion {k}" for k in range(count)]
     if isinstance(labels, str) or len(labels) != count:
-        raise ValueError(f"`labels` is {labels!r}, expected a list with one label for each of {count} "
-            "motions")
+        raise ValueError(f"`labels` is {labels!r}, expected a list of {count} labels, one per motion")
     return [str(label) for label in labels]
 
 
@@ -193,8 +192,7 @@ def _checked_bands(bands) -> list[float]:
     except (TypeError, ValueError):
         parts = [np.nan]
     if not all(0 < part < 1 for part in parts):
-        raise ValueError(f"`bands` is {bands!r}, expected fractions of the lanes between 0 and 1, such as "
-            "(0.5, 0.95)")
+        raise ValueError(f"`bands` is {bands!r}, expected fractions between 0 and 1, such as (0.5, 0.95)")
     return parts
 
 
@@ -203,8 +201,7 @@ def _scene(motion: Trajectory | Rollout):
 
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """Draw a line. For a rollout, draw the bands, widest and palest first, and the median. `y`: as returned
-    by `_values`.
+    """Draw a line, or for a rollout the bands (widest and palest first) and the median. `y`: from `_values`.
     """
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
@@ -218,12 +215,10 @@ def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], co
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:
-    """Return values at all times; for a rollout the lower and upper end of each band in turn, then the
-    median.
-    """
+    """Return values at all times; for a rollout the lower and upper end of each band, then the median."""
     many, scene = isinstance(motion, Rollout), _scene(motion)
     valid = (*scene.coordinate_names, *scene.speed_names, *(() if many else ENERGIES))
-    check_name(name, valid, f"nothing named `{name}` to plot", UnknownNameError)
+    check_name(name, valid, f"`{name}` cannot be plotted", UnknownNameError)
     if isinstance(motion, Rollout):
         return motion.quantiles(name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5])
     if name in ENERGIES:

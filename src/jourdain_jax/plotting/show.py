@@ -1,4 +1,4 @@
-"""Motions to turn, zoom and play: a self-contained HTML page, drawn by three.js."""
+"""Interactive 3D views of motions: a self-contained HTML page drawn by three.js."""
 
 import base64
 import html
@@ -20,14 +20,16 @@ from jourdain_jax.scene.names import check_names
 
 
 class View:
-    """A page that shows motions, `html`; displays itself in a notebook. `save(path)` writes it to a file."""
+    """3D view of motions as an HTML page, `html`. It displays itself in a notebook; `save(path)` writes it to
+    a file.
+    """
 
     def __init__(self, page: str, title: str, height: int):
         self.html, self.title, self.height = page, title, height
 
     def save(self, path: FilePath) -> None:
-        """Write the page to `path` (.html), one file that needs neither other files nor a network. Raises
-        ValueError for another suffix.
+        """Write the page to `path` (.html) as one file that needs no network. Raises ValueError for another
+        suffix.
         """
         _check_suffix(path)
         with open(path, "w", encoding="utf-8") as file:
@@ -38,28 +40,26 @@ class View:
         return f'<iframe srcdoc="{page}" title="{html.escape(self.title)}" style="width:100%;height:{self.height}px;border:1px solid #ddd"></iframe>'
 
     def __repr__(self) -> str:
-        return f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; shown in a notebook, or written to a file by .save('view.html')"
+        return f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; a notebook displays it, .save('view.html') writes it to a file"
 
 
 @of_known_numbers
 def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath | None = None, **how: Any) -> View:
     """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
-    - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly
-      spaced), drawn one over the other, all but the first translucent.
-    - `path`: a file (.html) to write as well, which needs no other file. `ride.html#t=2.5` opens at 2.5 s.
-    - `how`, by name: `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels
-      (480).
-    - `play`: whether it plays when it opens.
-    - `follow`: the view moves with the bodies (default: if they go far). `view`: initial elevation and
+    - `motion`: from `jj.simulate`; or a list of motions, or a rollout (at most 12 samples, evenly spaced),
+      drawn over each other, all but the first translucent.
+    - `path`: an .html file to write as well. `ride.html#t=2.5` opens at 2.5 s.
+    - `how`, by name: `title`: default: the name of the scene. `height`: height in pixels in a notebook (480).
+    - `play`: start playing when opened.
+    - `follow`: move the view with the bodies (default: if they travel far). `view`: initial elevation and
       azimuth, in degrees (default: (22, -60)).
     - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres if there
       is no contact).
-    - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body ->
-      "#rrggbb".
+    - `forces`: draw arrows for the contact forces (default: True). `colours`: name of a body -> "#rrggbb".
 
-    Looks of bodies come from the scene's `visuals`, see `jj.Visual`; otherwise they are guessed. Returns a
-    `View`. ValueError for other arguments.
+    Bodies look as the scene's `visuals` define (see `jj.Visual`), otherwise as guessed from their shapes and
+    inertias. Returns a `View`. Raises ValueError for invalid arguments.
 
     **Examples**
 
@@ -83,7 +83,7 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath |
 
 
 def _motions(given) -> list[Trajectory]:
-    """Return the single motions of the argument."""
+    """Return the argument as a list of single motions."""
     if isinstance(given, Rollout):
         chosen = np.unique(np.linspace(0, len(given) - 1, min(12, len(given))).astype(int))
         lanes = [given.lane(int(k)) for k in chosen]

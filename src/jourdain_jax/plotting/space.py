@@ -1,4 +1,4 @@
-"""Bodies in space by matplotlib: lit faces and shadows on a floor, within axes in metres."""
+"""3D drawings with matplotlib: lit bodies and their shadows on a floor, with axes in metres."""
 
 from collections.abc import Sequence
 
@@ -11,12 +11,12 @@ from jourdain_jax.plotting.looks import Drawn
 from jourdain_jax.plotting.solids import Quads, faces_of, split
 
 Painted = tuple[Quads, Float[np.ndarray, "faces 4"]]  # faces in space, and their red, green, blue and opacity
-_LIGHT = np.array([0.15, -0.4, 0.9])  # towards it
-_INK = "#444444"  # of paths
+_LIGHT = np.array([0.15, -0.4, 0.9])  # direction towards the light
+_INK = "#444444"  # colour of paths
 
 
 def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
-    """Return all bodies at the time with number `k`; `strength` below 1: paler."""
+    """Return the faces and colours of all bodies at time index `k`; `strength` below 1 makes them paler."""
     corners, colours, size = [], [], drawn.size
     for body in drawn.bodies.values():
         for look in body.looks:
@@ -34,19 +34,19 @@ def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
 
 
 def normals_of(faces: Quads) -> Float[np.ndarray, "faces 3"]:
-    """Unit vectors out of faces; zero where one has no area."""
+    """Return the outward unit normals of faces; zero for faces without area."""
     found = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300)
 
 
 def rgb(colour: str) -> Float[np.ndarray, "3"]:
-    """Red, green and blue, 0 to 1, of a colour "#rrggbb"."""
+    """Return red, green and blue, 0 to 1, of a colour "#rrggbb"."""
     return np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
 
 
 def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
-    """Return the lowest and the highest corner of the box that holds all points, m, and the floor below them,
-    with a margin at the sides.
+    """Return the lowest and highest corners (m) of a box around all points and the floor below them, with a
+    margin.
     """
     points = np.concatenate([x.reshape(-1, 3) for x in faces])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -55,10 +55,8 @@ def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
 
 
 def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, float, float] | None = None):
-    """Return axes of a matplotlib figure, seen from this elevation and azimuth (degrees). The axis along the
-    line of sight is hidden.
-
-    Without `place`, the floor has no numbers.
+    """Return 3D axes of a matplotlib figure, seen from this elevation and azimuth (degrees). The axis along
+    the line of sight is hidden. Without `place`, the axes have no numbers.
     """
     axes = figure.add_subplot(projection="3d", proj_type="ortho", computed_zorder=False)
     axes.view_init(*view)
@@ -78,8 +76,8 @@ def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, 
 
 
 def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarray, "2 3"]) -> None:
-    """Draw bodies with their shadows and paths (times, 3) in place of the present content. `box`: the visible
-    region, from its lowest corner to its highest.
+    """Replace the drawing by bodies with shadows and by paths (times, 3). `box`: lowest and highest corners
+    of the visible region.
     """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -103,14 +101,14 @@ def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarr
 
 
 def towards(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
-    """Unit vector from the scene to the eye; angles in degrees."""
+    """Return the unit vector from the scene towards the viewer; angles in degrees."""
     e, a = np.radians((elevation, azimuth))
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def legend(figure, drawn: Drawn, paths: int = 0) -> None:
-    """Draw names of the bodies in a row above the picture. If there are many, draw only the first, the second
-    and the last.
+    """Draw a legend of the bodies above the picture. If there are more than four, show the first two and the
+    last.
     """
     plt, colours = pyplot(), {name: body.colour for name, body in drawn.bodies.items() if name}
     names = list(colours) if len(colours) <= 4 else [*list(colours)[:2], list(colours)[-1]]

@@ -1,1 +1,3 @@
-"""Scalar programs: a graph of expressions, derivatives and normal forms on it, its values on NumPy arrays, and code from it."""
+"""Scalar programs: a graph of expressions with derivatives, normal forms, NumPy evaluation and code
+generation.
+"""

@@ -1,6 +1,5 @@
-"""Analytic expressions. An expression of +, -, *, /, roots, sines and cosines that is zero at random states
-is zero everywhere. An expression with a branch, a function that is flat somewhere, or an opaque call may be
-zero at every probe and not elsewhere.
+"""Analyticity of expressions. An expression of +, -, *, /, roots, sines and cosines that is zero at random
+states is zero everywhere. Branches, functions that are flat somewhere, and opaque calls break this rule.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -20,8 +19,7 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
 
 
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
-    """Return whether an operation of these kinds that influences the outputs depends on one of the variables.
-    """
+    """Return whether any operation of these kinds in the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
     decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
     return any(depend_on(graph, decisions, variables))

@@ -1,9 +1,9 @@
-"""Calls of JAX in a graph of scalars: the parts of a traced function that have no scalar form.
+"""JAX calls in a graph of scalars: the parts of a traced function that have no scalar form.
 
-    array   entries put together             opaque  the results of a `Call` of arrays
-    output  one of these results             entry   one entry of it, a scalar again
+    array   scalars combined into an array    opaque  the results of a `Call` of arrays
+    output  one of these results              entry   one of its entries, again a scalar
 
-The values of an array may have axes of lanes, which come last, as a scalar's do.
+Values may have batch axes, which come last.
 """
 
 import functools
@@ -21,15 +21,17 @@ from jourdain_jax.program.graph import Unsupported
 
 
 class Call:
-    """A closed jaxpr, and the reason why it is kept as a call. Two calls are equal if they do the same
+    """Closed jaxpr, and the reason why it is kept as a call. Two calls are equal if they do the same
     operations.
     """
 
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
         self._described = description(closed)
-        self._hash, self.name = hash(self._described), repr(self._described)  # the name tells it from calls of other functions
-        self.at_probes = uncompiled_lanes(jaxpr_as_fun(closed))  # on NumPy, operands and results with a leading axis of probes
+        # distinguishes calls of different functions
+        self._hash, self.name = hash(self._described), repr(self._described)
+        # on NumPy, operands and results with a leading axis of probes
+        self.at_probes = uncompiled_lanes(jaxpr_as_fun(closed))
 
     def __hash__(self):
         return self._hash
@@ -39,20 +41,20 @@ class Call:
 
     @property
     def reason(self) -> str:
-        """Why it is a call, in words without a verb."""
+        """Return the reason for the call, as a noun phrase."""
         return " and ".join(self.reasons)
 
     @property
     def loop(self) -> str:
-        """The name of a loop in it; empty if there is none."""
+        """Return the name of the first loop in it, or an empty string."""
         return next(loops(self.closed.jaxpr), "")
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Return the derivatives of each result with respect to the moving entries of the operands. These
-        entries are the leading axis.
+        """Return the derivatives of each result with respect to the moving entries of the operands, which
+        form the leading axis.
 
-        Raises `Unsupported` where JAX has no forward derivative.
+        Raises `Unsupported` if JAX has no forward derivative.
         """
         function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
         places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]
@@ -73,7 +75,7 @@ class Call:
         return Call(closed, self.reasons)
 
     def results(self, *operands) -> tuple:
-        """Return the results; operands, and so results, may have last axes of lanes."""
+        """Return the results; operands and results may have trailing batch axes."""
         function = jaxpr_as_fun(self.closed)
         avals = [v.aval for v in self.closed.jaxpr.invars]
         real = [x.dtype for x in operands if jnp.issubdtype(x.dtype, jnp.floating)]
@@ -88,8 +90,8 @@ class Call:
         except NotImplementedError as error:
             if not lanes or "vmap" not in str(error):
                 raise
-            raise NotImplementedError("a callback in a load or stop event does not define what it does with "
-                f"a batch: {str(error).splitlines()[0]}") from None
+            raise NotImplementedError("a callback in a load or stop event does not support batches: "
+                f"{str(error).splitlines()[0]}") from None
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
 
@@ -120,12 +122,12 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
-_SEVERAL = tuple, list  # a union of types is made again wherever it stands
+_SEVERAL = tuple, list  # defined once, because writing a union creates a new type each time
 
 
 def description(x) -> Hashable:
-    """Return a key of a jaxpr, or of a parameter of an operation. Two traces of one function have equal keys,
-    unless the function creates other functions.
+    """Return a key of a jaxpr or of a primitive's parameter. Two traces of one function have equal keys
+    unless it creates other functions.
     """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))

@@ -1,4 +1,4 @@
-"""Arrays of nodes reduced over axes: sums, products, extremes, products of matrices."""
+"""Arrays of nodes reduced over axes (sums, products, extremes), and matrix products."""
 
 from collections.abc import Sequence
 
@@ -33,8 +33,8 @@ def _of_all(graph: Graph, op: str, entries: list[int]) -> int:
 
 
 def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
-    """Return the extreme of more than two numbers as the mean of those that attain it. If several do, its
-    derivative is the mean of theirs, as in JAX.
+    """Return the extreme of more than two numbers as the mean of those that attain it. Its derivative is then
+    the mean of their derivatives, as in JAX.
     """
     reached = [graph.call("eq", entry, extreme) for entry in entries]
     total = graph.total(graph.call("select", reaches, graph.zero, entry) for reaches, entry in zip(reached, entries, strict=True))
@@ -51,8 +51,8 @@ def product(graph: Graph, equation, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
-    """Raise `Unsupported` for a product with more multiplications (other than by 0, 1 and -1) than a graph
-    should have.
+    """Raise `Unsupported` for a product with more multiplications (other than by 0, 1 and -1) than the graph
+    allows.
     """
     if left.size * right.shape[1] <= graph.most_multiplications:
         return
@@ -60,4 +60,4 @@ def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
     rows, columns = (np.sum([[[n not in trivial for n in row] for row in matrix] for matrix in x.tolist()], axis=1) for x in (left, right))
     count = int(np.sum(rows * columns))
     if count > graph.most_multiplications:
-        raise Unsupported(f"a product of matrices with {count} multiplications")
+        raise Unsupported(f"a matrix product with {count} multiplications")

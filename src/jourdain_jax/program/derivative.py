@@ -1,11 +1,11 @@
-"""Derivatives on the graph, by forward mode: nodes for directional derivatives.
+"""Derivatives on the graph: directional derivatives, cotangents, Jacobians, and JAX programs with such rules.
 
-A program of JAX has a rule of differentiation of its own, tangents by its Jacobian, derived on the graph:
+A JAX program gets its own derivative rule, with its Jacobian derived on the graph:
 
-    d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and with one another
+    d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and each other
 
-The entries are computed once, with the values, however many tangents there are; and reverse mode has to keep no more than them. Programs whose
-Jacobian is large, and those with an operation that has no rule on the graph, are differentiated by JAX.
+The entries are computed once, with the values, for any number of tangents, and reverse mode stores nothing
+else. JAX differentiates programs with a large Jacobian or with an operation that has no rule on the graph.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -37,7 +37,7 @@ def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> 
 
 
 def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
-    """Return the derivatives of each output along the named directions in which it changes, in one sweep;
+    """Return the derivatives of each output along the directions in which it changes, in one sweep;
     `directions[k][n]` is dn/ds in direction k.
 
     A node in any direction counts as independent in all others.
@@ -59,10 +59,9 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
 
 
 def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> NodeList:
-    """Return sum_i w_i d output_i/d variable for each variable (an independent node), in one sweep from the
-    outputs backward.
+    """Return sum_i w_i d output_i/d variable for each variable (an independent node), in one reverse sweep.
 
-    An untaken branch contributes zero, even if its derivative is NaN.
+    A branch that is not taken contributes zero, even if its derivative is NaN.
     """
     variables = list(variables)
     total: dict[int, int] = {}
@@ -90,7 +89,7 @@ def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], var
 
 
 def _part(graph: Graph, node: int, i: int, weight: int) -> int:
-    """Return the part of a node's weight for its argument number i."""
+    """Return the contribution of a node's weight to its argument i."""
     op, args = graph.operation(node)
     if op == "mul":
         return graph.mul(weight, args[1 - i])
@@ -104,15 +103,13 @@ def _part(graph: Graph, node: int, i: int, weight: int) -> int:
 
 
 def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[NodeList]:
-    """Return derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros
-    among them.
-    """
+    """Return the Jacobian by columns, one per variable, including zeros."""
     variables, rows = list(variables), jacobian(graph, outputs, variables)
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
 def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[NodeList]:
-    """Return the Jacobian row by row, zeros among them."""
+    """Return the Jacobian by rows, including zeros."""
     variables = list(variables)
     return [[row.get(n, graph.zero) for n in variables] for row in jacobian(graph, outputs, variables)]
 
@@ -131,7 +128,7 @@ def _derivative(graph: Graph, node: int, dots: list):
     value = graph.value[node]
     if op == "array":
         return tuple(dots) if np.issubdtype(value[1], np.floating) else graph.zero
-    return dots[0][value[0]]  # of a result, or of an entry
+    return dots[0][value[0]]  # a result or an entry
 
 
 def _of_call(graph: Graph, node: int, dots: list) -> tuple:
@@ -160,9 +157,8 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
 
 
 def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
-    """Return a function of the values of `variables`, on which all outputs depend. It returns the values of
-    `outputs`, as arrays of one shape in the precision of the variable with index `like`, and then the values
-    of the nodes `monitored`, without derivatives.
+    """Return a JAX function of the values of `variables`, on which all outputs must depend. It returns the
+    `outputs` in the shape and precision of variable `like`, then the nodes `monitored`, without derivatives.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
@@ -189,7 +185,8 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
         used = [(i, j, node) for i, j, node in entries if moving[j]]
         varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
         found = values_of([*outputs, *monitored, *varying], values)
-        found = fused(found) if found[0].ndim == 0 else found  # measured: a quarter less time for one motion, a quarter more in batches
+        # measured: a quarter less time for one motion, a quarter more in batches
+        found = fused(found) if found[0].ndim == 0 else found
         J = dict(zip(varying, found[count + len(monitored) :], strict=True))
         # d o_i = sum_j J_ij d x_j
         along = [jnp.zeros_like(x) for x in found[: count + len(monitored)]]
@@ -201,8 +198,8 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
 
 
 def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, NodeList, NodeList]:
-    """Return the outputs on a new graph in which the variables are inputs, so that no simplification uses
-    their definitions.
+    """Return the outputs on a new graph with the variables as inputs, so that no simplification uses their
+    definitions.
     """
     own = Graph()
     inputs = [own.input(str(k), True) for k in range(len(variables))]
@@ -211,13 +208,12 @@ def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -
 
 
 def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
-    """Return row, column and node of each structurally nonzero entry. Return None if JAX's own derivative is
-    better.
+    """Return row, column and node of each structurally nonzero entry, or None if JAX's derivative is better.
     """
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None
-    # 100_000 operations times variables: beyond, deriving takes longer than it can save
+    # above 100_000 operations times variables, deriving takes longer than it saves
     if operations * len(variables) > 100_000:
         return None
     try:
@@ -225,5 +221,5 @@ def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> 
     except Unsupported:
         return None
     entries = [(i, j, rows[i][n]) for j, n in enumerate(variables) for i in range(len(rows)) if n in rows[i]]
-    # 8 operations of values and Jacobian over those of the values
+    # values and Jacobian may take at most 8 times the operations of the values
     return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= 8 * max(operations, 10) else None

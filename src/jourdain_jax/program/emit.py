@@ -1,9 +1,12 @@
-"""A graph as JAX code: one array per scalar, so that a batch is a structure of arrays without stacking.
+"""JAX code of a graph: one array per scalar, so that a batch is a structure of arrays without stacking.
 
-Deep programs run in pieces: XLA gives each result a loop of its own, computes in it whatever it needs, and so computes what long chains share many
-times over. A piece ends where values that later pieces need are computed together.
-Sines and cosines of one argument are computed together, in double precision by range reduction with pi/2 in three parts and polynomials
-(error about 2e-16; XLA on a CPU would call libm once per element, and again in every fusion).
+Deep programs run in pieces. XLA makes a separate loop for each result and repeats shared parts in each, so it
+would compute the shared parts of long chains many times. At the end of each piece, values needed later are
+computed together.
+
+Sine and cosine of one argument are computed together. In double precision they use range reduction with pi/2
+in three parts and polynomials, with an error of about 2e-16; XLA on CPUs would call libm once per element and
+again in every fusion.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,17 +20,19 @@ from jourdain_jax.program.calls import EMITTED
 from jourdain_jax.program.fused import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
-DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
+# longest chain of operations in one piece; measured: chains of links and trailers gain from 100 to 250 on,
+# the bicycle (102) loses a quarter
+DEEP = 120
 PIECE = 128  # operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
-    """Return values of the outputs as JAX scalars (or numbers), from those of inputs and of nodes computed
-    before.
+    """Return the values of the outputs as JAX scalars (or numbers), given `known` values of inputs and other
+    nodes.
     """
     outputs, values = list(outputs), dict(known)
     needed = graph.needed(outputs, values)
-    depth: dict[int, int] = {}  # the longest chain of operations that ends in a node
+    depth: dict[int, int] = {}  # longest chain of operations that ends in a node
     for node in needed:
         depth[node] = 1 + max((depth.get(a, 0) for a in graph.args[node]), default=0)
     if max(depth.values(), default=0) <= DEEP:
@@ -44,10 +49,8 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
 
 
 def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> NodeList:
-    """Return the needed nodes, each soon after its arguments, with the longest chains of operations first.
-
-    Chains are then followed from their beginning, sums grow term by term, and few values are carried between
-    pieces.
+    """Return the needed nodes, each soon after its arguments, with the longest chains first. Sums then grow
+    term by term, and few values pass between pieces.
     """
     seen, order = set(known), []
 
@@ -85,7 +88,7 @@ def _run_in_a_row(graph: Graph, nodes: NodeList, values: dict[int, jax.Array]) -
 
 
 def _fused_by_shape(nodes: NodeList, values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
-    """Return values of the nodes, with nodes of equal shape and type computed together."""
+    """Return values of the nodes, computing nodes of equal shape and type together."""
     alike: dict[tuple, NodeList] = {}
     for n in nodes:
         if jnp.issubdtype(jnp.result_type(values[n]), jnp.floating) and isinstance(values[n], jax.Array):
@@ -95,7 +98,7 @@ def _fused_by_shape(nodes: NodeList, values: Mapping[int, jax.Array]) -> dict[in
 
 FUNCTIONS: dict[str, Callable] = {name: operation.in_jax for name, operation in TABLE.items()}
 
-# pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (K. C. Ng's, as in FreeBSD's libm)
+# pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (by K. C. Ng, as in FreeBSD's libm)
 HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 SINE = (
     1.58969099521155010221e-10,
@@ -117,7 +120,7 @@ COSINE = (
 
 @jax.custom_jvp
 def sine_and_cosine(x):
-    """(sin x, cos x)"""
+    """Return (sin x, cos x)."""
     x = jnp.asarray(x)
     if x.dtype != jnp.float64:
         return jnp.sin(x), jnp.cos(x)

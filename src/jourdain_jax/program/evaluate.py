@@ -1,4 +1,4 @@
-"""Values of nodes on NumPy arrays, at all probes at once, without compilation."""
+"""Evaluation of nodes on NumPy arrays, at all probes at once, without compilation."""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -10,7 +10,7 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 
 class Probes:
-    """Values of the nodes of a graph at sample inputs; computed values are kept."""
+    """Values of the nodes of a graph at sample inputs (probes); computed values are cached."""
 
     def __init__(
         self,
@@ -22,29 +22,30 @@ class Probes:
     ):
         self.graph, self.inputs, self._functions, self._of_arrays, self._constant = graph, dict(inputs), functions, arrays, constant
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
-        self._row: dict[int, int] = {}  # of the table, by node
+        self._row: dict[int, int] = {}  # row of the table, by node
         self._table = np.empty((256, self.count))
-        self._arrays: dict[int, np.ndarray | list[np.ndarray]] = {}  # what is no scalar, with a leading axis of probes
+        # arrays and results of calls, with a leading axis of probes
+        self._arrays: dict[int, np.ndarray | list[np.ndarray]] = {}
 
     def __call__(self, nodes: Iterable[int]) -> np.ndarray:
-        """Values, shape (nodes, probes)."""
+        """Return values, shape (nodes, probes)."""
         nodes = list(nodes)
         self._compute(nodes)
         return self._table[np.array([self._row[n] for n in nodes], int)]
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
-        """Return probes at which some inputs are changed and all others are kept."""
+        """Return probes with some inputs changed."""
         return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant)
 
     def sign(self, node: int) -> int:
-        """1 or -1 where the node has this sign at every probe, 0 otherwise."""
+        """Return 1 or -1 if the node has this sign at every probe, otherwise 0."""
         value = self([node])[0]
         signs = set(np.sign(value[np.isfinite(value)]).tolist())
         return int(signs.pop()) if len(signs) == 1 else 0
 
     def in_the_middle(self, node: int) -> int:
-        """Return the node as a function of parameters only. Inputs have their numbers at the probe at which
-        the magnitude of the node is the median. If there is no such probe, the result is 1.
+        """Return the node as a function of parameters only. Inputs take their values at the probe where its
+        magnitude is the median. Without such a probe, return 1.
         """
         graph, size = self.graph, np.abs(self([node])[0])
         known = np.flatnonzero(np.isfinite(size) & (size > 0))

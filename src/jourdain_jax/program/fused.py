@@ -1,7 +1,8 @@
 """Several values of one shape computed in one loop over their elements, with shared parts computed once.
 
-XLA on a CPU gives each result of a program a loop of its own and computes in each whatever it needs. A reduction over several operands is one
-loop, though; so each value is reduced with a zero beside it. To JAX this is the identity: linear, element by element.
+XLA on CPUs makes a separate loop for each result of a program and repeats shared parts in each. A reduction
+over several operands is one loop, so each value is padded with a zero and reduced. To JAX this is the
+identity: linear and elementwise.
 """
 
 import jax.numpy as jnp
@@ -31,7 +32,8 @@ def _transpose(cotangents, *_):
 
 
 def _batched(values, axes):
-    # what is the same in all lanes stays so: a rule of differentiation must not give it an axis that the values by themselves do not have
+    # values shared by all samples stay without a batch axis, because a derivative rule must not add one that
+    # the values lack
     alike = fused(tuple(x for x, axis in zip(values, axes, strict=True) if axis is None))
     lanes = fused(tuple(jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True) if axis is not None))
     found = {None: iter(alike), 0: iter(lanes)}

@@ -1,7 +1,7 @@
-"""A hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded.
+"""Hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded.
 
-Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of square roots, sin(-x), cos(-x).
-Arguments of sums and products are ordered, so that a b and b a are one node.
+Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of
+square roots, sin(-x), cos(-x). Arguments of sums and products are ordered, so that a b and b a are one node.
 """
 
 import heapq
@@ -15,32 +15,34 @@ import numpy as np
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 
-MOST_NODES = 500_000  # of one graph: some seconds of building
-MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
-ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
-NodeList = list[int]  # numbers of nodes
-_GROWING = threading.Lock()  # threads may derive on one graph
-OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
+MOST_NODES = 500_000  # limit of one graph, which takes seconds to build
+# limit of one expanded matrix product; measured in batches: scalars win at 16 x 16, calls from 24 x 24 on
+MOST_MULTIPLICATIONS = 512
+ARRAYS = {"array", "opaque", "output"}  # operations whose values are not scalars (`calls.py`)
+NodeList = list[int]  # node indices
+_GROWING = threading.Lock()  # lock, because threads may extend one graph
+OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # included in operation counts
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
 class Unsupported(Exception):
-    """An operation that cannot become part of a scalar program; the text gives the reason."""
+    """Operation that cannot become part of a scalar program; the text gives the reason."""
 
 
 class Graph:
-    """Nodes are integers; `op[n]` and `args[n]` define node n, `value[n]` is the number of a constant, the
-    name of an input, or the description of a call.
+    """Graph whose nodes are integers: `op[n]` and `args[n]` define node n, `value[n]` is a constant's number,
+    an input's name, or a call.
 
-    Products of matrices with more than `most_multiplications` are not expanded; with `keeps_rules`, neither
-    are functions with their own derivative."""
+    Matrix products with more than `most_multiplications` are not expanded; with `keeps_rules`, neither are
+    functions with a custom derivative.
+    """
 
     def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
         self.most_multiplications, self.keeps_rules = most_multiplications, keeps_rules
         self.op: list[str] = []
         self.args: list[tuple[int, ...]] = []
         self.value: list = []
-        self.varies: list[bool] = []  # depends on time, state or inputs; what does not is computed once per motion
+        self.varies: list[bool] = []  # depends on time, state or inputs; otherwise computed once per motion
         self._known: dict = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 
@@ -60,7 +62,7 @@ class Graph:
             self.value.append(value)
             self.varies.append(any(map(self.varies.__getitem__, args)) if varies is None else varies)
             node = self._known.setdefault(key, count)
-            if node != count:  # another thread has made it meanwhile
+            if node != count:  # another thread has added it meanwhile
                 for of_nodes in (self.op, self.args, self.value, self.varies):
                     of_nodes.pop()
         return node
@@ -68,21 +70,21 @@ class Graph:
     # leaves
 
     def const(self, value) -> int:
-        """Return a number."""
+        """Return a constant."""
         value = float(value)
-        return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is not a number
+        # a single zero and a single NaN
+        return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)
 
     def input(self, name: str, varies: bool) -> int:
-        """Return a named input: a parameter or, with `varies`, time, a coordinate, a speed or an input of the
-        scene."""
+        """Return a named input: a parameter or, with `varies`, time, a coordinate, speed or scene input."""
         return self._node("input", (), name, varies)
 
     def is_const(self, node: int) -> bool:
-        """Return whether a node is a number."""
+        """Return whether a node is a constant."""
         return self.op[node] == "const"
 
     def operation(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """Return the name of a node's operation, and its arguments."""
+        """Return the operation and the arguments of a node."""
         return self.op[node], self.args[node]
 
     # arithmetic
@@ -121,7 +123,7 @@ class Graph:
         return self._node("add", (a, b) if a < b else (b, a))
 
     def _without_wave(self, a: int, b: int) -> int | None:
-        """Return x of the pair a = sin(w)^2 x, b = cos(w)^2 x in either order; None for other products."""
+        """Return x for a = sin(w)^2 x, b = cos(w)^2 x in either order; None for other products."""
         factors = self._factors(a), self._factors(b)
         if len(factors[0]) != len(factors[1]):
             return None
@@ -135,9 +137,9 @@ class Graph:
         return self.product((left & right).elements())
 
     def _factors(self, node: int) -> NodeList:
-        """Return factors of a product of few; the node itself otherwise."""
+        """Return the factors of a product."""
         factors, split = [node], True
-        # 8 of a product that is looked at for squares of sines
+        # split into at most 8 factors
         while split and len(factors) < 8:
             split = False
             for k, n in enumerate(factors):
@@ -217,7 +219,7 @@ class Graph:
         return self._node("div", (a, b))
 
     def power(self, a: int, exponent: int) -> int:
-        """a^exponent for an integer exponent, by repeated multiplication."""
+        """Return a^exponent for an integer exponent, by repeated multiplication."""
         if exponent < 0:
             return self.div(self.one, self.power(a, -exponent))
         result, square = self.one, a
@@ -229,7 +231,7 @@ class Graph:
         return result
 
     def call(self, op: str, *args: int) -> int:
-        """Any other function of scalars, by name; folded where all arguments are numbers."""
+        """Return any other function of scalars, by name, folded if all arguments are constants."""
         if op in _ARITHMETIC:
             return getattr(self, op)(*args)
         if all(self.op[a] == "const" for a in args):
@@ -251,8 +253,7 @@ class Graph:
     # arrays and calls
 
     def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
-        """Combine scalars into an array. If they are all the entries of an existing array, in order, return
-        that array."""
+        """Combine scalars into an array, or return the existing array of exactly these entries."""
         entries = tuple(entries)
         whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
         if whole is not None and self.value[whole][1:] == (shape, dtype) and entries == tuple(self.entries(whole).ravel().tolist()):
@@ -264,7 +265,7 @@ class Graph:
         return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> NodeList:
-        """Results of a call, by number, given their shapes and types."""
+        """Return the results of a call with these indices, shapes and types."""
         return [self._node("output", (call,), (k, *shape)) for k, shape in shapes.items()]
 
     def entries(self, output: int) -> np.ndarray:
@@ -273,11 +274,11 @@ class Graph:
         return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
 
     def entries_of(self, array: int) -> NodeList:
-        """Return the entries of an array, or of a result of a call."""
+        """Return the entries of an array or of a result of a call."""
         return list(self.args[array]) if self.op[array] == "array" else self.entries(array).ravel().tolist()
 
     def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
-        """Apply the operation of a node to other arguments; `of`: the graph of the node (default: this)."""
+        """Apply the operation of a node to other arguments; `of`: graph of the node (default: this one)."""
         graph, args = of or self, tuple(args)
         op, value = graph.op[node], graph.value[node]
         if op == "array":
@@ -285,7 +286,7 @@ class Graph:
         return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
 
     def copied(self, nodes: Iterable[int], of: "Graph", known: Mapping[int, int]) -> dict[int, int]:
-        """Return nodes of another graph -> nodes of this one, where some are `known`."""
+        """Copy nodes from another graph; return old -> new node, including the `known` ones."""
         nodes, new = list(nodes), dict(known)
         for node in of.needed(nodes, new):
             new[node] = self.const(of.value[node]) if of.is_const(node) else self.again(node, [new[a] for a in of.args[node]], of)
@@ -304,7 +305,7 @@ class Graph:
         return reduce(self.mul, factors, self.one)
 
     def dot(self, a: Iterable[int], b: Iterable[int]) -> int:
-        """sum a_i b_i"""
+        """Return sum a_i b_i."""
         return self.total(self.mul(x, y) for x, y in zip(a, b, strict=True))
 
     def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> NodeList:
@@ -322,15 +323,14 @@ class Graph:
                 new[node] = self.again(node, (new[a] for a in self.args[node]))
         return [new[n] for n in outputs]
 
-    # what is in the graph
+    # queries
 
     def reachable(self, outputs: Iterable[int]) -> NodeList:
-        """Return all nodes that the outputs need, in an order in which they can be computed."""
+        """Return all nodes that the outputs need, in order of evaluation."""
         return self.needed(outputs, known=())
 
     def needed(self, outputs: Iterable[int], known) -> NodeList:
-        """Return, in order, the nodes that must be computed for the outputs when the nodes in `known` are
-        given."""
+        """Return, in order, the nodes to compute for the outputs when the nodes in `known` are given."""
         args = self.args
         seen = {node for node in outputs if node not in known}
         stack = list(seen)
@@ -339,20 +339,20 @@ class Graph:
                 if node not in seen and node not in known:
                     seen.add(node)
                     stack.append(node)
-        return sorted(seen)  # arguments are older than what uses them
+        return sorted(seen)  # arguments have smaller indices than the nodes that use them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """Return nodes of numbers that depend on parameters only and that varying nodes use."""
+        """Return the numeric nodes that depend only on parameters and are used by varying nodes."""
         outputs = list(outputs)
         found = {a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]} | set(outputs)
         return tuple(sorted(n for n in found if not (self.varies[n] or self.is_const(n) or self.is_truth(n))))
 
     def is_truth(self, node: int) -> bool:
-        """Return whether a node is a truth value."""
+        """Return whether a node is a boolean."""
         return self.op[node] in _TRUTHS or (self.op[node] == "select" and self.is_truth(self.args[node][1]))
 
     def with_quotients(self, outputs: Iterable[int]) -> NodeList:
-        """Return the outputs with `a (1/b)` as one division, where `1/b` is used only once."""
+        """Return the outputs with `a (1/b)` as one division if `1/b` is used only once."""
         outputs = list(outputs)
         uses = Counter(a for node in self.reachable(outputs) for a in self.args[node])
         new: dict[int, int] = {}
@@ -372,16 +372,16 @@ class Graph:
         return reciprocal and uses[node] == 1 and node not in outputs
 
     def operations(self, outputs: Iterable[int]) -> int:
-        """Return the number of operations on varying quantities; those of parameters only do not count."""
+        """Return the number of operations on varying quantities."""
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
     def more_operations(self, a: int, b: int) -> int:
-        """Return how many more operations node a needs than node b, without those that both share."""
+        """Return how many more operations node a needs than node b, not counting shared ones."""
         if a == b:
             return 0
         needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]
         unshared, more = 2, 0
-        while unshared:  # nodes that wait and are needed by one of the two only
+        while unshared:  # pending nodes that only one of the two needs
             node = -heapq.heappop(newest_first)
             who = needed_by[node]
             if who != 3:

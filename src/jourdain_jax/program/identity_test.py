@@ -1,15 +1,15 @@
-"""Probes that prove identities: expressions equal at these are equal everywhere.
+"""Proof of identities by generic probes: expressions that agree there are equal everywhere.
 
-Sums, products, quotients, roots, sines and cosines of generic numbers agree at random only if they agree everywhere (Schwartz, 1980; Zippel, 1979). Numbers
-near those of a scene are not generic, though (a parameter may be tiny, time may stop before a switch), and a function that has branches, or saturates, may do
-elsewhere what it does at no probe. So inputs are drawn again, of the order of one and larger; and any other
-function is replaced by one of its operands that
-is neither flat nor kinked anywhere. An identity that holds then holds whatever these functions are.
+Sums, products, quotients, roots, sines and cosines of random generic numbers agree only if they agree
+everywhere (Schwartz, 1980; Zippel, 1979). The numbers of a scene are not generic: a parameter may be tiny, or
+time may end before a switch. Functions that branch or saturate may also behave differently between probes.
+Inputs are therefore drawn anew, of order one and larger, and any other function is replaced by a generic one
+that is neither flat nor kinked. An identity that then holds does so for any such functions.
 
-Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (`calculus/round_off.py`), and two values are equal where they
-differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
-written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn again at every probe. A
-property of any R holds for this one.
+No comparison uses a fixed tolerance. Every value carries a round-off bound (`calculus/round_off.py`), and two
+values are equal if they differ by no more. Constants in the code of a scene may be far from one (1e-24, 1e16)
+and would dominate or vanish. They are written as c = m R^j with R = 2^40 and |m| between 2^-20 and 2^20, and
+R is drawn anew at every probe: an identity that holds for any R holds for this one.
 """
 
 import math
@@ -28,60 +28,56 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.onto_rows import onto_rows
 
-DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
-SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
-FEWEST = 6  # probes at which an expression is a number
+DIGITS = 40  # bits spanned by the constants in the code of a scene before they are rescaled
+SURE = 16.0  # equal values may differ by this many bounds, because bounds are first-order
+FEWEST = 6  # minimum number of probes with finite values
 
 
 _KEPT: Mapping[str, float] = MappingProxyType({})
 
 
 class Bounded(np.ndarray):
-    """Values with a bound of their round-off, infinite where they are meaningless."""
+    """Values with round-off bounds, infinite where a value is meaningless."""
 
     error: np.ndarray
 
 
 class IdentityProbes:
-    """Values of the nodes of a graph at generic inputs, with bounds of their round-off."""
+    """Values of the nodes of a graph at generic inputs, with round-off bounds."""
 
     def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float], radix: np.ndarray | None = None):
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
-        # numbers in place of 2^DIGITS
+        # random radix in place of 2^DIGITS
         self._radix = radix = np.random.default_rng(4).uniform(1.5, 3.0, self.count) if radix is None else radix
-        # the bounds follow the values in one array, as if they were further probes
+        # bounds follow the values in one array, like further probes
         self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
 
     def __call__(self, nodes: Sequence[int]) -> Bounded:
-        """Values, shape (nodes, probes)."""
+        """Return values with bounds, shape (nodes, probes)."""
         values, errors = np.split(self._both(nodes), 2, axis=1)
         found = values.view(Bounded)
         found.error = np.where(np.isfinite(values), np.where(np.isnan(errors), np.inf, errors), 0.0)
         return found
 
     def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
-        """Return probes at which some inputs, and the bounds of their round-off, are replaced. All other
-        inputs keep their values.
-        """
+        """Return probes with some inputs and their round-off bounds replaced."""
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
-        """Return these probes for another graph; `names`: new names of inputs, each with the name that it
-        replaces.
-        """
+        """Return these probes for another graph. `names`: name of each input there -> its name here."""
         errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 
     def varies(self, name: str) -> bool:
-        """Return whether an input surely has other values at some probes than at others."""
+        """Return whether an input provably varies between probes."""
         x, error = (np.broadcast_to(x, self.count) for x in (self.inputs[name], self._errors.get(name, 0.0)))
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """Return the probes with indices `at`, once for each group of names. In each copy, the inputs of one
-        group have their values from another probe.
+        """Return the probes with indices `at`, copied once per group of names. In each copy, the inputs of
+        one group take their values from another probe.
         """
 
         def in_turn(name, x):
@@ -93,13 +89,13 @@ class IdentityProbes:
 
 
 def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Return whether no operation that the nodes need is replaced by another function."""
+    """Return whether identity probes evaluate every operation that the nodes need exactly."""
     return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return whether the rows of each pair (values of expressions at generic probes) are equal to round-off,
-    at the `regular` probes.
+    """Return, for each pair of rows (values at generic probes), whether they are equal to round-off at the
+    `regular` probes.
     """
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
@@ -115,8 +111,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return the replacements of one node by another that do not change any of the `nodes`, each replacement
-    taken alone. `probes`: generic ones.
+    """Return the replacements of one node by another that leave all `nodes` unchanged, each tested alone.
+    `probes`: generic ones.
     """
     graph, here = probes.graph, probes(nodes)
 
@@ -131,8 +127,8 @@ def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[in
 
 
 def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:
-    """Return whether the vectors `a`, shape (probes, entries), are combinations of the `rows`, shape (probes,
-    rows, entries), at all meaningful probes.
+    """Return whether the vectors `a`, shape (probes, entries), are linear combinations of the `rows`, shape
+    (probes, rows, entries), at all meaningful probes.
     """
     said = np.isfinite(a).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=(1, 2))
     for v, e, B, E in zip(a[said], error[said], rows[said], errors[said], strict=True):
@@ -144,17 +140,18 @@ def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: n
 
 
 def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbes:
-    """Return generic probes for the graph of `probes`. Inputs in `unchanged`, such as parts of quaternions,
+    """Return generic probes for the graph of `probes`. Inputs in `unchanged`, such as quaternion components,
     keep their values.
 
-    Parameters, named p..., are positive.
+    Parameters (names p...) are positive.
     """
     generator, count = np.random.default_rng(2), probes.count
-    # half of the probes lie so much further out
+    # half of the probes are ten times larger
     scale = np.where(np.arange(count) % 2, 10.0, 1.0)
 
     def drawn(name: str, value: np.ndarray) -> np.ndarray:
-        if name in unchanged or (name.startswith("i") and np.ptp(value) > 0 and not np.any(value % 1.0)):  # a mode has whole numbers alone
+        # a mode is always an integer
+        if name in unchanged or (name.startswith("i") and np.ptp(value) > 0 and not np.any(value % 1.0)):
             return value
         return generator.uniform(0.5, 1.5, count) if name.startswith("p") else scale * generator.normal(size=count)
 
@@ -162,10 +159,10 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
 
 
 def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
-    """Return generic `probes` with `coordinates` (names of inputs, with their nodes) moved onto rows = 0, by
-    Gauss-Newton from `near`. Where this does not converge, the probes are meaningless.
+    """Return `probes` with `coordinates` (names of inputs -> nodes) projected onto rows = 0 by Gauss-Newton
+    from `near`. Probes without convergence become meaningless.
 
-    The probes stay unchanged if the rows contain a function for which equations cannot be solved.
+    The probes stay unchanged if the rows contain a function that identity probes replace.
     """
     if not taken_for_what_they_are(probes.graph, rows):
         return probes
@@ -177,29 +174,30 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     q = np.stack([found.probes.inputs[name] for name in found.moved])
     off = np.abs(np.asarray(values))
     errors = np.einsum("pqr,rp->qp", np.abs(pseudo_inverses(found.pattern.dense(J))), off + values.error) + EPS * np.abs(q)
-    # rows may be off by 1,000 bounds of round-off
+    # rows may deviate by 1,000 round-off bounds
     errors[:, ~np.all(off <= 1e3 * values.error, axis=0)] = np.inf
     return probes.with_inputs(dict(zip(found.moved, q, strict=True)), dict(zip(found.moved, errors, strict=True)))
 
 
 def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
-    """Return a number with R drawn again, and the bound of its round-off."""
+    """Return a constant with R drawn anew, and its round-off bound."""
     j = round(math.frexp(value)[1] / DIGITS) if math.isfinite(value) else 0
     moderate = math.ldexp(value, -DIGITS * j) * radix**j
     return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])
 
 
-# Functions of values and bounds that are taken for any function of theirs. -----------------------------------------------
+# Generic replacements of other functions, for values and bounds.
+# -----------------------------------------------
 
 
 def _generic(name: str) -> Callable:
-    """Return a function of any number of numbers, another one for every name."""
+    """Return a generic function of any number of arguments, different for every name."""
 
     def function(*operands):
         weights = np.random.default_rng(zlib.crc32(name.encode())).uniform(0.3, 1.7, (2, len(operands)))
         half = len(operands[0]) // 2
         (phase, e), (rest, _) = (halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights)
-        # no weight is more than six times another, so that this bounds the round-off of both sums
+        # weights differ at most sixfold, so this bounds the round-off of both sums
         size = sum(np.abs(x[:half]) for x in operands)
         return with_bound(np.sin(phase + 0.4) + 0.3 * rest, 3.0 * e + 2.0 * len(operands) * EPS * size)
 
@@ -207,11 +205,12 @@ def _generic(name: str) -> Callable:
 
 
 def _opaque(call, *operands) -> np.ndarray:
-    """Return one number per probe, made from all entries of the operands."""
+    """Return one number per probe that depends on all entries of the operands."""
     return _generic(call.name)(*(column for x in operands for column in (x.T if x.ndim == 2 else [x])))
 
 
-_KNOWN = {"const", "input", *(name for name, operation in TABLE.items() if operation.bounded)}  # taken for what they are
+# operations evaluated exactly
+_KNOWN = {"const", "input", *(name for name, operation in TABLE.items() if operation.bounded)}
 _SCALARS = {name: operation.bounded or _generic(name) for name, operation in TABLE.items()}
 _ARRAYS: dict[str, Callable] = {
     "array": lambda shape_and_type, *entries: np.stack(entries, axis=-1) if entries else np.empty((0, 0)),

@@ -1,7 +1,8 @@
-"""A jaxpr run over scalars: every array is an array of nodes of a `Graph`, every primitive acts on its entries.
+"""Interpreter of a jaxpr over scalars: every array is an array of nodes of a `Graph`, every primitive acts on
+its entries.
 
-Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive without a rule raises
-`Unsupported`; `opaque_calls.py` makes a call of what it belongs to.
+Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive
+without a rule raises `Unsupported`; `opaque_calls.py` then keeps its surroundings as a call.
 """
 
 import os
@@ -21,12 +22,12 @@ from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
-_LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # in pieces, with the slopes of their values
-_HOME = f"{Path(__file__).parent.parent}{os.sep}"  # where the source of this package lies
+_LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # piecewise linear, with the derivative of each piece
+_HOME = f"{Path(__file__).parent.parent}{os.sep}"  # folder of this package
 
 
 class Nodes:
-    """An array of nodes."""
+    """Array of nodes."""
 
     __slots__ = ("ids",)
 
@@ -38,12 +39,12 @@ Value: TypeAlias = Nodes | np.ndarray
 
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
-    """Return outputs of a closed jaxpr at the given arguments."""
+    """Return the outputs of a closed jaxpr at the given arguments."""
     return evaluated(closed, arguments, lambda equation, inputs: apply(graph, equation, inputs), lambda x, aval: np.asarray(x))
 
 
 def effects_of(jaxpr) -> str:
-    """Name an operation that does more than compute, such as printing; empty if there is none."""
+    """Describe the first operation with side effects, such as printing; empty if there is none."""
     for equation in jaxpr.eqns:
         if equation.effects:
             inner = called(equation.primitive.name, equation.params)
@@ -55,14 +56,14 @@ def as_nodes(graph: Graph, value: Value) -> np.ndarray:
     """Return the nodes of a value; numbers become constants."""
     if isinstance(value, Nodes):
         return value.ids
-    # 200_000 scalars in one array
+    # limit on the scalars of one array
     if value.size > 200_000:
         raise Unsupported(f"an array of {value.size} numbers")
     return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
 
 
 def apply(graph: Graph, equation, inputs) -> list[Value]:
-    """Results of one equation."""
+    """Return the results of one equation."""
     name = equation.primitive.name
     refuse(equation)
     if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
@@ -110,36 +111,36 @@ def _elementwise(graph: Graph, result: Callable, inputs: Sequence[Value]) -> np.
 
 
 def refuse(equation) -> None:
-    """ValueError where an equation can be no part of a scene."""
+    """Raise ValueError if a scene cannot contain this equation."""
     kinds = {v.aval.dtype for v in (*equation.invars, *equation.outvars)}
     if any(jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
         raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
-            "them outside, and give them as parameters or inputs")
+            "them outside and pass them as parameters or inputs")
 
 
 def own_rule(name: str, params) -> str:
-    """Return the name of the function if it has a custom derivative that the graph does not know; empty if
-    not. Functions of this package do not count, since their custom derivatives equal those of their
-    operations.
+    """Return the name of the function if it has a custom derivative unknown to the graph; empty if not.
+    Functions of this package do not count, because their custom derivatives equal those of their operations.
 
-    JAX's own functions do count: `softplus` and `sinc` compute with branches, which give wrong derivatives
+    JAX's own functions do count: `softplus` and `sinc` compute with branches, which have wrong derivatives
     where two branches meet.
     """
     if name == "stop_gradient":
-        return "`stop_gradient`, whose derivative is zero by decree,"
+        return "`stop_gradient`, which sets its derivative to zero,"
     function = called(name, params)
     if function is None or not name.startswith("custom_"):
         return ""
     info = getattr(function.jaxpr.debug_info, "func_src_info", None) or "a function"
     known = _HOME in info or _LINEAR.match(info)
-    return "" if known else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
+    return "" if known else f"`{info.split(' at ')[0]}`, which has a custom derivative,"
 
 
-# Primitives that move entries about. ---------------------------------------------------------------------------------
+# Primitives that move entries.
+# ---------------------------------------------------------------------------------
 
 
 def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.ndarray]:
-    """Return nodes moved as numbers would be; numbers that stand among them become constants."""
+    """Return nodes moved as numbers would be; numbers among them become constants."""
     entries = _MOVES[name](len(inputs))
     if any(isinstance(x, Nodes) for i, x in enumerate(inputs) if i not in entries):
         raise Unsupported("an index that depends on the state")
@@ -148,7 +149,7 @@ def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.nd
 
 
 def _gather(graph, inputs, params):
-    """Return the entries at the places found by applying the operation to positions."""
+    """Gather nodes by gathering their positions."""
     x, indices = inputs
     with jax.ensure_compile_time_eval():
         positions = jnp.arange(x.size, dtype=jnp.int32).reshape(x.shape)
@@ -182,7 +183,7 @@ def _scatter_add(graph, inputs, params):
     return flat.reshape(x.shape)
 
 
-# Which operands hold entries; the others are indices.
+# Operands that hold entries; the others are indices.
 _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "dynamic_slice", "split"), lambda n: (0,)),
     **dict.fromkeys(("gather", "copy", "copy_p", "stop_gradient", "unstack"), lambda n: (0,)),
@@ -190,7 +191,7 @@ _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
     **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),
 }
-# All others move numbers of nodes as `eager/numpy_backend.py` moves numbers.
+# All others move node indices as `eager/numpy_backend.py` moves numbers.
 _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,
@@ -200,17 +201,17 @@ _OF_NODES: dict[str, Callable] = {
 
 
 def _is_rounded(dtype: np.dtype) -> bool:
-    """Return whether numbers of a type have fewer digits than those of the program."""
+    """Return whether a type has lower precision than the program."""
     return _kind(dtype) == "f" and dtype.itemsize < jnp.result_type(float).itemsize
 
 
 def _kind(dtype: np.dtype) -> str:
-    """Return the kind of a type in NumPy's terms, also for bfloat16 and similar floating-point types."""
+    """Return NumPy's kind of a type; bfloat16 and similar types are floats."""
     return "f" if jnp.issubdtype(dtype, jnp.floating) else dtype.kind
 
 
 def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:
-    """Return nodes of another type: truth values become 1 or 0, and a number is true unless it is zero."""
+    """Convert nodes to another type: booleans become 1 or 0, and nonzero numbers are true."""
     kinds = _kind(old), _kind(new)
     if kinds == ("f", "f") and jnp.finfo(new).eps > jnp.finfo(old).eps and _is_rounded(new):
         raise Unsupported(f"a number in {new}")
@@ -222,7 +223,8 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
     return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
 
 
-# Primitives on entries. ----------------------------------------------------------------------------------------------
+# Primitives on entries.
+# ----------------------------------------------------------------------------------------------
 
 
 def _call(op: str) -> Callable:
@@ -242,7 +244,7 @@ def _select(graph: Graph, params, which, *cases):
 
 
 def _first_true(graph: Graph, truths: np.ndarray) -> int:
-    """Return at which place the first of some truths is true; 0 where none is."""
+    """Return the index of the first true node, or 0 if none is true."""
     found = graph.zero
     for k in reversed(range(len(truths))):
         found = graph.call("select", int(truths[k]), found, graph.const(float(k)))
@@ -272,4 +274,5 @@ _ELEMENTWISE: dict[str, Callable] = {
     "xor": _call("ne"),
 }
 
-_NOT_OF_INTEGERS = {"div", "and", "or", "xor", "not", "reduce_and", "reduce_or"}  # by digits, or rounded
+# bitwise, or rounded for integers
+_NOT_OF_INTEGERS = {"div", "and", "or", "xor", "not", "reduce_and", "reduce_or"}

@@ -12,17 +12,17 @@ from jourdain_jax.program.graph import Graph
 
 
 class Projected(NamedTuple):
-    """Probes on rows, or as near as they came."""
+    """Probes projected onto constraints, or as close as the iteration came."""
 
-    probes: Any  # as they were given: `Probes` or `IdentityProbes`
-    moved: list[str]  # names of the inputs that rows depend on
-    pattern: Pattern  # of the derivatives of rows with respect to these
-    slopes: list[int]  # their nodes
+    probes: Any  # of the given type: `Probes` or `IdentityProbes`
+    moved: list[str]  # names of the inputs on which the constraints depend
+    pattern: Pattern  # sparsity pattern of the constraint Jacobian with respect to these
+    slopes: list[int]  # nodes of its entries
 
 
 def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
-    """Return the probes with `inputs` (names, with their nodes) moved to the nearest point with rows = 0;
-    `limits` of steps as in `nearest_root`.
+    """Return the probes with `inputs` (names -> nodes) moved to the nearest point with rows = 0; `limits` of
+    steps as in `nearest_root`.
     """
     graph = probes.graph
     needed = set(graph.reachable(rows))
@@ -44,7 +44,9 @@ def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) 
 
 
 def _slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
-    """Return the structurally nonzero derivatives of rows with respect to variables: places and nodes."""
+    """Return the structurally nonzero derivatives of rows with respect to variables: their pattern and their
+    nodes.
+    """
     place = {n: k for k, n in enumerate(variables)}
     entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
     return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]

@@ -1,12 +1,12 @@
-"""A jaxpr run over scalars, with parts that have no scalar form as calls in the graph.
+"""Interpreter of a jaxpr over scalars that keeps parts without scalar form as calls.
 
-An equation without a rule is opaque. So are those that hand large arrays to it, those that continue with
-large arrays from it, and what lies between
-two opaque ones; so a network is one call. Opaque equations that follow on one another, with nothing else in between, are one call:
+An equation without a rule is opaque. Equations that exchange large arrays with it, and equations between two
+opaque ones, become opaque as well, so a network is one call. Each equation has a level:
 
-    level of a scalar = the largest level of what it is made from,   level of an opaque equation = that, and one more behind a scalar
+    level of a scalar = the largest level of its operands
+    level of an opaque equation = the same, plus one after a scalar
 
-and those of one level that hang together are put together.
+Connected opaque equations of one level form one call.
 """
 
 from dataclasses import dataclass, field
@@ -21,11 +21,11 @@ from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
 
-LARGEST = 4096  # entries of an array of scalars
+LARGEST = 4096  # maximum number of entries of an array of scalars
 
 
 class _Variable:
-    """A value, or one yet to be known."""
+    """A value, or a placeholder for one."""
 
     __slots__ = ("aval",)
 
@@ -34,7 +34,7 @@ class _Variable:
 
     @property
     def is_large(self) -> bool:
-        # 16 entries of an array that is not taken apart beside a call
+        # next to a call, larger arrays are not split into scalars
         return self.aval.size > 16
 
     @property
@@ -44,10 +44,10 @@ class _Variable:
 
 @dataclass(eq=False)
 class _Step:
-    """An equation; its inputs are variables or numbers."""
+    """Equation whose inputs are variables or numbers."""
 
     equation: Any
-    around: Any  # the jaxpr it comes from
+    around: Any  # the enclosing jaxpr
     inputs: list
     outputs: list[_Variable]
     opaque: bool = False
@@ -68,14 +68,14 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Opaque:
-    """A value that is not an array of scalars: the node of an array."""
+    """Value that is not an array of scalars: the node of an array."""
 
     node: int
 
 
 def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[Value]:
-    """Return the outputs of a closed jaxpr at the given arguments, as `interpret` does, with calls for the
-    parts that have no scalar form.
+    """Return the outputs of a closed jaxpr, as `interpret` does, with calls for the parts that have no scalar
+    form.
     """
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
@@ -88,7 +88,8 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     asked = {v for v in outputs if isinstance(v, _Variable)}
     _put_together(steps, users, asked)
     values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
-    for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):  # otherwise in the order in which they came
+    # otherwise in their original order
+    for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):
         if not step.opaque:
             results = apply(graph, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
             values |= dict(zip(step.outputs, results, strict=True))
@@ -98,8 +99,8 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
-    """Append all equations, including those of inner jaxprs in place; functions with their own derivatives
-    stay whole.
+    """Append all equations, inlining inner jaxprs except functions with custom derivatives; return the
+    outputs.
     """
 
     def results(equation, inputs: list) -> list:
@@ -115,11 +116,11 @@ def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
 
 
 def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:
-    """Find by trial which steps have a scalar form; return the variables that are numbers."""
+    """Mark the steps without scalar form as opaque, by trial; return the variables that are numbers."""
     values: dict = {}
 
     def introduce(v: _Variable) -> Nodes | None:
-        """New symbols, if a variable may be scalars."""
+        """Return new symbols if a variable may be scalars."""
         if not v.may_be_scalars:
             return None
         names = [f"{len(scratch.op)}_{i}" for i in range(v.aval.size)]
@@ -132,7 +133,7 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
         size = max((v.aval.size for v in step.outputs), default=0)
         try:
             if any(x is None for x in given):
-                raise Unsupported("")  # it follows an opaque one
+                raise Unsupported("")  # follows an opaque step
             if size > LARGEST and any(isinstance(x, Nodes) for x in given):
                 raise Unsupported(f"an array of {size} numbers")
             results = apply(scratch, step.equation, given)
@@ -153,9 +154,7 @@ def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
 
 
 def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
-    """Mark steps as opaque that depend on opaque parts within the same call, and find the steps that form one
-    call.
-    """
+    """Extend opaque steps to their large neighbours, assign levels, and group the steps of each call."""
     maker = {v: step for step in steps for v in step.outputs}
     number = {id(step): k for k, step in enumerate(steps)}
 
@@ -182,7 +181,7 @@ def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked
 
 
 def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> dict:
-    """Return values computed by a part for others, by a call."""
+    """Add the call of a part to the graph; return the values of its results."""
     made = [v for step in part for v in step.outputs]
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
@@ -194,7 +193,7 @@ def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable
 
 
 def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:
-    """Return the part as a function of its operands."""
+    """Return the part as a call of its operands."""
 
     def function(*arrays):
         known = dict(zip(operands, arrays, strict=True))
@@ -204,4 +203,4 @@ def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]
 
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))
     reasons = tuple(dict.fromkeys(step.reason for step in part if step.reason))
-    return Call(closed, reasons or ("a result of the arrays of another call",))
+    return Call(closed, reasons or ("a result of arrays of another call",))

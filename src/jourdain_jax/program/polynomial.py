@@ -1,9 +1,9 @@
-"""Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a short expression.
+"""Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a
+short expression.
 
-Atoms are inputs and everything that is not +, -, *: sines, cosines, square roots, reciprocals. Expanding
-cancels equal terms; going back,
-terms are gathered by their varying part, whose coefficient (a polynomial in parameters alone) is computed once per motion, and common
-factors are taken out greedily (Horner's scheme in several variables).
+Atoms are inputs and everything but +, -, *: sines, cosines, square roots, reciprocals. Expansion cancels
+equal terms. Reconstruction groups terms by their varying part, whose coefficient (a polynomial in parameters)
+is computed once per motion. It then factors greedily (multivariate Horner scheme).
 """
 
 from collections import Counter
@@ -13,21 +13,20 @@ from operator import and_
 
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
-Monomial = tuple[int, ...]  # atoms in order, repeated as often as they occur
+Monomial = tuple[int, ...]  # atoms in order, repeated by their power
 Polynomial = dict[Monomial, float]
 
 
 class TooLarge(Exception):
-    """The expansion has more terms than allowed."""
+    """Raised if the expansion has more terms than allowed."""
 
 
 class NormalForms:
-    """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the reverse took
-    fewer operations in no model).
+    """Normal forms of the nodes of one graph. Squares of sines are replaced by squares of cosines (the
+    reverse took fewer operations in no model).
 
-    - `most_terms`: the largest number of terms of a normal form; 0: nodes stay unchanged.
-    - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x if it is known, and `guards` records x with
-      its sign.
+    - `most_terms`: maximum number of terms of a normal form; 0: nodes stay unchanged.
+    - `sign`: 1, -1 or 0 (unknown) for a node. With a known sign, |x| becomes x or -x, and `guards` records it.
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
 
@@ -44,12 +43,10 @@ class NormalForms:
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
         self._reductions: dict[Monomial, tuple[tuple[Monomial, float], ...]] = {}
-        self._reciprocals: dict[int, int | None] = {}  # x of an atom 1/x, None of any other
+        self._reciprocals: dict[int, int | None] = {}  # x of an atom 1/x, None for others
 
     def simplified(self, node: int) -> int:
-        """Return the node in normal form if that takes fewer operations; otherwise the node with its parts
-        simplified.
-        """
+        """Return the normal form of a node if it takes no more operations, otherwise the node itself."""
         if node not in self._simplified:
             self._simplified[node] = self._smaller(node)
         return self._simplified[node]
@@ -72,7 +69,7 @@ class NormalForms:
     def expanded(self, node: int) -> Polynomial:
         """Return the polynomial of a node."""
         if node not in self._expanded:
-            for part in self.graph.needed([node], self._expanded):  # arguments first: no deep recursion
+            for part in self.graph.needed([node], self._expanded):  # arguments first, to avoid deep recursion
                 try:
                     self._expanded[part] = self._expand(part)
                 except TooLarge:
@@ -112,7 +109,7 @@ class NormalForms:
         return self._atom(atom) if graph.op[atom] == op else self.expanded(atom)
 
     def _rebuilt_or(self, node: int) -> int:
-        """Return a node from its normal form, or itself where it has none."""
+        """Return a node rebuilt from its normal form, or the node itself if it has none."""
         found = self._expanded[node]
         return node if found is None else self.rebuilt(found)
 
@@ -126,13 +123,13 @@ class NormalForms:
         return self._times(self._root(inside) if inside != {(): 1.0} else inside, self._magnitude, outside)
 
     def _times(self, p: Polynomial, function: Callable[[int], Polynomial], atoms: Iterable[int]) -> Polynomial:
-        """p f(x) f(y) ... of some atoms."""
+        """Return p f(x) f(y) ... for some atoms."""
         for atom in atoms:
             p = self.product(p, function(atom))
         return p
 
     def _rooted(self, p: Polynomial) -> tuple[NodeList, Polynomial] | None:
-        """Return the atoms to take out of the root, and the rest; None if there are none."""
+        """Return the atoms that leave the root, and the remaining radicand; None if there are none."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
@@ -146,7 +143,7 @@ class NormalForms:
         return None
 
     def _absolute(self, p: Polynomial) -> Polynomial:
-        """|p|, a product factor by factor."""
+        """Return |p|; for a product, factor by factor."""
         if len(p) != 1:
             return self._kept_absolute(self.rebuilt(p))
         ((monomial, c),) = p.items()
@@ -157,8 +154,8 @@ class NormalForms:
         return self._atom(value) if self.graph.op[value] == "abs" else self.expanded(value)
 
     def _magnitude(self, node: int) -> Polynomial:
-        """Return |x| from a root. For a sine or a cosine, as in lengths of contacts, the sign is that of the
-        probed states; a guard marks its validity.
+        """Return |x| of a factor extracted from a root. For sines and cosines, as in contact lengths, use the
+        sign at the probes and guard it.
         """
         sign = self._sign(node) if self.graph.op[node] in ("sin", "cos") and self.graph.varies[node] else 0
         if sign == 0:
@@ -188,7 +185,7 @@ class NormalForms:
         return {(atom,): 1.0}
 
     def product(self, p: Polynomial, q: Polynomial) -> Polynomial:
-        """p q, with squares replaced."""
+        """Return p q, with squares replaced."""
         if len(p) * len(q) > 8 * self.most_terms:
             raise TooLarge
         result: Polynomial = {}
@@ -208,7 +205,7 @@ class NormalForms:
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
         """Return the terms of a monomial, with squares replaced and pairs x, 1/x cancelled. The result is
-        cached. The square of an atom is known before the atom is used.
+        cached, because the square of an atom is known before its first use.
         """
         found = self._reductions.get(monomial)
         if found is None:
@@ -227,7 +224,7 @@ class NormalForms:
         return found
 
     def _first_square(self, monomial: Monomial) -> int | None:
-        """Return the place of a squared atom whose square is another polynomial."""
+        """Return the index of a squared atom whose square is another polynomial."""
         before = None
         for at, atom in enumerate(monomial):
             if atom == before and atom in self._squares:
@@ -236,7 +233,7 @@ class NormalForms:
         return None
 
     def _cancelled(self, monomial: Monomial) -> Monomial:
-        """Without pairs x, 1/x."""
+        """Return the monomial without pairs x, 1/x."""
         for atom in monomial:
             x = self._reciprocal_of(atom)
             if x is not None and x in monomial:
@@ -244,7 +241,7 @@ class NormalForms:
         return monomial
 
     def _reciprocal_of(self, atom: int) -> int | None:
-        """x of an atom 1/x; None of any other."""
+        """Return x for an atom 1/x, None for others."""
         graph = self.graph
         if atom not in self._reciprocals:
             self._reciprocals[atom] = graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
@@ -253,8 +250,8 @@ class NormalForms:
     # and back
 
     def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
-        """Return a node for the polynomial, divided by `divisor` (which depends on parameters only), with few
-        operations.
+        """Return a node with few operations for the polynomial, divided by `divisor` (a function of
+        parameters only).
         """
         graph = self.graph
         terms = []
@@ -267,7 +264,7 @@ class NormalForms:
         return self._horner(terms)
 
     def _gathered(self, p: Polynomial) -> dict[Monomial, Polynomial]:
-        """Coefficients (polynomials in parameters) by varying monomial."""
+        """Return the coefficient of each varying monomial, a polynomial in parameters."""
         gathered: dict[Monomial, Polynomial] = {}
         for monomial, c in p.items():
             varying = tuple(x for x in monomial if self.graph.varies[x])
@@ -275,7 +272,7 @@ class NormalForms:
         return gathered
 
     def quotient(self, p: Polynomial, q: Polynomial) -> int:
-        """Return a node for p/q, with the common factors of all terms of q cancelled term by term."""
+        """Return a node for p/q, with common factors of all terms of q cancelled term by term."""
         graph = self.graph
         if not p:
             return graph.zero
@@ -286,7 +283,7 @@ class NormalForms:
         return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)
 
     def cramer(self, M: list[NodeList], f: NodeList) -> NodeList:
-        """`M^-1 f` by determinants, in normal form; for up to three unknowns."""
+        """Return `M^-1 f` in normal form by Cramer's rule, for up to three unknowns."""
         A, b = [[self.expanded(x) for x in row] for row in M], [self.expanded(x) for x in f]
         determinant = self._determinant(A)
         replaced = [[[b[i] if j == k else A[i][j] for j in range(len(b))] for i in range(len(b))] for k in range(len(b))]
@@ -305,7 +302,7 @@ class NormalForms:
         return total
 
     def _coefficient(self, p: Polynomial) -> int:
-        """Return a polynomial in parameters alone: how many operations it takes does not matter."""
+        """Return a node for a polynomial in parameters, without minimising its operations."""
         return self.graph.total(self.graph.mul(self.graph.const(c), self.graph.product(monomial)) for monomial, c in sorted(p.items()))
 
     def _horner(self, terms: list[tuple[Monomial, bool]]) -> int:
@@ -313,7 +310,8 @@ class NormalForms:
         counts = Counter(factor for factors, _ in terms for factor in set(factors))
         factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(graph.one, 0))
         if count < 2:
-            products = ((graph.product(sorted(factors, key=graph.varies.__getitem__)), positive) for factors, positive in sorted(terms))  # parameters first
+            # parameters first
+            products = ((graph.product(sorted(factors, key=graph.varies.__getitem__)), positive) for factors, positive in sorted(terms))
             return graph.total(product if positive else graph.neg(product) for product, positive in products)
         inside = [(_without(f, factor), s) for f, s in terms if factor in f]
         outside = [(f, s) for f, s in terms if factor not in f]
@@ -327,7 +325,7 @@ def _without(factors: Monomial, factor: int) -> Monomial:
 
 def _put(p: Polynomial, monomial: Monomial, c: float) -> None:
     new = p.get(monomial, 0.0) + c
-    if abs(new) <= 1e-13 * abs(c):  # cancelled, up to the round-off of the numbers in the scene
+    if abs(new) <= 1e-13 * abs(c):  # cancelled up to the round-off of the constants in the scene
         p.pop(monomial, None)
     else:
         p[monomial] = new

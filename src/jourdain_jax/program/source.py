@@ -1,4 +1,4 @@
-"""A graph as text: readable Python, C, or SymPy expressions, with names for values that are used more than
+"""Source code of a graph: readable Python, C, or SymPy expressions, with names for values used more than
 once.
 """
 
@@ -14,18 +14,18 @@ from jourdain_jax.program.graph import Graph
 class Language:
     """Syntax of expressions and statements."""
 
-    name: str  # the field of an operation that says how it is written
+    name: str  # field of `Operation` with the source form
     library: str
     assignment: str
     infinity: str
 
     @property
     def names(self) -> set[str]:
-        """Names of functions."""
+        """Return the names of functions."""
         return {getattr(operation, self.name) or name for name, operation in TABLE.items()}
 
     def written(self, op: str, operands: list[str]) -> str:
-        """Return a function of operands, which bind as loosely as may be."""
+        """Return the source of a function of operands."""
         form = getattr(TABLE[op], self.name) or self.library + op
         return f"({form.format(*operands)})" if "{" in form else f"{form}({', '.join(operands)})"
 
@@ -36,15 +36,15 @@ C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
     """Return lines that name values used more than once, and the expressions of the outputs. `names`: names
-    of inputs and of nodes already known.
+    of inputs and of known nodes.
     """
     nodes = _needed(graph, outputs, names)
     uses = Counter([*outputs, *(a for node in nodes for a in graph.args[node])])
-    written: dict[int, tuple[str, int]] = {n: (name, 9) for n, name in names.items()}  # text and how tightly it binds
+    written: dict[int, tuple[str, int]] = {n: (name, 9) for n, name in names.items()}  # text and precedence
     lines: list[str] = []
     for node in nodes:
         text, binds = _expression(graph, node, written, language)
-        # 110 characters of an expression before it is given a name
+        # name expressions longer than 110 characters
         if graph.args[node] and (uses[node] > 1 or len(text) > 110) and binds < 9:
             name = f"{prefix}{len(lines)}"
             lines.append(language.assignment.format(name=name, value=text))
@@ -54,13 +54,13 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
 
 
 def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dict) -> list[int]:
-    """Return the nodes to be written, in order. Raises ValueError if a call of JAX is among them."""
+    """Return the nodes to write, in order. Raises ValueError if a JAX call is among them."""
     nodes = graph.needed(outputs, names)
     reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
         raise ValueError(
-            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; write the load or event that "
-            "contains them in scalar operations, or print the scene without it"
+            f"calls of JAX ({'; '.join(reasons)}) cannot be written as source; rewrite the load or event "
+                "that contains them in scalar operations, or print the scene without it"
         )
     return nodes
 
@@ -88,7 +88,7 @@ def _inside(part: tuple[str, int], level: int) -> str:
 
 
 def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, str]) -> list:
-    """Return the outputs as SymPy expressions; needs SymPy."""
+    """Return the outputs as SymPy expressions; requires SymPy."""
     import sympy
 
     values: dict = {n: sympy.Symbol(name) for n, name in names.items()}
