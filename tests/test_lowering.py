@@ -36,12 +36,12 @@ def test_scenes_without_rows_and_with_multipliers_are_shortened_too():
     assert "multipliers" not in str(jj.lower(MODELS["double-pendulum-angles"]()))
     skate = jj.lower(MODELS["skate"]())
     assert skate.operations <= 11
-    assert "rows kept by multipliers, by elimination" in str(skate)
+    assert "constraints enforced by multipliers" in str(skate)
 
 
 def test_the_summary_says_what_was_dropped_and_chosen():
     text = str(jj.lower(MODELS["tilting-disc"]()))
-    for part in ("privileged speeds: yaw_rate, lean_rate, spin_rate", "eliminated: x_rate, y_rate", "x, y, yaw, spin", "operations"):
+    for part in ("independent speeds: yaw_rate, lean_rate, spin_rate", "eliminated: x_rate, y_rate", "x, y, yaw, spin", "operations"):
         assert part in text
 
 
@@ -110,12 +110,12 @@ def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, 
 def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
     disc = jj.lower(MODELS["tilting-disc"]())
     assert "SI units and radians): mass (kg), radius (m), gravity (m/s^2)" in str(disc)
-    assert "must stay positive, signs that are relied on: cos(lean)" in str(disc)
+    assert "monitored guards, which must stay positive: cos(lean)" in str(disc)
     assert '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""' in disc.python_source()
     assert "positive spin rolls forward" in disc.python_source()
     assert "const double spin_rate = speeds[2];" in disc.c_source()
     two = jj.lower(TwoLateralRows())
-    assert "redundant rows omitted: second" in str(two)
+    assert "redundant constraints omitted: second" in str(two)
 
 
 class TwoLateralRows(jj.models.ChaplyginSleigh):

@@ -145,7 +145,7 @@ def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_
     assert len(program.calls) == len(program.graph.calls([*program.ydot, program.power])) == 1
     assert all(reason in call for call in program.calls)
     assert program.operations <= 60
-    assert f"kept as a call of JAX, as it has no scalar form: {program.calls[0]}" in str(program)
+    assert f"kept as a JAX call, without scalar form: {program.calls[0]}" in str(program)
     (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
     expected = jax.jit(jax.vmap(lambda q, y: dense(scene, q, y)))(q, y)
     assert_allclose(jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12)
@@ -269,7 +269,7 @@ def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources
     scene = LAWS["iteration"][0]
     program = jj.lower(scene)
     said = jj.report(scene).lowering
-    why = "the operation `while` has no scalar form: kept as a call; not to machine code: a part of it is kept as a call of JAX"
+    why = "the operation `while` has no scalar form: kept as a call; not to machine code: a part of it is kept as a JAX call"
     assert said == f"a scalar program of {program.operations} operations; {why}"
     for printed in (program.python_source, program.c_source):
         with pytest.raises(ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as source"):

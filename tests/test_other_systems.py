@@ -43,8 +43,8 @@ def test_under_windows_motions_are_integrated_by_xla(monkeypatch):
     monkeypatch.setattr(host.ctypes, "CDLL", _no_library)
     host.reason_against.cache_clear()
     try:
-        assert set_up(jj.models.TiltingDisc()).reason_against_machine_code == "it is made under Linux and macOS alone"
-        with pytest.raises(ValueError, match="it is made under Linux and macOS alone"):
+        assert set_up(jj.models.TiltingDisc()).reason_against_machine_code == "it requires Linux or macOS"
+        with pytest.raises(ValueError, match="it requires Linux or macOS"):
             jj.simulate(jj.models.TiltingDisc(), t1=0.1, backend="native")
     finally:
         host.reason_against.cache_clear()
@@ -65,7 +65,7 @@ def test_a_system_without_a_function_that_is_called_has_no_machine_code(name, mo
             return getattr(self.all, asked)
 
     monkeypatch.setattr(host.ctypes, "CDLL", Library)
-    assert host.reason_against.__wrapped__().endswith(f"does not serve here (undefined symbol: {name})")
+    assert host.reason_against.__wrapped__().endswith(f"does not work here (undefined symbol: {name})")
 
 
 @needs_machine_code
@@ -75,7 +75,7 @@ def test_an_llvmlite_that_is_too_old_or_too_new_has_no_machine_code(lacking, mon
         raise RuntimeError("LLVM IR parsing error\n<string>:1:8: expected type")
 
     monkeypatch.setattr(host.llvm, lacking, refused)
-    assert re.fullmatch(r"LLVM [\d.]+ of llvmlite does not serve here \(LLVM IR parsing error\)", host.reason_against.__wrapped__())
+    assert re.fullmatch(r"llvmlite's LLVM [\d.]+ does not work here \(LLVM IR parsing error\)", host.reason_against.__wrapped__())
 
 
 @pytest.mark.parametrize(("error", "said"), [(OSError("no libllvmlite.so"), "cannot be imported (no libllvmlite.so)"), (None, "is not installed")])

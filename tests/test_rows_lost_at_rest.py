@@ -158,7 +158,7 @@ def slider(case, monkeypatch):
 def test_a_row_that_may_set_in_is_not_left_out(name, monkeypatch):
     scene = slider(SETS_IN[name], monkeypatch)
     assert jj.structure_of(scene).may_set_in == ("late",)
-    with pytest.raises(jj.NotLowered, match="rows `late` are redundant at all probed states, but this could not be proved for all states"):
+    with pytest.raises(jj.NotLowered, match="constraints `late` are redundant at all probed states, but not provably everywhere"):
         jj.lower(scene)
     with pytest.raises(
         ValueError, match=r"of `Slider` (may become independent of the others during a motion|are nonlinear in the speeds).*use jj.Formulation\('full'\)"

@@ -1,13 +1,13 @@
-"""Jourdain's equations in privileged speeds, built on the graph: rates of the minimal state (q, y) as scalar expressions.
+"""Jourdain's equations in independent speeds: rates of the minimal state (q, y) as scalar expressions.
 
     A_z z = -(A_y y + phi_0)                         dependent speeds, by elimination                     (25)-(31)
     v, omega;  beta, gamma = d(v, omega)/dy;  a_0, alpha_0 along the motion at ydot = 0
     M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M ydot = f                                                                                             (41), (50), (56)
 
-Rows that are not eliminated are kept instead (`kept_rows.py`).
-Two ways lead there. *Explicit*: z, as an expression in (q, y), is put into the velocities before they are differentiated; best where z is
-simple. *Implicit*: speeds are differentiated as they stand, and the rates of z come from the rates of the rows; best where z is not.
+Constraints that are not eliminated are kept (`kept_rows.py`). There are two strategies.
+*Explicit*: substitute z(q, y) into the velocities before differentiating them, best if z is simple.
+*Implicit*: differentiate the velocities as they are, with zdot from the differentiated constraints.
 """
 
 from dataclasses import dataclass, field
@@ -31,18 +31,18 @@ from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 @dataclass(frozen=True)
 class Strategy:
-    """A strategy for building the equations; all give equal values."""
+    """Strategy for building the equations; all strategies give equal values."""
 
     explicit: bool = True
-    most_terms: int = 0  # of a normal form; 0: none are made
+    most_terms: int = 0  # limit of a normal form; 0: no normal forms
     most_terms_of_equations: int = 0  # the same for the entries of M and f
-    by_determinants: bool = False  # the accelerations in normal form, by Cramer's rule, while dependent speeds are symbols
-    held: tuple[int, ...] = ()  # ignorable coordinates, held at the reference in the accelerations
+    by_determinants: bool = False  # accelerations by Cramer's rule, with dependent speeds as symbols
+    held: tuple[int, ...] = ()  # ignorable coordinates, fixed at the reference in the accelerations
 
     @property
     def description(self) -> str:
-        """Description of the derivation."""
-        way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
+        """Describe the strategy for the summary."""
+        way = "dependent speeds substituted before differentiation" if self.explicit else "constraints differentiated through body velocities"
         solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
         return f"{way}, {solved}"
 
@@ -53,19 +53,19 @@ class Equations:
 
     qdot: NodeList
     ydot: NodeList
-    z: NodeList  # the dependent speeds
+    z: NodeList  # dependent speeds
     pivots: NodeList  # must not vanish
     guards: NodeList = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`
     events: NodeList = field(default_factory=list)  # values of the stop events
-    resets: NodeList = field(default_factory=list)  # of each: coordinates, speeds of the state and modes after it, and what loads store then
+    resets: NodeList = field(default_factory=list)  # after each event: state, modes, energy in loads
     energies: NodeList = field(default_factory=list)  # kinetic and potential
-    directions: NodeList = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
-    squares: NodeList = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
+    directions: NodeList = field(default_factory=list)  # of nonlinear constraints, by speed: must not reverse
+    squares: NodeList = field(default_factory=list)  # of constraints with multipliers (`Accelerations`)
 
 
 class AppellOnGraph:
-    """The construction for one scene."""
+    """Builder of the equations of one scene."""
 
     def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
@@ -80,7 +80,7 @@ class AppellOnGraph:
             simplify_contacts(traced, self._forms)
 
     def build(self, strategy: Strategy) -> Equations:
-        """Return the equations by one strategy."""
+        """Return the equations built by one strategy."""
         forms = self._forms(strategy.most_terms)
         held = self._at_reference(strategy.held)
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.by_determinants)
@@ -112,7 +112,7 @@ class AppellOnGraph:
         return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares)
 
     def _of_state(self, resets: np.ndarray) -> NodeList:
-        """Return the changes of a state by events, without dependent speeds."""
+        """Return the state changes at events, without dependent speeds."""
         first = len(self.traced.q)
         return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist() if resets.size else []
 
@@ -120,14 +120,14 @@ class AppellOnGraph:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
     def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[NodeList, NodeList]:
-        """Return coordinates projected onto quaternion norms and geometric rows, and speeds projected onto
-        velocity rows (none if these are eliminated).
-
-        Closed contacts count as rows."""
+        """Return coordinates projected onto quaternion norms and geometric constraints, and speeds projected
+        onto velocity constraints (empty if eliminated). Closed contacts count as constraints.
+        """
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))  # others have one value on the rows, but derivatives by them
+        # constraints fix the others, but have derivatives with respect to them
+        varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))
         closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(varying)))
         moved = list(q)
         if closure:
@@ -142,7 +142,7 @@ class AppellOnGraph:
             M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
             phi = [int(at.phi[s]) for s in self.multiplied]
             speeds = self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
-        if len(at.held):  # contacts that are closed, first
+        if len(at.held):  # closed contacts first
             u, (held_q, held_u) = self.traced.u.tolist(), np.split(at.held, [len(q)])
             moved = g.substituted(moved, dict(zip(q, held_q.tolist(), strict=True)))
             speeds = g.substituted(held_u.tolist(), dict(zip(u, speeds or u, strict=True)))
@@ -176,7 +176,7 @@ class AppellOnGraph:
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
     def _inertia_resultants(self, at: VelocityQuantities, b: int, a: NodeList, alpha: NodeList) -> tuple[NodeList, NodeList]:
-        """`m a` and `I alpha + omega x I omega` of body b."""
+        """Return `m a` and `I alpha + omega x I omega` of body b."""
         g, inertia, omega = self.graph, at.inertia[b].tolist(), at.omega[b].tolist()
         momentum = [g.dot(row, omega) for row in inertia]
         gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
@@ -191,7 +191,7 @@ class AppellOnGraph:
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
     def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[NodeList, NodeList, NodeList]:
-        """Return dependent speeds and rates at the true coordinates; recompute those of held coordinates."""
+        """Return dependent speeds and coordinate rates with no coordinate fixed, and new pivots."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
@@ -246,7 +246,7 @@ class AppellOnGraph:
 
 
 class _Kinematics:
-    """Velocities, partial velocities and accelerations at ydot = 0; some coordinates are held."""
+    """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates fixed."""
 
     def __init__(self, build: AppellOnGraph, forms: NormalForms, held: dict[int, int], explicit: bool, free_z: bool = False):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
@@ -255,7 +255,7 @@ class _Kinematics:
         self.phi = [int(build.traced.at.phi[s]) for s in build.rows]
         (self._explicitly if explicit else self._implicitly)()
 
-    # Explicit: the dependent speeds are put into the velocities, which are then differentiated.
+    # Explicit: substitute the dependent speeds into the velocities, then differentiate.
 
     def _explicitly(self) -> None:
         A = [list(row) for row in zip(*(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True)]
@@ -266,7 +266,7 @@ class _Kinematics:
         partial = [self._simple(column) for column in columns(self.graph, simple, self.y)]
         self._shape(simple, partial, self._along(simple, raw, self.qdot))
 
-    # Implicit: speeds are differentiated as they stand; the rows are differentiated through the velocities of the bodies they are made of.
+    # Implicit: differentiate the velocities as they are, and the constraints through body velocities.
 
     def _implicitly(self) -> None:
         g, build, at = self.graph, self.build, self.build.traced.at
@@ -282,7 +282,7 @@ class _Kinematics:
         put = self._cut(levels)
         self._put = put
 
-        # velocities are cut in every direction, and move in few of them
+        # velocities are replaced in every direction, and change in few of them
         directions: dict = {None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])}
         for k, column in enumerate(by_speed):
             parts = self._parts(column)
@@ -313,7 +313,7 @@ class _Kinematics:
         self._shape(known(simple), partial, rates)
 
     def _solve(self, A, phi_0) -> None:
-        """`z = B y + b` from `A_z z = -(A_y y + phi_0)`."""
+        """Solve `A_z z = -(A_y y + phi_0)` for `z = B y + b`."""
         g, build = self.graph, self.build
         right = [[*(g.neg(row[i]) for i in build.independent), g.neg(rest)] for row, rest in zip(A, phi_0, strict=True)]
         self._A_z = [[row[d] for d in build.dependent] for row in A]
@@ -325,20 +325,20 @@ class _Kinematics:
         self.known = dict(zip([self.u[d] for d in build.dependent], self.z, strict=True))
 
     def rows_along_motion(self, rows: NodeList) -> tuple[list[NodeList], NodeList]:
-        """Jacobian in the speeds and drift of some rows, at the held coordinates."""
+        """Return the Jacobian (by speeds) and the drift of some constraints, at the fixed coordinates."""
         raw = [int(self.build.traced.at.phi[s]) for s in rows]
         simple = self._at(raw)
         by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
         return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
     def rates_along_motion(self, raw: NodeList) -> NodeList:
-        """Return rates of traced nodes along the motion, at the held coordinates."""
+        """Return rates of traced nodes along the motion, at the fixed coordinates."""
         return self._along(self._at(raw), raw, self.qdot)
 
     # helpers
 
     def _at(self, nodes) -> NodeList:
-        """Return nodes at the held coordinates, simplified."""
+        """Return nodes at the fixed coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
 
     def _turned(self, R, w) -> NodeList:
@@ -350,7 +350,7 @@ class _Kinematics:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
     def _cut(self, levels) -> dict[int, int]:
-        """Return traced nodes with their replacements (zero if none is given); numbers stay numbers."""
+        """Return traced nodes -> replacements (zero if none is given); constants are excluded."""
         pairs: dict[int, int] = {}
         for nodes, values in levels:
             flat = np.ravel(nodes).tolist()
@@ -363,7 +363,7 @@ class _Kinematics:
         return pairs
 
     def _along(self, nodes, raw, qdot) -> NodeList:
-        """Return the rate of `nodes` along the motion; `raw`: the nodes before any coordinate was held."""
+        """Return the rate of `nodes` along the motion; `raw`: the nodes before fixing coordinates."""
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
         rates = derivatives(g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held})
@@ -373,13 +373,13 @@ class _Kinematics:
         return self._simple(rates)
 
     def _velocities(self, replacement) -> tuple[NodeList, NodeList]:
-        """v and omega in a row, raw and simplified at the held coordinates."""
+        """Return v and omega of all bodies in one list, raw and simplified at the fixed coordinates."""
         at = self.build.traced.at
         raw = self.graph.substituted([*at.v.ravel().tolist(), *at.omega.ravel().tolist()], replacement)
         return raw, self._at(raw)
 
     def _quantities(self) -> None:
-        """Everything traced, at the dependent speeds and the held coordinates."""
+        """Evaluate all traced quantities at the dependent speeds and the fixed coordinates."""
         at, g = self.build.traced.at, self.graph
 
         def put(nodes):
@@ -390,7 +390,7 @@ class _Kinematics:
         self.qdot = self.at.qdot.tolist()
 
     def _parts(self, nodes) -> tuple[list, list]:
-        """Linear and angular parts, per body."""
+        """Return linear and angular parts per body."""
         rows = np.array(nodes, np.int64).reshape(2, len(self.build.traced.at.mass), 3).tolist()
         return rows[0], rows[1]
 

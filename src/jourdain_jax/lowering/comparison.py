@@ -1,5 +1,5 @@
-"""Equality of the rates of two programs, or of a program and dense matrices: at probes where both are valid,
-relative to the typical size of each rate.
+"""Comparison of the rates of two programs, or of a program and dense matrices, at probes where both are valid
+and relative to the typical size of each rate.
 """
 
 import jax
@@ -16,7 +16,7 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
 DIFFERS = "differs from the dense path"
-LIKELY = "a body, load or row has more than one derivative there, as at a kink, or rows, or the inertia along what they leave free, are nearly singular"
+LIKELY = "a body, load or constraint may have a kink there, or the constraints or the remaining inertia are nearly singular"
 
 
 def rates_of(found: Equations) -> list[int]:
@@ -25,50 +25,51 @@ def rates_of(found: Equations) -> list[int]:
 
 
 def values_at(found: Equations, probes: Probes) -> np.ndarray:
-    """Return rates at all probes; NaN at probes with a small pivot, where the program is not valid."""
+    """Return the rates at all probes; NaN at probes with a small pivot, where the program is not valid."""
     return np.where(pivots_ok(found.pivots, probes), probes(rates_of(found)), np.nan)
 
 
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Return whether two programs agree wherever the second is valid."""
     usable = all_finite(expected, axis=0)
-    # 1e-9 between programs at the probes, relative to the size of each rate
+    # tolerance 1e-9, relative to the size of each rate
     return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable])))
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
-    """Return the sizes relative to which errors of rates (first axis) at probes are judged: the usual size of
-    each rate, in its own unit.
+    """Return the sizes relative to which errors of rates (first axis) at probes are judged: the usual
+    size of each rate, in its unit.
     """
     usual = largest(rates, 1, keepdims=True)
-    # 0.01 of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
+    # plus 0.01 of the largest rate at a probe, because elimination spreads its round-off over all rates
     return usual + 0.01 * largest(rates, 0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
-    """Return whether a program is valid at enough of the probed states. For long chains only some are
-    assembled.
+    """Return whether a program is valid at enough of the probes. For long chains only
+    some satisfy the constraints.
     """
-    # at 12 probes programs can be compared, where so many were found
+    # at least 12 probes, if so many exist
     return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
 
 
 def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
-    """Compare the scalar program with JAX's own derivatives and a dense solution at the probes. Return the
-    reason, with a name, where they differ.
+    """Raise `NotLowered`, naming the worst rate, if the program differs at the probes from JAX's
+    derivatives and a dense solution.
     """
     probes, independent = builder.probes, tuple(builder.independent)
     leaves, treedef = jax.tree.flatten(scene)
     columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
-    values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]  # a parameter may have no entries
+    # a parameter may have no entries
+    values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]
     parameters = jax.tree.unflatten(treedef, [x.reshape(-1 if x.size else probes.count, *np.shape(leaf)) for x, leaf in zip(values_of, leaves, strict=True)])
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
     usable = all_finite(values, axis=0)
-    # operations: above, fewer probes are compared with the dense path
+    # above 5000 operations, fewer probes are compared with the dense path
     large = builder.graph.operations(rates_of(found)) > 5000
-    # above so many operations, 6 of the probes are compared
+    # 6 probes for large programs
     chosen = np.flatnonzero(usable)[:6] if large else np.arange(probes.count)
     states = at_index((parameters, t, q, u, inputs), chosen)
     qdot, ydot, events = dense_rates(scene, structure, independent, *states)
@@ -78,7 +79,8 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
         raise NotLowered("its scalar program is valid at too few of the probed states")
-    # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
+    # tolerance between the program (in double precision) and the dense path,
+    # relative to the size of each rate
     limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]

@@ -1,5 +1,5 @@
-"""Normal forms of switching contacts: their parts are simplified once, and loads, events, resets and starts
-are rebuilt from them.
+"""Normal forms of switching contacts: contact responses are simplified once; loads, events, resets and
+starts are rebuilt from them.
 """
 
 from collections.abc import Callable
@@ -9,12 +9,12 @@ import numpy as np
 from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.polynomial import NormalForms
 
-MOST_TERMS = (8, 60)  # of normal forms that are tried
+MOST_TERMS = (8, 60)  # term limits to try
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Replace `responses` by normal forms. At later states of the motion these are functions of the responses
-    at earlier ones. `forms`: returns normal forms with a limited number of terms.
+    """Replace `responses` by normal forms, including responses at later states, which are functions of
+    earlier ones. `forms`: returns normal forms with a limited number of terms.
     """
     g, at = traced.graph, traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]

@@ -1,8 +1,7 @@
-"""Rates of a scene by dense matrices on NumPy, the reference of a scalar program, with JAX's derivatives.
+"""Rates of a scene by dense matrices on NumPy with JAX's derivatives, the reference for scalar programs.
 
     beta, gamma, A          derivatives of v, omega, phi along each speed
-    a_0, alpha_0, drift     along (1, qdot, 0)
-
+    a_0, alpha_0, drift     derivatives along (1, qdot, 0)
     M = sum m beta' beta + gamma' I gamma
     f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M udot - A' lambda = f,   A udot = -drift                                        (68)-(70)
@@ -29,10 +28,10 @@ from jourdain_jax.scene.scene import Scene
 
 def dense_rates(scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
     """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
-    states; NaN where accelerations are not determined.
+    states; NaN if the accelerations are not unique.
 
-    All arrays, including parameters, have a leading axis of states. `independent`: speeds in the state; if
-    these are not all, the others follow from the rows.
+    All arrays, including parameters, have a leading axis of states. `independent`: speeds in the state; the
+    constraints determine the others.
     """
     closed, shape = jaxpr_of_scene(scene, structure.potentials_of_inputs)
     numbers: VelocityQuantities = jax.tree.unflatten(jax.tree.structure(shape), range(len(jax.tree.leaves(shape))))[0]
@@ -47,7 +46,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: Indices, parame
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
 
     functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
-    # 4096 states times directions are computed at once
+    # limit on states times directions computed at once
     size = -(-len(t) // (1 + u.size // 4096))
     found = [_rates(functions, structure, independent, *at_index(states, slice(i, i + size))) for i in range(0, len(t), size)]
     return tuple(map(np.concatenate, zip(*found, strict=True)))
@@ -70,7 +69,7 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
         A_z = A[:, :, dependent]
         u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
     qdot, omega, force, torque, direct, m, I, events, turns = values(parameters, t, q, u, inputs)
-    # in as many lanes as above, so that JAX traces this once
+    # with the same batch size, so that JAX traces this once
     a, alpha, drift = (x[:, 0] for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[1])
     turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
     force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
@@ -80,10 +79,10 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
-    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not determined.
+    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not unique.
 
-    `rank`: that of the rows. Rows beyond it do not count, since coordinates rounded to single precision make
-    dependent rows independent by some 1e-8.
+    `rank`: rank of the constraints. Smaller eigenvalues are dropped, because coordinates rounded to single
+    precision make dependent constraints independent by about 1e-8.
     """
     c = speed_scales(M)
     A = A * c[:, None]

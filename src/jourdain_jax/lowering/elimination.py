@@ -12,30 +12,30 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes
 
-Rows = list[list[int]]  # of a matrix, entry by entry a node
+Rows = list[list[int]]  # of a matrix; each entry is a node
 
 
 @dataclass(frozen=True)
 class Eliminated:
-    """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish along the motion or for some
-    parameters.
+    """Solution of `A x_k = b_k` as `solution[column][k]`, and the pivots that may vanish along the
+    motion or for some parameters.
     """
 
     solution: Rows
     pivots: list[int]
-    forward: Rows = field(default_factory=list)  # of a symmetric system, `L^-1 right`
+    forward: Rows = field(default_factory=list)  # for a symmetric system, `L^-1 right`
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """Return the probes at which quotients by these pivots are accurate: no pivot is small relative to its
-    typical size.
+    """Return the probes at which division by these pivots is accurate: none is small
+    relative to its typical size.
     """
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 
 
 def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
-    """Return the median of each value over the probes where it is finite; NaN if there are none."""
+    """Return the median of each value over the probes where it is defined; NaN without any."""
     known = np.any(~np.isnan(sizes), axis=1)
     found = np.full(len(sizes), np.nan)
     found[known] = np.nanmedian(sizes[known], axis=1)
@@ -43,10 +43,10 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
 
 
 def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None) -> Eliminated:
-    """Solve a system. `right[row]` holds the right-hand sides of that row. If there are more rows than
-    unknowns, they must be consistent.
+    """Solve a system. `right[row]` holds the right-hand sides of that row. With more rows than unknowns,
+    the rows must be consistent.
 
-    `far`: probes at full turns of all angles. They are made only when a pivot must be judged there.
+    `far`: makes probes with angles over full turns, only when a pivot must be judged there.
     """
     system = Pivots(graph, A, right, probes, far)
     count = len(system.columns)
@@ -69,19 +69,19 @@ def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:
-    """Return a/b, by the reciprocal of b if that is in the graph already."""
+    """Return a/b as a times the reciprocal of b, which can be shared."""
     return graph.mul(a, graph.div(graph.one, b))
 
 
 def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
-    """Return `M^-1 right` for a symmetric positive definite M, by its factors L D L'. `right` and the
+    """Return `M^-1 right` for a symmetric positive definite M by factorisation L D L'. `right` and the
     solution consist of columns; the pivots are D.
     """
     count = len(M)
     S, columns = [list(row) for row in M], [list(column) for column in right]
     left = set(range(count))
     order: list[int] = []
-    factors: dict[int, dict[int, int]] = {}  # column of L by pivot
+    factors: dict[int, dict[int, int]] = {}  # column of L, by pivot
 
     def cost(k):
         fill = sum(S[k][j] != graph.zero for j in left)

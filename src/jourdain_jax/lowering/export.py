@@ -1,6 +1,4 @@
-"""A lowered scene for readers: a summary, and the program as Python, C, SymPy or LaTeX (functions of a
-`Lowered`).
-"""
+"""Output of a lowered scene for readers: a summary, and the program as Python, C, SymPy or LaTeX."""
 
 import re
 
@@ -14,7 +12,7 @@ _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
 def summary(lowered) -> str:
-    """Return the summary: operations after each step, omitted parts with reasons, privileged speeds, pivots
+    """Return the summary: operations after each step, omitted parts with reasons, independent speeds, pivots
     and guards, parameters with units.
     """
     lines = [
@@ -23,15 +21,15 @@ def summary(lowered) -> str:
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
         f"  omitted, without influence on the accelerations: {', '.join(lowered.held) or 'nothing'}",
-        *(f"  kept as a call of JAX, as it has no scalar form: {reason}" for reason in lowered.calls),
-        *([f"  redundant rows omitted: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
-        f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
-        f"  computed once per motion, from parameters alone: {len(lowered.fixed)} "
-        f"number{'' if len(lowered.fixed) == 1 else 's'}",
-        "  must not vanish, pivots that are monitored: "
-        f"{_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
-        f"  must stay positive, signs that are relied on: {_shown(lowered, lowered.guards)}",
-        f"  way: {lowered.way}; {lowered.seconds:.2f} s",
+        *(f"  kept as a JAX call, without scalar form: {reason}" for reason in lowered.calls),
+        *([f"  redundant constraints omitted: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
+        f"  parameters, kept as inputs (SI units and radians): {_parameters(lowered) or 'none'}",
+        f"  computed once per motion, from parameters only: {len(lowered.fixed)} "
+            f"number{'' if len(lowered.fixed) == 1 else 's'}",
+        "  monitored pivots, which must not vanish: "
+            f"{_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
+        f"  monitored guards, which must stay positive: {_shown(lowered, lowered.guards)}",
+        f"  strategy: {lowered.way}; {lowered.seconds:.2f} s",
     ]
     return "\n".join(lines)
 
@@ -42,8 +40,8 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """Return the nodes as expressions if these are short (at most 60 characters and 8 nodes), otherwise their
-    number.
+    """Return short nodes as expressions (up to 8, of at most 60 characters each),
+    and the number of the others.
     """
     names = identifiers(lowered)
     written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
@@ -53,23 +51,24 @@ def _shown(lowered, nodes) -> str:
 
 
 def _alone(graph, pivot: int) -> int:
-    """Return a text that describes a pivot as a multiple of another value, or by that value's sign."""
+    """Return the varying factor of a scaled pivot, or the argument of a sign."""
     args = graph.args[pivot]
     return next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
 
 
 def _speeds(lowered) -> list[str]:
     if lowered.projected_u:
-        return [f"  speeds, all integrated, with rows kept by multipliers: {', '.join(lowered.speeds)}"]
+        return ["  all speeds are integrated, with multipliers for the constraints: "
+            f"{', '.join(lowered.speeds)}"]
     return [
-        f"  privileged speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
+        f"  independent speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
         "  dependent speeds, eliminated: "
-        f"{', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
+            f"{', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
     ]
 
 
 def identifiers(lowered) -> dict[int, str]:
-    """Return a readable name for every input of the program, each its own."""
+    """Return a unique readable name for every input of the program."""
     traced = lowered.traced
     named = [(traced.t, "t")]
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
@@ -99,12 +98,12 @@ def results(lowered) -> dict[str, int]:
 
 
 def _prefix(letter: str, names) -> str:
-    """Return a prefix for generated, numbered names that no name of the scene begins with."""
+    """Return a prefix for numbered names that no name of the scene begins with."""
     return _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
 
 
 def python_source(lowered) -> str:
-    """Return two functions: values of parameters only, and the rates."""
+    """Return the source of two functions: values that depend on parameters only, and the rates."""
     names, rates = identifiers(lowered), results(lowered)
     c, k, s = (_prefix(letter, names.values()) for letter in "cks")
     parameters = [names[int(n)] for nodes in lowered.traced.parameters for n in np.ravel(nodes)]
@@ -144,14 +143,14 @@ def python_source(lowered) -> str:
 
 
 def _conventions(lowered) -> str:
-    """Units and axes, in a form that ends no docstring and no comment."""
+    """Return units and axes as text that cannot end a docstring or comment."""
     said = lowered.conventions.replace('"', "'").replace("*/", "").rstrip()
     return said if "SI units" in said else f"SI units, radians. {said}".rstrip()
 
 
 def c_source(lowered, name: str = "rates") -> str:
-    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; it
-    needs the mathematical library.
+    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)`; it
+    needs the C mathematical library.
     """
     traced, rates = lowered.traced, results(lowered)
     names = {n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given for n, given in identifiers(lowered).items()}
@@ -185,16 +184,16 @@ def c_source(lowered, name: str = "rates") -> str:
 
 
 def expressions(lowered) -> dict:
-    """Return name -> SymPy expression of every rate, in the parameters and the state; needs SymPy."""
+    """Return name -> SymPy expression of every rate, in the parameters and the state; requires SymPy."""
     rates = results(lowered)
     return dict(zip(rates, sympy_expressions(lowered.graph, list(rates.values()), identifiers(lowered)), strict=True))
 
 
 def latex(lowered) -> str:
-    """Return the equations for an `align` environment, long numbers with six digits; needs SymPy.
+    """Return the equations for an `align` environment, with numbers rounded to six digits; requires SymPy.
 
-    A speed that is the rate of a coordinate appears as the derivative of that coordinate, and needs no
-    equation.
+    A speed that is the rate of a coordinate appears as its derivative and needs no equation
+    of motion for the coordinate.
     """
     import sympy
 
@@ -206,14 +205,16 @@ def latex(lowered) -> str:
     left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
     left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
-    # fractions that are longer than their decimals: 9/2 is not, 144952661367387/50000000000000 is
+    # round long fractions: 144952661367387/50000000000000, but not 9/2
     values = [value.replace(lambda x: x.is_Rational and x.q >= 1000, lambda number: sympy.Float(number, 6)) for value in expressions(lowered).values()]
     lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, values, strict=True)]
     return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
 
 
 def _symbol(name: str) -> str:
-    """Return a letter, Latin or Greek, in italics with its number as index; other words are upright."""
+    """Return a single Latin or Greek letter in italics, other words upright, each
+    with its number as subscript.
+    """
     import sympy
 
     letter = name.rstrip("0123456789").rstrip("_")

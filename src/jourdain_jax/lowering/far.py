@@ -1,6 +1,6 @@
-"""Probes outside the domain. Angles take any value, since a pivot that is large in the domain may vanish at
-another heading. Speeds satisfy the velocity constraints, since redundant constraints have a solution only
-there.
+"""Probes outside the domain, with angles over full turns, because a pivot that is large in the
+domain may vanish at another heading. Speeds satisfy the velocity constraints, because redundant
+constraints have a solution only there.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from jourdain_jax.program.onto_rows import onto_rows
 
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
-    """Return probes with coordinates up to half a turn away from the given ones, projected onto the geometric
-    constraints where Newton's method converges. They are made on first use.
+    """Return a function that makes probes with coordinates up to half a turn away from the given ones,
+    projected onto the geometric constraints where that converges. They are made on first use.
 
     Quaternions are drawn anew.
     """
@@ -26,7 +26,7 @@ def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
 
 def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     coordinates = traced.q.tolist()
-    # fewer probes where there are many coordinates
+    # fewer probes for many coordinates
     count, generator = 96 if len(coordinates) <= 16 else 24, np.random.default_rng(3)
     places = np.arange(count) % probes.count
     inputs = {name: np.broadcast_to(value, probes.count)[places] for name, value in probes.inputs.items()}
@@ -40,10 +40,10 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     for name in sorted({str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}):
         inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
     found = onto_rows(probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
-    off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also where Gauss-Newton does not converge
+    off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also true where Gauss-Newton gave NaN
     return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 
 def on_velocity_rows(probes: Probes, traced: TracedScene) -> Probes:
-    """Return the probes with the nearest speeds on the rows."""
+    """Return the probes with speeds projected onto the velocity constraints."""
     return onto_rows(probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}).probes

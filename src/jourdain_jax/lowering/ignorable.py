@@ -1,4 +1,6 @@
-"""Coordinates without influence on privileged accelerations, which the program holds at the reference."""
+"""Coordinates without influence on the accelerations of the independent speeds; the program
+fixes them at the reference.
+"""
 
 from dataclasses import replace
 
@@ -12,17 +14,19 @@ from jourdain_jax.program.derivative import cotangents, on_its_own
 from jourdain_jax.program.identity_test import SURE, alike, equal, taken_for_what_they_are
 from jourdain_jax.scene.scene import Scene
 
-FEW = 6  # probes that show most coordinates to count
+FEW = 6  # number of probes that suffices for most coordinates
 
 
 def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
     """Return the coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe.
+
     The derivative may be below the round-off of the values, as for the heading of the last of many trailers.
     Only operations that the identity test evaluates exactly are considered.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
-    coordinates = [n for n in coordinates if n in set(inputs) and generic.varies(str(graph.value[n]))]  # others have one value wherever rows are met
+    # the constraints fix all others
+    coordinates = [n for n in coordinates if n in set(inputs) and generic.varies(str(graph.value[n]))]
     if not coordinates or graph.calls(ydot):
         return set()
     own, outputs, variables = on_its_own(graph, ydot, inputs)
@@ -36,8 +40,8 @@ def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int]
 
 
 def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
-    """Return coordinates (quaternions as a whole) whose value has no effect on the privileged accelerations
-    anywhere.
+    """Return the coordinates (quaternions as a whole) whose values never affect the
+    accelerations of the independent speeds.
     """
     probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
     attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
@@ -51,8 +55,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def surely_changed(groups) -> np.ndarray:
-        """Return groups of coordinates that certainly influence the results. A few probes find them for all
-        groups at once; in a long chain nearly all groups are among them.
+        """Return which groups of coordinates certainly influence the accelerations. A few probes test all
+        groups at once, which finds nearly all groups of a long chain.
         """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
@@ -62,7 +66,7 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         before = here[:, lanes]
         before.error = here.error[:, lanes]
         sizes = np.abs(elsewhere(equations.pivots))
-        # 100.0 times as large as the smallest pivot that serves: one that serves whatever is usual
+        # require pivots 100 times above the limit, so that they are valid whatever their typical size
         far_from_singular = np.all(sizes > 100.0 * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
         return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
 
@@ -77,7 +81,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
     count_little = _with_slopes(builder, equations.ydot, [q[i] for group in left if len(group) == 1 for i in group], regular)
     left = [group for group in left if q[group[0]] not in count_little]
     together = [i for group in left for i in group]
-    if len(left) > FEW and unchanged(together) and regular_at_reference(together):  # what all of them together change nothing of, none does
+    # if all together have no effect, neither has any of them
+    if len(left) > FEW and unchanged(together) and regular_at_reference(together):
         return tuple(sorted([*held, *together]))
     for group in left:
         if unchanged(group) and regular_at_reference(group):

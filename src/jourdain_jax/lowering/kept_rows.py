@@ -1,9 +1,9 @@
-"""Constraints kept while all speeds stay in the state: by multipliers, or by privileged speeds where
-multipliers are not determined.
+"""Constraints while all speeds stay in the state: enforced by multipliers, or by independent speeds if
+the multipliers are not unique.
 
-A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds, with as many rows as there are
-C' M C ydot = C' (f - M c)                                                                             (41)
-z <- z + dz,   A_z dz = -phi(t, q, u)         speeds projected onto the constraints
+    A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds
+    C' M C ydot = C' (f - M c)                                                                             (41)
+    z <- z + dz,   A_z dz = -phi(t, q, u)         projection of the speeds
 """
 
 from jourdain_jax.build.structure import Structure
@@ -15,8 +15,8 @@ from jourdain_jax.program.polynomial import NormalForms
 
 
 class KeptRows:
-    """The treatment of constraints. `massless`: whether M may be singular. `probes`, and if necessary `far`:
-    states at which pivots of privileged speeds are judged.
+    """Treatment of constraints. `massless`: whether M may be singular. `probes` and, if necessary, `far`:
+    states at which pivots of independent speeds are judged.
     """
 
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
@@ -26,10 +26,11 @@ class KeptRows:
 
     @property
     def description(self) -> str:
-        """Description of how the constraints are kept."""
+        """Describe the treatment for the summary."""
         if self.by_partition:
-            return "all speeds in the state, their accelerations by privileged ones"
-        return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")
+            return "all speeds in the state, accelerations from the independent ones"
+        return "constraints enforced by multipliers" + (", with inertia added along the "
+            "constraints" if self.massless else "")
 
     def accelerations(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
         """Return the accelerations under all constraints, and the pivots."""
@@ -38,7 +39,7 @@ class KeptRows:
         return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine)
 
     def projected_speeds(self, M: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
-        """Return the speeds on `phi = 0`; if privileged speeds are used, unchanged."""
+        """Return the speeds projected onto `phi = 0`."""
         A = matrix(self.graph, phi, u)
         if not self.by_partition:
             return projected_speeds(self.graph, self._inertia(M, A), A, u, phi, forms)

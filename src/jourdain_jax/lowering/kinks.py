@@ -1,6 +1,6 @@
-"""Which loads and masses bend or jump at a state, and whether any jump at all: relations of the traced scene, with or without a scalar program of its rates.
+"""Kinks and jumps of loads and masses: relations of the traced scene, with or without a lowered program.
 
-What a call of JAX hides (`jnp.interp`, a callback) is not seen.
+Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ def loads_have_relations(scene: Scene) -> bool:
 
 
 def loads_may_jump(scene: Scene) -> bool:
-    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times are excepted, since
+    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times are excluded, because
     derivatives remain correct there.
     """
     scene = with_reference_parameters(scene)
@@ -35,9 +35,7 @@ def loads_may_jump(scene: Scene) -> bool:
 
 
 def bent_load(scene: Scene, t, q, u, inputs) -> str:
-    """Describe the load or mass that has no derivative with respect to the state at some state; empty if none
-    is found.
-    """
+    """Describe a load or mass without a derivative with respect to the state here; empty if there is none."""
     try:
         traced = looked_at(scene).traced
     except Unsupported:
@@ -47,7 +45,7 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
     if not numbers:
         return ""
     at = np.concatenate([np.ravel(x).astype(float) for x in (q, u, inputs)])
-    # 1e-6 off a state, relative to entries larger than one
+    # 1e-6 away from the state, relative for entries larger than one
     step = np.diag(1e-6 * np.maximum(1.0, np.abs(at)))
     q, u, inputs = np.split(np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1)
     beside = Probes(graph, named_values(scene, t, q, u, inputs))
@@ -60,12 +58,12 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
 
 
 def _probes(scene: Scene, traced: TracedScene) -> Probes:
-    """Return the states at which the structure of the scene was found, with random speeds and inputs."""
+    """Return the states that determined the structure of the scene, with random speeds and inputs."""
     known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
     u, inputs = (generator.normal(size=(len(known.times), len(names))) for names in (scene.speed_names.entries, scene.inputs))
     return Probes(traced.graph, named_values(scene, known.times, known.coordinates, u, inputs))
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
-    """Return the nodes of loads and masses, with the name of each."""
+    """Return the nodes of loads and masses -> their names."""
     return owned(scene, **{name: getattr(traced.at, name) for name in ("force", "torque", "mass", "inertia", "direct")})

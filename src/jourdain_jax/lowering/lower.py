@@ -1,5 +1,5 @@
-"""The lowered equations of a scene: candidates are built in several ways and compared with each other and
-with dense matrices; the one with the fewest operations is kept. If lowering fails, the reason is reported.
+"""Lowered equations of a scene. Several candidates are built and compared with each other and with dense
+matrices; the one with the fewest operations is kept. If lowering fails, the reason is reported.
 """
 
 import time
@@ -33,20 +33,22 @@ from jourdain_jax.scene.identity import once_per_class, varied, with_reference_p
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-# Of the program before simplification; beyond, the dense path is taken. By XLA, the program needs a minute more than dense matrices there (24 joint angles,
-# 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
-# As machine code it wins beyond, too (a quadruped of 20,550 operations: 11 s of processor time to the first motion, 50 s by dense matrices; then 0.02 and
-# 5.5 s); of 60,000 operations, those of the steps included, there is none.
+# Operations of the program before simplification above which the dense path is taken. With XLA, such a
+# program needs a minute more to compile than dense matrices (24 joint angles, 20,762 operations: 71 and 7.5
+# s), though an evaluation takes 0.15 of the time (0.22 in a batch). Smaller programs always beat the dense
+# path (bench/README.md). As machine code larger programs win, too: a quadruped of 20,550 operations takes 11
+# s of processor time to the first motion (dense matrices 50 s), then 0.02 s (5.5 s). Machine code is limited
+# to 60,000 operations, integration steps included.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
     """Return the lowered equations of the scene's class, or the reason why there are none. They are built
-    once per class, shapes and privileged speeds.
+    once per class, shapes and independent speeds.
 
-    `every_speed`: whether all speeds stay in the state, with multipliers for the rows. By default they do so
-    only if no privileged speeds are valid everywhere.
+    `every_speed`: whether all speeds stay in the state, with multipliers for the constraints. The default is
+    to do so only if no independent speeds are valid everywhere.
     """
     structure = structure_of(scene)
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
@@ -62,29 +64,29 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     """Return the lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout`
     integrate. Raises `NotLowered` with the reason.
 
-    print(jj.lower(disc))                     operations after each step, what was dropped and why
-    print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
+        print(jj.lower(disc))                     operations after each step, what was dropped and why
+        print(jj.lower(disc).python_source())     also c_source(), expressions() and latex() (SymPy)
 
-    `every_speed`: True keeps all speeds in the state, with multipliers for the rows; False eliminates
-    dependent speeds. By default dependent speeds are eliminated if some privileged speeds are valid
+    `every_speed`: True keeps all speeds in the state, with multipliers for the constraints; False
+    eliminates dependent speeds. By default they are eliminated if some independent speeds are valid
     everywhere in the scene's domain.
     """
     scene = as_scene(scene)
     found = lowered(scene, every_speed)
     if isinstance(found, NotLowered):
-        raise NotLowered(f"`{type(scene).__name__}` is not lowered: {found}") from None
+        raise NotLowered(f"`{type(scene).__name__}` cannot be lowered: {found}") from None
     return found
 
 
 @once_per_class
 def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
-    """Return the program. It depends on the structure's `kept` part, but not on the values of parameters."""
+    """Return the program. It depends on the `kept` part of the structure, but not on parameter values."""
     begin = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):  # what is not a number at a probe does not count there
+        with np.errstate(all="ignore"):  # probes with undefined values are ignored
             found = _built(scene, structure_whatever_its_faults(scene), every_speed, massless)
     except NotLowered as reason:
-        return NotLowered(str(reason))  # kept without its traceback
+        return NotLowered(str(reason))  # without its traceback
     return replace(found, seconds=time.perf_counter() - begin)
 
 
@@ -93,8 +95,8 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         raise NotLowered("its constraints are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise NotLowered(f"rows {named} are redundant at all probed states, but this could not be proved for "
-            "all states")
+        raise NotLowered(f"constraints {named} are redundant at all probed states, but not provably "
+            "everywhere")
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
     try:
@@ -103,10 +105,12 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
             raise Unsupported(traced.effects)
         loops = (traced.graph.value[call].loop for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()))
         if loop := next(filter(None, loops), None):
-            # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
+            # measured: a ball on a hill, whose contact point is found by Newton's method, takes four times as
+            # long as with dense matrices
             raise Unsupported(f"the operation `{loop}`")
         probes = _probes(scene, structure, traced)
-        if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
+        # elsewhere redundant constraints contradict each other
+        if every_speed and len(structure.row_names) > structure.rank:
             probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
         kept = KeptRows(traced.graph, structure, massless, probes, far) if every_speed and structure.row_names else None
@@ -114,18 +118,20 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
-        raise NotLowered("in whatever order its constraints are eliminated, a pivot is zero") from None
+        raise NotLowered("every order of elimination meets a zero pivot") from None
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
-    """Return configurations on the geometric constraints, random and symmetric ones, with random speeds.
-    Parameters are up to a tenth larger than given, so that coincidences do not count. Where the scene would
-    then be undefined or moments of inertia impossible, they are smaller or closer to the given values.
+    """Return random and symmetric configurations that satisfy the geometric constraints, with random speeds.
+
+    Parameters are up to a tenth larger than given, to exclude coincidences. If the scene would then be
+    undefined or its moments of inertia impossible, they are smaller or closer to the given values.
     """
     generator = np.random.default_rng(1)
-    # 56 probes at most
+    # at most 56 probes
     t, q = structure.times[:56], np.array(structure.coordinates[:56], np.float64)
-    for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
+    # in single precision their norms are one only to seven digits
+    for first, _ in scene.coordinates.quaternions:
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
     given = [np.asarray(x) for x in jax.tree.leaves(scene)]
@@ -141,7 +147,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
         return Probes(traced.graph, values | {name: np.asarray(value, np.float64) for name, value in parameters.items()})
 
     share, possible, least = np.zeros(len(t)), False, _least_moments(traced, probes(np.zeros(len(t)))) / 2
-    # shares of the usual differences from the values of parameters: the first with which these can be
+    # try shrinking shares of the parameter variation until the scene is valid
     for tried in (1.0, -1.0, *(0.1**k for k in range(1, 9))):
         share = np.where(possible, share, tried)
         here = probes(share)
@@ -153,7 +159,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
 
 
 def _least_moments(traced: TracedScene, probes: Probes) -> Float[np.ndarray, "probes bodies"]:
-    """Return the smallest principal moment of each body at each probe; NaN if it is undefined."""
+    """Return the smallest principal moment of each body at each probe; NaN if undefined."""
     I = np.moveaxis(probes(traced.at.inertia.ravel().tolist()).reshape(-1, 3, 3, probes.count), -1, 0)
     known = all_finite(I, axis=(2, 3))
     return np.where(known, np.linalg.eigvalsh(np.where(known[..., None, None], I, 0.0))[..., 0], np.nan)
@@ -169,20 +175,21 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         raise NotLowered(f"its scalar program has {fewest} operations, more than {most}")
     expected = values_at(best, probes)
     check_against_dense(scene, structure, builder, best, expected)
-    # 1000 operations: below, further ways are tried
+    # try further strategies only below 1000 operations
     held, small = ignorable(scene, builder, best, expected), 1000
-    stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
+    stages = [Stage("scalar program: structural zeros and ones removed, common subexpressions "
+        "shared", fewest)]
     plainly_held = fewest
-    # 4000 operations: holding ignorable coordinates leaves no small program of so many
+    # above 4000 operations, fixing ignorable coordinates never yields a small program
     if held and fewest < 4000:
         plainly_held = graph.operations(rates_of(builder.build(replace(first, held=held))))
-        stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
+        stages.append(Stage("ignorable coordinates fixed in the accelerations", plainly_held))
     for strategy in _strategies(builder, held, plainly_held < small, fewest):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(rates_of(candidate)))
         if count < fewest and agree(values_at(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
-    stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
+    stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors extracted", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "resets", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
@@ -201,7 +208,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
     given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist(), *(n for x in own.parameters for n in x.ravel().tolist())]
-    # without what was tried for it
+    # without the failed candidates
     alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
     place = places.tolist()
     names = scene.coordinate_names.entries
@@ -226,14 +233,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
-        seconds=0.0,  # not known yet
+        seconds=0.0,  # set later
         sides=(),
         **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
 
 
 def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> None:
-    """Raise ValueError where an event gives dependent speeds other values than the rows do."""
+    """Raise ValueError if an event sets dependent speeds that violate the constraints."""
     graph, traced, first = builder.graph, builder.traced, len(builder.traced.q)
     for name, row in zip(names_of_events(scene), traced.at.resets.tolist(), strict=False):
         if not row or not builder.dependent:
@@ -248,14 +255,14 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
             free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in (builder.independent, builder.dependent))
             raise ValueError(
                 f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity "
-                f"constraints, by which {tied} follow from {free}; give values for all of them that satisfy "
-                "the constraints, or state the independent ones as `privileged`"
+                    f"constraints, which determine {tied} from {free}; set all of them consistently, or "
+                    "declare the independent ones as `privileged`"
             )
 
 
 def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
-    """Return the divisors in the rates of coordinates, such as sin q in w/sin q. Divisors that a `where`
-    keeps away from zero are omitted.
+    """Return the divisors in the coordinate rates, such as sin q in w/sin q, except those that a
+    `where` keeps away from zero.
     """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
@@ -264,9 +271,9 @@ def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
 
 
 def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int) -> Iterator[Strategy]:
-    """Yield strategies worth trying; `plainly`: without normal forms of operations.
+    """Yield the strategies worth trying; `plainly`: operations without normal forms.
 
-    For all models, with all speeds and without, no other of twelve strategies took fewer operations.
+    No other of twelve strategies took fewer operations for any model, with eliminated speeds or all speeds.
     """
     if builder.multiplied:
         yield Strategy(True, MOST_TERMS, MOST_TERMS if small else 0, held=held)
@@ -275,31 +282,32 @@ def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int
         yield Strategy(False, MOST_TERMS, MOST_TERMS, by_determinants=True, held=held)
     else:
         yield Strategy(False, MOST_TERMS, held=held)
-        # 5000 operations: above, the explicit way is not tried
+        # try the explicit strategy only up to 5000 operations
         if plainly <= 5000 and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
             yield Strategy(True, MOST_TERMS, held=held)
 
 
 def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
-    """Return pivots relative to their values at a probed state with the same parameters. For pivots that
-    never vary, return their signs.
+    """Return pivots relative to their values at a probe with the same parameters. For
+    constant pivots, return their signs.
     """
     return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
 
 
 def _operands(graph: Graph, call: int) -> NodeList:
-    """Return the scalar operands of a call, without those that other calls compute."""
+    """Return the scalar operands of a call, without results of other calls."""
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
 def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeList:
     """Merge calls that compute equal values."""
     graph = generic.graph
-    calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
+    # so that no call is replaced by one that depends on it
+    calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))
     kept: dict = {}
     same: dict[int, int] = {}
     for call in calls:
-        # what other calls hand it whole must be the same, not only of one shape
+        # array operands from other calls must be identical, not only of equal shape
         whole = tuple((graph.value[a], *(same.get(other, other) for other in graph.args[a] if graph.op[a] != "array")) for a in graph.args[call])
         alike = kept.setdefault((graph.value[call], whole), [])
         given = generic(_operands(graph, call))
@@ -312,12 +320,11 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeLi
 
 
 def may_be_massless(scene: Scene, structure: Structure) -> bool:
-    """Return whether M is singular at the parameters of `scene`. Traced parameters that may be zero are set
-    to zero.
+    """Return whether M is singular at the parameters of `scene`, with traced parameters
+    that may be zero set to zero.
 
-    These are parameters declared `non_negative` and those with a default of zero. If privileged speeds are
-    used in any case, all parameters that are not declared `positive` are set to zero, since that costs
-    nothing.
+    These are parameters declared `non_negative` or with default zero. If independent speeds are used in any
+    case, all parameters not declared `positive` are set to zero, because that costs nothing.
     """
     if structure.massless:
         return True
@@ -326,12 +333,12 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
         return False
     try:
         return structure_of(without).massless
-    except ValueError:  # all of them at once cannot be zero; some may
+    except ValueError:  # they cannot all be zero at once, but some may
         return True
 
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
-    """Return numbers for the scene's parameters, with all permitted zeros; None if there are none."""
+    """Return concrete parameters of the scene with all permitted zeros; None if there are none."""
     may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or np.array_equal(f.default, 0)}
     given, treedef = jax.tree_util.tree_flatten_with_path(scene)
     zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]

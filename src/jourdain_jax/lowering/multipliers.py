@@ -1,16 +1,21 @@
-"""Constraints kept by multipliers, and projected states, on the graph; all speeds stay in the state.
+"""Constraints enforced by multipliers, and projected states, on the graph; all speeds stay in the state.
 
     M udot = f + A' lambda,   A udot = -drift          S lambda = -(drift + A M^-1 f),   S = A M^-1 A'
     q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
-    u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact where rows are affine in the speeds
+    u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact if the constraints are affine in the speeds
 
-S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
-left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
-Accelerations lose as many digits as that square is small. A row that vanishes at some configuration makes no small angle, but a small entry: an entry
-counts for no less than what it is, for the same parameters, at a probed state (`Probes.in_the_middle`). Rows that are nonlinear in the speeds are as small
-as these, and are lost where what is left of one after elimination, L^-1 A, passes through zero: it turns round there.
+S is symmetric, positive definite if the constraints are independent, and as sparse as they are local:
+tridiagonal for a chain. The remainder of a diagonal entry of S after elimination, relative to the entry, is
+the squared sine of the angle between this constraint and the earlier ones. Accelerations lose as many
+digits as this square is small.
 
-Where M is singular, though no admissible velocity is without inertia, M + A' W A stands in its place: A udot is known, so only the multipliers change.
+A constraint whose row vanishes at some configuration has a small entry instead of a small angle, so entries
+are bounded from below by their size at a probe with the same parameters (`Probes.in_the_middle`). Constraints
+nonlinear in the speeds may legitimately become small. They are lost where the remainder of their row, L^-1 A,
+passes through zero and reverses.
+
+If M is singular but every admissible velocity has inertia, M + A' W A replaces M. This changes only the
+multipliers, because A udot is prescribed.
 """
 
 from typing import NamedTuple
@@ -28,13 +33,14 @@ Columns = list[NodeList]
 
 
 class Accelerations(NamedTuple):
-    """NodeList of the solution, and of its pivots."""
+    """Accelerations and monitored quantities."""
 
     udot: NodeList
-    sines: NodeList  # one per row, between that row and those before it; or the pivots of privileged speeds
-    margins: NodeList  # must stay positive: what is left of each entry, above its least
-    directions: Columns = []  # that rows must not leave within a step
-    squares: NodeList = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
+    sines: NodeList  # one per constraint, its sine with the earlier ones; or the pivots of independent speeds
+    margins: NodeList  # must stay positive: remainder of each entry minus its lower limit
+    directions: Columns = []  # of constraints, must not reverse within a step
+    # per constraint: remainder of its entry, and its size; the ratio is a squared sine
+    squares: NodeList = []
 
 
 def accelerations_by_multipliers(
@@ -43,11 +49,12 @@ def accelerations_by_multipliers(
     """Return the accelerations under all constraints. `probes` give the typical sizes of entries; `affine`:
     whether constraints are affine in the speeds.
     """
-    *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
+    # M^-1 A' column by column, M^-1 f
+    *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
         alone = all(S[r][s] == graph.zero for s in range(len(A)) if s != r)
-        if alone and not graph.varies[S[r][r]]:  # the entry is divided out where it costs nothing
+        if alone and not graph.varies[S[r][r]]:  # scale by the entry where that costs nothing
             impulses[r] = [forms.simplified(quotient(graph, n, S[r][r])) for n in impulses[r]]
             S[r][r] = graph.one
     right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
@@ -56,8 +63,8 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion
-    # continues, and the program does not serve
+    # relative sine or length below which round-off decides how a motion continues,
+    # and the program is not valid
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
@@ -68,8 +75,8 @@ def accelerations_by_multipliers(
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
-    """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The added
-    inertia has the size of M.
+    """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The
+    added inertia has the size of M.
     """
     made, speeds = [list(row) for row in M], range(len(M))
     heavy = np.nanmedian(largest(probes([row[i] for i, row in enumerate(M)]), 0))
@@ -91,19 +98,19 @@ def projected_coordinates(graph: Graph, q: NodeList, closure: NodeList) -> NodeL
 
 
 def projected_speeds(graph: Graph, M: Columns, A: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
-    """Return the speeds on `phi = 0`, nearest in the metric of M."""
+    """Return the speeds projected onto `phi = 0` in the metric of M."""
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
     return _less(graph, u, impulses, multipliers)
 
 
 def _less(graph: Graph, x: NodeList, rows: Columns, factors: NodeList) -> NodeList:
-    """`x - rows' factors`"""
+    """Return `x - rows' factors`."""
     return [graph.sub(n, graph.dot(column, factors)) for n, *column in zip(x, *rows, strict=True)]
 
 
 def _products(graph: Graph, A: Columns, X: Columns, forms: NormalForms) -> Columns:
-    """`A X'`, which is symmetric; zero where no speed is shared."""
+    """Return the symmetric product `A X'`; entries are zero if no speed is shared."""
     S = [[graph.zero] * len(A) for _ in A]
     used = [[k for k, n in enumerate(row) if n != graph.zero] for row in A]
     for r in range(len(A)):

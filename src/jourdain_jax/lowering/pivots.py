@@ -1,13 +1,17 @@
-"""Pivots for eliminating a linear system of nodes: large wherever the system itself is regular.
+"""Pivots for eliminating a linear system of nodes, chosen to be large wherever the system itself is regular.
 
-A pivot that is a number or depends on parameters alone cannot vanish on the way and is taken first; the others are judged by the smallest
-value they take, relative to their row, at all probes. Among good pivots the one that fills in least is taken. Where only entries that may
-vanish are left, two rows and two columns are eliminated together if their determinant cannot vanish: components of a vector in turned axes, such as
-the velocity of a hitch, have one that depends on parameters alone, while each entry is zero at some angle.
-Where no order of elimination serves, rows are combined: those of one column, a_1, a_2, ..., into one row with the pivot sum w_i a_i^2, from which the
-others are made orthogonal. Rows of a rolling wheel along the world's axes so become rows along and across its heading. In exact numbers such a pivot is
-the squared distance of its column from those before it, which is no smaller than the smallest singular value squared, and it serves as well where there
-are more rows than unknowns and each row vanishes somewhere.
+A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken
+first. Others are judged by their smallest value over all probes, relative to their row. Among good
+pivots, the one with the least fill-in is taken. If only entries that may vanish remain, two rows and
+two columns are eliminated together if their determinant cannot vanish. Vector components in rotated
+axes, such as the velocity of a hitch, have a determinant that depends only on parameters, while each
+entry is zero at some angle.
+
+If no order of elimination works, rows are combined. The rows a_1, a_2, ... of one column give one row with
+the pivot sum w_i a_i^2, and the others are made orthogonal to it. The constraints of a rolling wheel along
+the world axes thus become constraints along and across its heading. In exact arithmetic, this pivot is the
+squared distance of its column from the earlier ones, at least the smallest singular value squared. It remains
+valid with more rows than unknowns even if each row vanishes somewhere.
 """
 
 from collections import Counter
@@ -23,8 +27,8 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
 
-GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
-FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
+GOOD = 0.02  # smallest acceptable pivot relative to its row, at the worst probe
+FEW = 12  # number of equations up to which the choice of a pivot counts its operations
 
 
 @dataclass(frozen=True)
@@ -39,32 +43,33 @@ class Pivot:
 
 @dataclass(frozen=True)
 class _Entry:
-    """The quality of a place as a pivot."""
+    """Quality of an entry as a pivot."""
 
-    worst: float  # of its row, at the worst probe
-    fixed: bool  # it depends on parameters alone
+    worst: float  # size relative to its row, at the worst probe
+    fixed: bool  # depends only on parameters
 
 
 class Pivots:
-    """The system `A x = right` during elimination, and the choice of the next pivot. `probes`: of the domain;
-    `far`: at full turns of all angles.
+    """System `A x = right` during elimination, and the choice of the next pivot. `probes`: states in the
+    domain; `far`: with angles over full turns.
     """
 
     def __init__(self, graph: Graph, A: Sequence[Sequence[int]], right: Sequence[Sequence[int]], probes: Probes, far: Callable[[], Probes] | None):
-        # terms of a determinant in normal form
+        # at most 32 terms of a determinant in normal form
         self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, 32, sign=probes.sign)
         self.A, self.right = [list(row) for row in A], [list(row) for row in right]
         self.rows, self.columns = set(range(len(self.A))), set(range(len(self.A[0]) if self.A else 0))
         self._far, self._kept_regular = far, None
         self._given = [list(row) for row in A]
         self._tall = len(self.rows) > len(self.columns)
-        self._sizes: dict[int, np.ndarray] = {}  # of what a row was made of
-        self._entries: dict[int, list[int]] = {}  # columns of a row that hold something
+        self._sizes: dict[int, np.ndarray] = {}  # size of the terms of each row
+        self._entries: dict[int, list[int]] = {}  # columns with structurally nonzero entries, by row
         self._judged: dict[int, dict[int, _Entry]] = {}
-        self._determinants: dict[tuple[int, int, int, int], int | None] = {}  # of two rows and columns, where it serves as a pivot
+        # of two rows and columns, None if unsuitable as a pivot
+        self._determinants: dict[tuple[int, int, int, int], int | None] = {}
 
     def eliminated(self, pivot: Pivot) -> None:
-        """Subtract multiples of the pivot's rows from the rows that are left."""
+        """Subtract multiples of the pivot rows from the remaining rows."""
         graph, A = self.graph, self.A
         self.rows -= set(pivot.rows)
         self.columns -= set(pivot.columns)
@@ -83,23 +88,23 @@ class Pivots:
                 self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
 
     def _changed(self, *rows: int) -> None:
-        """Some rows were changed; all of them, where none is named."""
+        """Clear cached results of these rows, or of all rows."""
         for row in rows or list(self._entries):
             self._entries.pop(row, None)
             self._judged.pop(row, None)
 
     def _in_row(self, row: int) -> list[int]:
-        """Return the columns left in which a row holds something, in order."""
+        """Return the remaining columns with nonzero entries in a row, in order."""
         if row not in self._entries:
             self._entries[row] = [k for k, n in enumerate(self.A[row]) if n != self.graph.zero]
         return [k for k in self._entries[row] if k in self.columns]
 
     def best(self) -> Pivot:
-        """Return the next pivot. Rows may be combined for it."""
+        """Return the next pivot, combining rows if necessary."""
         graph, A, rows = self.graph, self.A, self.rows
         judged = [(r, c, entry) for r in sorted(rows) for c, entry in self._judged_row(r).items()]
         if not judged:
-            raise ZeroDivisionError("the rows are dependent")
+            raise ZeroDivisionError("the constraints are dependent")
         in_row, in_column = Counter(r for r, _, _ in judged), Counter(c for _, c, _ in judged)
 
         def cost(place):
@@ -123,7 +128,7 @@ class Pivots:
         return self._by_column((r, c))
 
     def _judged_row(self, row: int) -> dict[int, "_Entry"]:
-        """Return the entries of a row by column, judged; kept until the row changes."""
+        """Return the judged entries of a row by column, cached until the row changes."""
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
@@ -133,7 +138,7 @@ class Pivots:
         return self._judged[row]
 
     def _is_fixed(self, node: int) -> bool:
-        """Return whether a node depends on parameters only, and no parameter changes its sign."""
+        """Return whether a node depends only on parameters and has a constant sign."""
         graph = self.graph
         return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
 
@@ -141,20 +146,20 @@ class Pivots:
         entry = self.A[row][column]
         return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if monitored is None else monitored)
 
-    # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
+    # judgement at probes in the domain, and with angles over full turns where the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Return whether an entry stays away from zero wherever the system is regular, also outside of the
-        domain.
+        """Return whether an entry stays away from zero wherever the system is
+        regular, also outside the domain.
         """
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
         size = np.min(np.abs(ratio), initial=np.inf)
-        # one with both signs that is smaller than 0.25 somewhere vanishes in between
+        # an entry with both signs that is below 0.25 somewhere is assumed to vanish
         return bool(size > 0.25 or (size > GOOD and not ratio.min() < 0 < ratio.max()))
 
     def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
-        """Return an entry beside the largest of its row, with its sign."""
+        """Return a signed entry relative to the largest entry of its row."""
         r, c = place
         columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
         places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
@@ -163,8 +168,8 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """Return the probes, in the domain and far from it, at which the system with scaled rows and columns
-        is regular.
+        """Return the probes, in the domain and far from it, at which the system with scaled
+        rows and columns is regular.
         """
         if self._kept_regular is None:
             count = len(self._given[0])
@@ -176,24 +181,24 @@ class Pivots:
             A = A / np.where(usual > 0, usual, 1.0)
             width = np.sqrt(np.mean(np.sum(A**2, axis=1), axis=0))
             sigma = np.linalg.svd(A / np.where(width > 0, width, 1.0), compute_uv=False)[:, count - 1]
-            # smallest singular value of a scaled system that a pivot has to serve
+            # smallest singular value at which a scaled system counts as regular
             self._kept_regular = finite & (sigma > 0.02)
         return self._kept_regular
 
     def _at(self, nodes) -> np.ndarray:
-        """Return values at the probes of the domain and the far ones."""
+        """Return values at the probes in the domain and the far ones."""
         near = self.probes(nodes)
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
     def _size(self, row: int) -> np.ndarray:
-        """Return the size of the terms of a row, at all probes."""
+        """Return the size of the terms of a row at all probes."""
         if row not in self._sizes:
             self._sizes[row] = largest(self._at(self.A[row]), 0)
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
-        """Return reference sizes of entries and of their rows, at the first probes; None if a vanishing row
-        makes the system singular.
+        """Return reference sizes of the rows of some entries at the first probes, or None if a vanishing
+        row makes the system singular.
         """
         if not self._tall:
             return None
@@ -202,8 +207,8 @@ class Pivots:
     # two rows and two columns
 
     def _best_pair(self) -> Pivot | None:
-        """Return two rows and columns whose determinant depends on parameters only, with the least fill-in;
-        None if there are none.
+        """Return two rows and columns whose determinant depends only on parameters, with the least
+        fill-in; None if there are none.
         """
         graph, A = self.graph, self.A
         used = {r: set(self._in_row(r)) for r in self.rows}
@@ -228,18 +233,18 @@ class Pivots:
         return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
 
     def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
-        """Return a b - c d if it depends on parameters only and is not small; otherwise None."""
+        """Return a b - c d if it depends only on parameters and is not small; otherwise None."""
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
         regular = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
         return determinant if regular else None
 
-    # rows combined
+    # combined rows
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """Combine all rows that contain a column into one for that column. If the `single` entry at that
-        place is as good, return that entry instead.
+        """Combine all rows that contain a column into one pivot row for it, or take the entry at
+        `single` if that is as good.
         """
         graph, A, regular = self.graph, self.A, self._regular
         found = []
@@ -262,17 +267,17 @@ class Pivots:
         return combined(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
-        """Return the weights of rows in a combination: one where their sizes are alike."""
+        """Return weights for combining rows: one if their sizes are similar."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
-        # rows whose sizes differ by more are combined with weights
+        # otherwise scale rows whose sizes differ more than eightfold
         if min(sizes) * 8.0 > largest:
             return [1.0] * len(rows)
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 
     def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Rotate two rows into one with the pivot and one without: `a r + w b s` and `b r - a s`; the
-        determinant keeps its sign.
+        """Rotate two rows into one with the pivot and one without: `a r + w b s` and `b r - a s`. The sign of
+        the determinant is unchanged.
         """
         graph, A, (r, s) = self.graph, self.A, users
         a, b = A[r][c], A[s][c]
@@ -291,8 +296,8 @@ class Pivots:
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Combine all rows of a column into one new row, and make the other rows orthogonal to the column
-        (Gram and Schmidt).
+        """Combine all rows of a column into one new row, and make the other rows orthogonal
+        to the column (Gram-Schmidt).
         """
         graph, A = self.graph, self.A
         new = len(A)
@@ -316,11 +321,12 @@ class Pivots:
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
-    """Return the ratios of entries to the largest entry of their row, and to `sizes`. Entries of a row are
-    contiguous.
+    """Return the ratios of entries to the largest entry of their row, or to `sizes` if larger.
+    Entries of a row are contiguous.
     """
     values = np.abs(values)
-    starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
+    # places are ordered by rows
+    starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])
     largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)
     largest = largest if sizes is None else np.fmax(largest, sizes)
     with np.errstate(all="ignore"):
@@ -333,7 +339,7 @@ def turns(graph: Graph, node: int) -> bool:
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:
-    """Return the smallest; zero where none is a number."""
+    """Return the smallest finite ratio; zero without any."""
     return float(np.min(ratio[np.isfinite(ratio)], initial=np.inf)) if np.isfinite(ratio).any() else 0.0
 
 

@@ -1,16 +1,18 @@
-"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: they become
-sides (`sides.py`).
+"""Relations that decide between branches of rates and stop events, as numbers whose signs decide.
+They become sides (`sides.py`).
 
     a < b, max(a, b), ...    a - b          sign(x), |x|    x
     floor(x), ceil(x)    sin(pi x)          round(x)    sin(pi (x + 1/2))
 
-A relation counts where a rate, or its slope, is another one on either side of where that number vanishes, or where a stop event may have a dip there;
-with it count the relations that its number is made of. Where its branches agree, as those of a guard do, it does not. Both branches are evaluated on
-either side of such places, which are found between the states that are probed, and there with all decisions
-of relations that have nothing to do with its number: those of `(x > a) & (y > b)` agree where y < b. A
-relation that vanishes between none of these states counts.
+A relation counts if a rate or its slope differs on either side of the zero of its number, or if a stop event
+may have a dip there. Relations on which its number depends then count as well. Relations with equal
+branches, as in guards, do not count.
 
-A rate jumps where such a number vanishes if it changes as much over a way that is much shorter, and bends there if it does not.
+Both branches are evaluated on either side of zeros between probes, for all decisions of unrelated relations:
+the branches of `(x > a) & (y > b)` agree where y < b. A relation without a zero between probes counts.
+
+A rate jumps at a zero if its change does not shrink with the distance between the two
+sides; otherwise it has a kink.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,19 +23,21 @@ from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList
 
-MOST_WATCHED = 32  # of a scene
-COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
-EQUAL = {"eq": (False, False), "ne": (True, True)}  # these decide nothing by themselves
+MOST_WATCHED = 32  # limit per scene
+# truth for a > b, and for a < b
+COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}
+EQUAL = {"eq": (False, False), "ne": (True, True)}  # these alone decide nothing
 COMPARED |= EQUAL
-ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
-DECISIONS = 512  # of other relations, tried at each place: all, or so many random ones
-Decided = dict[int, list[tuple[int, int]]]  # as `switches` gives it
+# distance from a zero, relative to the distance of two probes; tolerance relative to the size of a rate
+ASIDE, AGREE = 1e-5, 1e-7
+DECISIONS = 512  # maximum number of decisions of other relations tried at each zero; random beyond
+Decided = dict[int, list[tuple[int, int]]]  # as `switches` returns it
 WHOLE = ("floor", "ceil", "round", "rem")
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> Decided:
-    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if its own
-    number is the negative of the key.
+    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if it
+    decides on the negative number.
     """
     found: Decided = {}
     for n in graph.reachable(list(nodes)):
@@ -64,8 +68,8 @@ def _own(graph: Graph, node: int) -> int | None:
 
 
 def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
-    """Return the number whose whole part decides: a/b of rem(a, b), a + 1/2 of round(a), a of floor(a) and
-    ceil(a).
+    """Return the number whose integer part decides: a/b for rem(a, b), a + 1/2 for
+    round(a), a for floor(a) and ceil(a).
     """
     if op == "rem":
         return graph.div(*args)
@@ -81,7 +85,7 @@ def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
 
 
 def _branch(graph: Graph, node: int, above: bool) -> int:
-    """Return the value of a relation where its own number is positive (`above`) or negative."""
+    """Return the value of a relation where its number is positive (`above`) or negative."""
     op, args = graph.operation(node)
     if op in COMPARED:
         return graph.const(COMPARED[op][0 if above else 1])
@@ -93,24 +97,22 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
 
 
 def where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
-    """Return a node that is `there` where the condition is true."""
+    """Return a node with the value `there` if the condition is true, else `otherwise`."""
     return graph.call("select", condition, otherwise, there)
 
 
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
-    """Return the outputs for a positive number, and for a negative number, of these relations (of
-    `switches`).
-    """
+    """Return the outputs for a positive and for a negative number of these relations (from `switches`)."""
     outputs = list(outputs)
     above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
     return above, below
 
 
 def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[Indices, Indices]:
-    """Return the numbers whose signs are monitored, in two parts: those of the rates, and those that occur in
-    stop events only.
+    """Return the numbers whose signs are monitored, in two parts: those in the rates,
+    and those only in stop events.
 
-    Numbers that depend on `modes` are omitted, since modes have their own events.
+    Numbers that depend on `modes` are omitted, because modes have their own events.
     """
     found: list[NodeList] = []
     for outputs, excess in ((rates, _difference), (events, _dip)):
@@ -128,7 +130,7 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
 
 def _counts(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], excess, probes) -> bool:
-    """Return whether the branches of relations differ near a zero of their number."""
+    """Return whether the branches of the relations differ near a zero of their number."""
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
     for beside, here in _beside(graph, number, decided, outputs, probes):
         above, below = branches(graph, decided[number], here)
@@ -145,13 +147,13 @@ def _difference(values, above, below):
 
 
 def _dip(values, above, below):
-    """Return by how much a value is above the lower one of its two branches; where it is, it may dip."""
+    """Return by how much a value exceeds the lower of its two branches; if it does, it may dip."""
     return values - np.minimum(above, below)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
-    """Return the numbers whose branches may be continued beyond their zeros, since both branches are finite
-    where the outputs are.
+    """Return the numbers whose branches continue beyond their zeros, because both are
+    finite where the outputs are.
     """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
@@ -179,13 +181,13 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], probes: Probes) -> Iterator:
-    """Yield a function of a distance that returns states on either side of zeros of a number, and the
-    outputs; then the same with all decisions of relations that this number does not decide: their numbers are
-    not made of it, nor it of them, and differ between its zeros. Nothing where probes have no zero between them.
+    """Yield a function (distance -> states on either side of zeros of a number) with the outputs. Then
+    yield the same for all decisions of unrelated relations: neither number depends on the other, and theirs
+    vary between the zeros. Yields nothing without a zero between probes.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
-    count = min(len(positive), len(negative), 6)  # places
+    count = min(len(positive), len(negative), 6)  # number of zeros
     if not count:
         return
     a, b = ({name: np.broadcast_to(x, probes.count)[k[:count]] for name, x in probes.inputs.items()} for k in (positive, negative))

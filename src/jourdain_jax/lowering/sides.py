@@ -1,14 +1,15 @@
-"""Relations of a scalar program as modes and events: a number s holds the side of a relation.
+"""Relations of a scalar program as modes and events: a mode s stores on which
+side of a relation the state is.
 
     x = a - b of a < b, max(a, b), ...; x of |x|, sign(x)     s = 1, -1: x counts as positive, negative
-    c = s x falls through zero:  s <- -s                      s = 0: x rests at zero, and counts as it is
+    c = s x falls through zero:  s <- -s                      s = 0: x rests at zero; its current sign counts
 
     n of floor(a) = n, ceil(a) = n + 1, ...                   s = 2 n + 1; s = 0 before the start
     c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
 
-Within a step no branch changes: the search for events ends the step where x vanishes, and the derivative
-jumps there as at any event (`motion/native/transitions.py`). Relations in Modelica are events, too.
-If a branch ends where x vanishes, as `sqrt` does, its relation has the event only.
+No branch changes within a step: the event search ends the step where x vanishes, and the derivative jumps
+there as at any event (`motion/native/transitions.py`). Modelica treats relations the same way. If a branch is
+undefined beyond x = 0, as with `sqrt`, its relation has only the event.
 """
 
 from dataclasses import replace
@@ -27,7 +28,7 @@ from jourdain_jax.program.graph import Graph, NodeList
 def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lowered:
     """Return the program with an additional mode and event for each relation, after those of the scene.
 
-    `modes`: which of its inputs are modes.
+    `modes`: indices of the inputs that are modes.
     """
     old, graph, numbers = program.graph, Graph(keeps_rules=True), program.watched(has_events)
     given = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
@@ -40,7 +41,7 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         if number in program.sided:
             relations |= {n: (number, side, turned) for n, turned in decided[number]}
     new = given
-    for n in sorted(relations):  # each after those that it is made of
+    for n in sorted(relations):  # in order of dependence
         number, side, turned = relations[n]
         new = graph.copied([number, *old.args[n]], old, new)
         args = [new[a] for a in old.args[n]]
@@ -52,17 +53,18 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     x = [_counted(graph, old, first[n][0], new) if whole else new[n] for n, whole in zip(numbers, wholes, strict=True)]
     inputs = np.array([*(new[n] for n in program.traced.inputs.tolist()), *sides], np.int64)
     parts = program.traced.q, program.traced.u
-    q, u = (np.array([new.get(n, 0) for n in part.tolist()], np.int64) for part in parts)  # dependent speeds: none
+    # no dependent speeds
+    q, u = (np.array([new.get(n, 0) for n in part.tolist()], np.int64) for part in parts)
     now = [*q.tolist(), *(int(u[k]) for k in program.independent), *(int(inputs[i]) for i in modes)]
     events, stops = (copied["events"], program.stops) if has_events else ((), ())
     each = len(copied["resets"]) // max(len(events), 1)
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
-        """Add a reset: the state and the modes `after` an event, the sides (from the numbers at the new
-        state), and the gain in energy.
+        """Add a reset: the state and the modes `after` an event, the sides at the new
+        state, and the gain in energy.
         """
-        for k in sorted(range(len(x)), key=numbers.__getitem__):  # each after those that it is made of
+        for k in sorted(range(len(x)), key=numbers.__getitem__):  # in order of dependence
             (moved,) = graph.substituted([x[k]], after)
             if moved != x[k] and sides[k] not in after:
                 anew = _odd(graph, graph.call("floor", moved)) if wholes[k] else graph.call("sign", moved)
@@ -96,8 +98,8 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
 
 
 def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, int]) -> int:
-    """Return the number a whose whole part decides; `first`: a relation that it decides, and -1 if that is of
-    -a.
+    """Return the number a whose integer part decides; `first`: one of its relations,
+    with -1 if that decides on -a.
     """
     node, turned = first
     found = counted(graph, old.op[node], [new[a] for a in old.args[node]])
@@ -110,12 +112,13 @@ def _whole(graph: Graph, side: int) -> int:
 
 
 def _odd(graph: Graph, n: int) -> int:
-    """Return the side of n."""
+    """Return the side 2 n + 1."""
     return graph.add(graph.mul(graph.const(2.0), n), graph.one)
 
 
 def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, number: int, whole: bool) -> int:
-    """Return the value of a relation on this side of its own number or, `turned` by -1, of its negative."""
+    """Return the value of a relation on this side of its number or, `turned` by -1, of the negative number.
+    """
     at_rest = graph.call("eq", side, graph.zero)
     if op in WHOLE:
         n = _whole(graph, side)

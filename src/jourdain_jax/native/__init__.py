@@ -1,1 +1,3 @@
-"""Scalar programs as machine code of the CPU and of NVIDIA GPUs, by LLVM (llvmlite; not under Windows), called from JAX by its foreign function interface."""
+"""Scalar programs as machine code for CPUs and NVIDIA GPUs, compiled by LLVM (llvmlite; not on Windows) and
+called from JAX by its foreign function interface.
+"""

@@ -1,17 +1,18 @@
-"""Sine, cosine and tangent of vectors of doubles, and their inverses, by polynomials, with double-double
-numbers.
+"""Sine, cosine, tangent and their inverses for vectors of doubles, by polynomials
+and double-double arithmetic.
 
-Angles lose whole quarter turns: pi/2 has the three parts of `program/emit.py`, and the angle that is left a second part, by which it is over. That serves
-while the multiple of pi/2 has 20 bits; angles beyond are multiplied by as many bits of 2/pi as matter (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18
-(1983) 19). Sine and cosine have the minimax polynomials of `program/emit.py`, arcs those of Chebyshev
-(mpmath's `chebyfit` of 12 and 13 terms; a test finds them again):
+Whole quarter turns are subtracted from an angle with pi/2 in the three parts of `program/emit.py`, which
+leaves a remainder in two parts. This is exact while the multiple of pi/2 has 20 bits; larger angles are
+multiplied by the relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and
+cosine use the minimax polynomials of `program/emit.py`, arcs use Chebyshev polynomials (12 and 13 terms of
+mpmath's `chebyfit`, which a test reproduces):
 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
     asin s = s + s^3 P(s^2) for |s| < 1/2,         otherwise   asin s = pi/2 - 2 asin sqrt((1 - s)/2)
 
-Errors are below 0.9 ulp. In a double-double number, the rest holds the round-off of the head. Sources: T. J.
-Dekker, Numerische Mathematik 18
-(1971) 224; J.-M. Muller et al., Handbook of Floating-Point Arithmetic (2018), chapter 4.
+Errors are below 0.9 ulp. In a double-double number, the low part holds the round-off of the head. Sources:
+T. J. Dekker, Numerische Mathematik 18 (1971) 224; J.-M. Muller et al., Handbook of Floating-Point
+Arithmetic (2018), chapter 4.
 """
 
 import math
@@ -20,14 +21,14 @@ from collections.abc import Callable, Sequence
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
-DoubleDouble = tuple[Value, Value]  # head and rest
+DoubleDouble = tuple[Value, Value]  # head and low part
 
 Triple = tuple[Value, Value, Value]
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """Return the value of a polynomial by Horner's rule, highest power first. For a long one, even and odd
-    powers are evaluated separately.
+    """Return a polynomial by Horner's rule, highest power first. Long ones evaluate
+    even and odd powers separately.
     """
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
@@ -39,19 +40,19 @@ def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
 
 
 def two_sum(a: Value | float, b: Value) -> DoubleDouble:
-    """a + b, for an a that is zero or no smaller than b."""
+    """Return a + b exactly, if a is zero or |a| >= |b|."""
     head = a + b
     return head, (a - head) + b
 
 
 def two_product(w: Writer, a: Value, b: Value) -> DoubleDouble:
-    """a b"""
+    """Return a b exactly."""
     head = a * b
     return head, product_less(w, a, b, head)
 
 
 def product_less(w: Writer, a: Value, b: Value, c: Value) -> Value:
-    """Return a b - c without round-off, for a c close to the product."""
+    """Return a b - c without round-off, for c close to the product."""
     if w.fused:
         return w.fma(a, b, -c)
     (a_high, a_low), (b_high, b_low) = _halves(w, a), _halves(w, b)
@@ -59,25 +60,25 @@ def product_less(w: Writer, a: Value, b: Value, c: Value) -> Value:
 
 
 def _halves(w: Writer, a: Value) -> DoubleDouble:
-    """Return two numbers of 26 and 27 bits, whose sum is a."""
+    """Return two numbers of 26 and 27 bits whose sum is a."""
     high = w.converted("bitcast", w.converted("bitcast", a, w.whole) & -(2**27), w.real)
     return high, a - high
 
 
 def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return q and d, where q - d is the quotient of two numbers, each of which is in two parts. A zero
-    quotient keeps its sign.
+    """Return q and d, where q - d is the quotient of two double-double numbers. A
+    zero quotient keeps its sign.
     """
     inverse = 1.0 / b[0]
     q = a[0] * inverse
     return q, (product_less(w, q, b[0], a[0]) + (q * b[1] - a[1])) * inverse
 
 
-WHOLE = 1.5 * 2.0**52  # a number to which this is added is rounded to a whole one, whose last bits are the last of the sum
+WHOLE = 1.5 * 2.0**52  # adding this rounds to an integer, which the last bits of the sum hold
 LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
 _HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 _LESS_SINE = tuple(-c for c in SINE)
-_PI = (3.1415926535897896, 3.675178358715236e-15)  # the first has 50 bits: 1/4, 1/2 and 3/4 of it are exact
+_PI = (3.1415926535897896, 3.675178358715236e-15)  # the head has 50 bits, so 1/4, 1/2 and 3/4 of it are exact
 ATAN = (
     0.016285756855221028,
     -0.034570561981427744,
@@ -110,19 +111,19 @@ ASIN = (
 
 
 def sine_and_cosine(w: Writer, x: Value) -> DoubleDouble:
-    """(sin x, cos x)"""
+    """Return (sin x, cos x)."""
     s, c = _or_far(w, x, _sine_and_cosine(w, _reduced(w, x)), _FAR_SINE_AND_COSINE)
     return s, c
 
 
 def tangent(w: Writer, x: Value) -> Value:
-    """tan x"""
+    """Return tan x."""
     return _or_far(w, x, [_tangent(w, _reduced(w, x))], _FAR_TANGENT)[0]
 
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
-    """Return the quick values, replaced in lanes with large angles. Separate functions, which most calls
-    skip, compute the values for large angles.
+    """Return the `quick` values, replaced in lanes with large angles by the results of `far_ones`. These are
+    separate functions, because most calls skip them.
     """
     far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
@@ -154,7 +155,9 @@ _FAR_TANGENT = {"far_tangent": _tangent}
 
 
 def _reduced(w: Writer, x: Value) -> Triple:
-    """Return the remainder of an angle after whole quarter turns, its low part, and the number of turns."""
+    """Return the remainder of an angle after whole quarter turns, its low part, and
+    the number of quarter turns.
+    """
     shifted = w.fma(x, 2 / math.pi, WHOLE)
     turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
     near = w.fma(-turns, HALF_PI[0], x)  # exact
@@ -163,8 +166,8 @@ def _reduced(w: Writer, x: Value) -> Triple:
 
 
 def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDouble, DoubleDouble, Value]:
-    """Return (r, s), (m, c) and k. The angle without k quarter turns has the sine r - s and the cosine m + c.
-    A zero sine keeps its sign.
+    """Return (r, s), (m, c) and k: an angle of k quarter turns plus a remainder with sine r - s and cosine m
+    + c. A zero sine keeps its sign.
     """
     square = r * r
     half = 0.5 * square
@@ -175,12 +178,12 @@ def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDou
 
 
 def _reduced_far(w: Writer, x: Value) -> Triple:
-    """Return the results of `_reduced` for large angles, and NaN for small ones.
+    """Return `_reduced` for large angles, and NaN for small ones.
 
-    x = m 2^e with a whole number m of 53 bits. Only 192 bits of 2/pi are needed: other bits give whole turns,
+    x = m 2^e with an integer m of 53 bits. Only 192 bits of 2/pi matter: the others contribute whole turns,
     or less than about 2^-126, when multiplied by m.
     """
-    bits = (  # the first 1,216 of 2/pi, 64 in each
+    bits = (  # the first 1,216 bits of 2/pi, 64 per word
         0xA2F9836E4E441529,
         0xFC2757D1F534DDC0,
         0xDB6295993C439041,
@@ -218,11 +221,12 @@ def _reduced_far(w: Writer, x: Value) -> Triple:
 def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value) -> None:
     bits = w.load(x, type="i64")
     m = w.converted("zext", (bits & (2**52 - 1)) | 2**52, "i128")
-    start = (w.binary("lshr", bits, 52) & 2047) - (1077 - 64)  # of the bits of 2/pi, after a word of zeros
+    # index into the bits of 2/pi, after a word of zeros
+    start = (w.binary("lshr", bits, 52) & 2047) - (1077 - 64)
     word, shift = w.binary("ashr", start, 6), start & 63
 
     def digits(k: int) -> Value:
-        """64 bits of 2/pi."""
+        """Return 64 bits of 2/pi."""
         table = Value(w, "ptr", "@two_over_pi")
         both = w.binary("shl", w.converted("zext", w.load(table, word + k, "i64"), "i128"), 64) | w.converted(
             "zext", w.load(table, word + (k + 1), "i64"), "i128"
@@ -254,19 +258,19 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
 
 
 def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
-    """Return x with the opposite sign in the third and fourth quadrants, whose numbers are 2 and 3."""
+    """Return x with the opposite sign in the third and fourth quadrants (numbers 2 and 3)."""
     sign = w.binary("shl", quadrant & 2, 62)
     return w.converted("bitcast", w.binary("xor", w.converted("bitcast", x, w.whole), sign), w.real)
 
 
 def arctangent(w: Writer, x: Value) -> Value:
-    """atan x"""
+    """Return atan x."""
     a = w.magnitude(x)
     return w.intrinsic("copysign", _direction(w, w.where(a > 2.0**100, 2.0**100, a), w.number(1.0)), x)
 
 
 def arctangent_of_two(w: Writer, y: Value, x: Value) -> Value:
-    """atan2(y, x); tiny and huge numbers are scaled."""
+    """Return atan2(y, x); tiny and huge numbers are scaled."""
     a, b = w.magnitude(y), w.magnitude(x)
     huge, place = ~(a + b < 2.0**60), w.room()
     w.store(_direction(w, a, x), place)
@@ -285,7 +289,7 @@ def _tiny(a: Value) -> Value:
 
 
 def _direction(w: Writer, across: Value, x: Value) -> Value:
-    """Return the angle from 0 to pi of a point with the coordinates x and `across`, which is not negative."""
+    """Return the angle, 0 to pi, of a point with coordinates x and `across` >= 0."""
     along = w.magnitude(x)
     steep = across > along
     a, b = w.where(steep, along, across), w.where(steep, across, along)
@@ -299,7 +303,7 @@ def _direction(w: Writer, across: Value, x: Value) -> Value:
     )
     square = q * q
     rest = w.fma(q * square, polynomial(w, ATAN, square), w.fma(over, square, -over))
-    # the angle is n pi/4 and this arc, or less it
+    # the angle is n pi/4 plus or minus this arc
     back = w.converted("bitcast", x, w.whole) < 0
     n = w.where(middle, 1.0, 0.0)
     n = w.where(steep, 2.0 - n, n)
@@ -309,19 +313,19 @@ def _direction(w: Writer, across: Value, x: Value) -> Value:
 
 
 def _arc(w: Writer, halves: Value, way: Value, s: Value, rest: Value) -> Value:
-    """`halves` pi + `way` (s + rest)"""
+    """Return `halves` pi + `way` (s + rest)."""
     head, less = two_sum(halves * _PI[0], way * s)
     return head + (less + w.fma(halves, _PI[1], way * rest))
 
 
 def arcsine(w: Writer, x: Value) -> Value:
-    """asin x"""
+    """Return asin x."""
     large, s, rest = _of_half(w, x)
     return w.intrinsic("copysign", _arc(w, w.where(large, 0.5, w.number(0.0)), w.where(large, -2.0, w.number(1.0)), s, rest), x)
 
 
 def arccosine(w: Writer, x: Value) -> Value:
-    """acos x"""
+    """Return acos x."""
     large, s, rest = _of_half(w, x)
     negative = x < 0.0
     halves = w.where(large, w.where(negative, 1.0, 0.0), 0.5)
@@ -329,8 +333,8 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> Triple:
-    """Return whether |x| is above 1/2, and a number in two parts. The number is the arc whose sine is |x| or,
-    above 1/2, sqrt((1 - |x|)/2).
+    """Return whether |x| is above 1/2, and an arc in two parts: asin |x| or, above
+    1/2, asin sqrt((1 - |x|)/2).
     """
     a = w.magnitude(x)
     large = a > 0.5

@@ -1,10 +1,11 @@
 """Machine code as a function of JAX: the call frame of XLA's foreign function interface, registered handlers,
-and lanes divided among threads.
+and distribution of lanes over threads.
 
-Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header that comes with jaxlib says which version it speaks; another
-major version, or a frame with other members, is one that is not known here.
+Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header shipped with
+jaxlib states its version. Another major version, or frames with other members, are not supported.
 
-Machine code works on doubles. Arrays in single precision are converted by XLA before and after a call, so that their results are rounded once.
+Machine code works in double precision. XLA converts arrays in single precision before and after a call,
+so results are rounded once.
 """
 
 import ctypes
@@ -25,8 +26,8 @@ from jourdain_jax.native import host, nvidia
 from jourdain_jax.native.ir import Value, Writer
 
 HANDLER, KERNEL = "handler", "kernel"
-WORDS, MOST_BUFFERS = 4, 16  # what a kernel of a GPU is told of each array (`gpu.py`), and of how many arrays at most
-FIRST_OF_SCRATCH = 8  # double of a kernel's own memory that is not the counter
+WORDS, MOST_BUFFERS = 4, 16  # words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays
+FIRST_OF_SCRATCH = 8  # index of the first double of a kernel's scratch memory after the lane counter
 _LAYOUTS = {
     "CallFrame": "api ctx stage args rets attrs future",
     "Buffer": "dtype data rank dims",
@@ -36,8 +37,8 @@ _LAYOUTS = {
     "Error_Create_Args": "message errc",
     "Stream_Get_Args": "ctx stream",
 }
-_FUNCTIONS = ["Error_Create", "Stream_Get"]  # those that are called: the first one and the fifth
-# places, in words of 8 bytes
+_FUNCTIONS = ["Error_Create", "Stream_Get"]  # functions called here: the first one and the fifth
+# word indices of 8 bytes
 ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
 
 _REGISTERED: set[str] = set()  # names of handlers
@@ -50,17 +51,17 @@ def version() -> tuple[int, int] | None:
     found = _stated_version()
     if found is None:
         warnings.warn(
-            "this jaxlib has an unknown foreign function interface: motions are integrated by XLA, more "
-            "slowly; install a supported version of jaxlib",
+            "this jaxlib has an unknown foreign function interface, so XLA integrates motions, more slowly; "
+                "install a supported version of jaxlib",
             stacklevel=2,
         )
     return found
 
 
 def reason_against() -> str:
-    """Return why none of our machine code can be called here; empty if it can."""
+    """Return why machine code cannot be called here; empty if it can."""
     if (backend := jax.default_backend()) not in ("cpu", "gpu"):
-        return f"it is made for CPUs and NVIDIA GPUs, not for JAX's backend {backend}"
+        return f"it supports CPUs and NVIDIA GPUs, not JAX's backend {backend}"
     if reason := host.reason_against() if backend == "cpu" else nvidia.reason_against():
         return reason
     if version() is None:
@@ -69,7 +70,7 @@ def reason_against() -> str:
 
 
 def devices() -> str:
-    """Return the note on devices of machine code, if there are any besides the CPU."""
+    """Return the devices of machine code for display, if there are any besides the CPU."""
     return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
 
 
@@ -95,7 +96,7 @@ def _members(header: str, struct: str) -> str:
 
 
 class Given(NamedTuple):
-    """An argument of a handler."""
+    """Argument of a handler."""
 
     data: Value  # pointer
     sizes: Value  # pointer to the sizes of its axes
@@ -122,8 +123,8 @@ def product(w: Writer, x: Given, but: int) -> Value:
 def write_handler(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write a handler that calls `body` with all arguments and results; on a GPU it calls the kernel that
-    does so.
+    """Write a handler that calls `body` with all arguments and results; for a GPU,
+    write the kernel that does so.
     """
     if w.device:
         return _write_kernel(w, arguments, results, body)
@@ -138,15 +139,16 @@ def write_handler(
 
 
 def answer_metadata(w: Writer, frame: Value) -> None:
-    """Answer a call that asks for the version of the interface, and return."""
+    """Answer a call that queries the version of the interface, and return from the handler."""
     known = version()
     assert known is not None
     extension = w.load(frame, 1, "ptr")
     with w.when(w.converted("ptrtoint", extension, "i64").differs(0)):
-        asked = w.load(extension, 2, "i32").equals(1)  # the kind of an extension, in its second word
+        asked = w.load(extension, 2, "i32").equals(1)  # type of an extension, in its second word
         with w.when(asked):
             metadata = w.load(extension, 3, "ptr")
-            for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
+            # major and minor version in the fourth word, then flags
+            for place, number in enumerate((*known, 0), 6):
                 w.store(w.literal(number, "i32"), metadata, place)
         w.give_where(asked, w.null)
 
@@ -154,8 +156,7 @@ def answer_metadata(w: Writer, frame: Value) -> None:
 def _write_kernel(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write `kernel(words)`, which every thread of a GPU runs. The last result is memory that belongs to this
-    call.
+    """Write `kernel(words)`, which every thread of a GPU runs. The last result is scratch memory of the call.
     """
     with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
         words = Value(w, "ptr", "%words")
@@ -166,13 +167,13 @@ def _write_kernel(
 
 
 def given(w: Writer, buffer: Value) -> Given:
-    """Return the array that a handler receives."""
+    """Return the array in a buffer that a handler receives."""
     # words of a buffer: 2 the type, 3 the data, 4 the rank, 5 the sizes
     return Given(w.load(buffer, 3, "ptr"), w.load(buffer, 5, "ptr"), w.load(buffer, 4, "i64"))
 
 
 def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:
-    """Return the results of a `call` of machine code in a program of JAX, with arrays in single precision
+    """Return the results of a `call` of machine code in a JAX program, with arrays in single precision
     converted; `more`: avals of further results, which are dropped.
     """
 
@@ -188,8 +189,7 @@ def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callabl
 
 
 def registered(text: str, effort: int = 2) -> str:
-    """Return the name under which JAX calls the handler of a module of LLVM IR; `effort`: as of
-    `host.object_code`.
+    """Register the handler of a module of LLVM IR and return its name; `effort`: as for `host.object_code`.
     """
     name = _name(text, effort)
     register(name, text, "cpu", effort)
@@ -201,50 +201,49 @@ def _name(text: str, effort: int) -> str:
 
 
 def register(name: str, text: str, platform: str, effort: int = 2) -> None:
-    """Registers the handler of a module of LLVM IR under a name, once."""
+    """Register the handler of a module of LLVM IR under a name, once."""
     if name in _REGISTERED:
         return
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     code = host.kept(_name(text, effort), host.description(), lambda: host.object_code(text, effort))
     with _REGISTERING:
-        if name not in _REGISTERED:  # by another thread meanwhile
+        if name not in _REGISTERED:  # another thread may have registered it meanwhile
             jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform=platform)
             _REGISTERED.add(name)
 
 
-NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
+# words of a job: index of the next row, number of rows, pointers to the given and to the returned rows
+NEXT, COUNT, IN, OUT = range(4)
 
 
 def start_counting(w: Writer, job: Value, word: int) -> None:
-    """Reset the count of samples taken. The count is a word of the job; on a GPU, the word to which it
-    points.
-    """
+    """Reset the counter of lanes taken: a word of the job, or on a GPU the word to which it points."""
     w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
 
 
 def next_lane(w: Writer, job: Value, word: int) -> Value:
-    """Return the number of the next lane, which is taken."""
+    """Take the next lane and return its index."""
     return w.counted_up(w.load(job, word, "ptr"), 0) if w.device else w.counted_up(job, word)
 
 
 def lanes_taken(w: Writer, job: Value, word: int) -> Value:
-    """Return how many lanes are taken; there may be fewer."""
+    """Return how many lanes have been taken, which may exceed their number."""
     return w.load(w.load(job, word, "ptr"), type="i64") if w.device else w.load(job, word, "i64")
 
 
 def share(w: Writer, job: Value, count: Value) -> None:
-    """Call the module's `loop(job)` in as many threads as the writer allows; in fewer for small batches."""
+    """Call the module's `loop(job)` in up to `w.threads` threads, fewer for small batches."""
     threads = w.threads
     loop, nothing, others, started = Value(w, "ptr", "@loop"), w.null, w.room(threads, "i64"), w.room(type="i64")
     w.store(w.literal(0, "i64"), started)
     how = w.room(16, "i64")  # a `pthread_attr_t`, which takes up to 64 bytes
     if threads > 1:
         w.external("pthread_attr_init", "i32", how)
-        # 2**23 bytes for each thread, as the first one has in most systems; macOS gives others 512 kB
+        # 8 MB of stack per thread, as the main thread has on most systems; the default of macOS is 512 kB
         w.external("pthread_attr_setstacksize", "i32", how, w.literal(2**23, "i64"))
     for more in range(1, threads):
-        # 8 times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
+        # start another thread, which takes about 30 us, for every 8 vectors of lanes
         with w.when(count >= (more + 1) * 8 * w.lanes):
             number = w.load(started, type="i64")
             failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), how, loop, job)
@@ -256,27 +255,25 @@ def share(w: Writer, job: Value, count: Value) -> None:
 
 
 class OfLane(NamedTuple):
-    """The numbers of one lane in an array of a batch: the position of the first one, and the distance to the
-    next.
-    """
+    """Numbers of one lane in an array of a batch: pointer to the first, and distance to the next."""
 
     first: Value
     apart: Value | int
 
     def place(self, number: Value | int) -> Value:
-        """Return where the number with this index is."""
+        """Return the pointer to the number with this index."""
         return self.first.writer.at(self.first, number if self.apart == 1 else number * self.apart, "double")
 
     def after(self, count: Value | int) -> "OfLane":
-        """Return the numbers after so many."""
+        """Return the numbers after the first `count`."""
         return OfLane(self.place(count), self.apart)
 
 
 def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
     """Return the numbers of one of `count` lanes in an array; on a CPU they are contiguous.
 
-    On a GPU lanes come last: neighbouring threads, which begin and save together, then access neighbouring
-    words.
+    On a GPU lanes come last, so that neighbouring threads, which begin and save
+    together, access neighbouring words.
     """
     return (
         OfLane(w.at(array, lane, "double"), count)
@@ -286,22 +283,22 @@ def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: V
 
 
 def taken_in(w: Writer, count: int, numbers: OfLane, rows: Value, lane: Value) -> None:
-    """Copy so many numbers of a lane into its rows."""
+    """Copy the first `count` numbers of a lane into its rows."""
     with w.counted(count) as row:
         w.store(w.load(numbers.place(row), type="double"), rows, row * w.lanes + lane)
 
 
 def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane) -> None:
-    """Copy so many rows of a lane into its numbers."""
+    """Copy the first `count` rows of a lane into its numbers."""
     with w.counted(count) as row:
         w.store(w.load(rows, row * w.lanes + lane, "double"), numbers.place(row))
 
 
 def write_rows(w: Writer, given: int, returned: int) -> None:
-    """Write a handler that maps rows of `given` numbers to rows of `returned` ones. It calls the module's
-    `row(given, returned)` for several lanes side by side.
+    """Write a handler that maps rows of `given` numbers to rows of `returned` numbers. It calls the module's
+    `row(given, returned)` for several lanes at once.
 
-    Lanes beyond the last row compute that row again.
+    Lanes beyond the last row repeat that row.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")

@@ -1,8 +1,10 @@
-"""Kernels of NVIDIA GPUs as functions of JAX: a handler on the host, which is machine code of the CPU, puts each call into XLA's stream.
+"""Kernels of NVIDIA GPUs as functions of JAX. A handler on the host, compiled for the CPU, launches
+each kernel on XLA's stream.
 
-The handler is one for all kernels: a call names its own by a number, which a table in this process takes to what the driver has loaded. It hands over for
-each array where it is, the size of the last axis, and the products of the sizes of all axes but the last and but the last three. The last result is memory
-of the call's own: a counter of the lanes, and what threads need beyond their own memory. Layouts are those of `ffi.py`.
+One handler serves all kernels. A call identifies its kernel by a number, which a table of this process maps
+to the loaded kernel. For each array the kernel receives its address, the size of the last axis, and the
+products of the sizes of all axes but the last one and but the last three. The last result is scratch memory
+of the call: a lane counter, and memory that threads need beyond their own. Layouts are as in `ffi.py`.
 """
 
 import ctypes
@@ -21,17 +23,18 @@ from jourdain_jax.native import ffi, host, nvidia
 from jourdain_jax.native.ir import Value, Writer
 
 _TARGET = "jourdain_jax_on_gpu"
-MOST_KERNELS = 4096  # of a process
-_NUMBER, _FUNCTION, _WORDS = range(3)  # words of a kernel in the table; the number of words
+MOST_KERNELS = 4096  # per process
+_NUMBER, _FUNCTION, _WORDS = range(3)  # word indices of a table entry, and number of words
 _BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
 
-_table = (ctypes.c_uint64 * (_WORDS * (MOST_KERNELS + 1)))()  # the last one is no kernel: where a program asks for one that this process has not
+# the last entry is empty: a program that names a kernel unknown to this process finds it
+_table = (ctypes.c_uint64 * (_WORDS * (MOST_KERNELS + 1)))()
 _loading = threading.RLock()
 _kernels: dict[int, nvidia.Loaded] = {}
 
 
 class Kernel(NamedTuple):
-    """A kernel that can be called."""
+    """Kernel that can be called."""
 
     number: int
     loaded: nvidia.Loaded
@@ -39,7 +42,7 @@ class Kernel(NamedTuple):
 
 
 def handler_text() -> str:
-    """The module of the handler."""
+    """Return the LLVM IR of the handler."""
     w = Writer(1, False)
     _write_described(w)
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
@@ -78,7 +81,7 @@ def handler_text() -> str:
         with w.when(w.load(code, type="i32").differs(0)):
             message, error = w.room(type="ptr"), w.room(4, "i64")
             w.external("cuGetErrorString", "i32", w.load(code, type="i32"), message)
-            # the driver is out of memory: XLA's resources are exhausted; otherwise its error is an internal one
+            # out of memory in the driver is XLA's RESOURCE_EXHAUSTED, any other error INTERNAL
             kind = w.where(w.load(code, type="i32").equals(2), w.literal(8, "i64"), 13)
             for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load(message, type="i64"), kind)):
                 w.store(value, error, word)
@@ -89,7 +92,7 @@ def handler_text() -> str:
 
 
 def _write_described(w: Writer) -> None:
-    """`described(buffer, words)`: what a kernel is told of an array."""
+    """Write `described(buffer, words)`, which fills in the words that describe an array to a kernel."""
     with w.function("described", "void", {"buffer": "ptr", "words": "ptr"}) as (buffer, words):
         x = ffi.given(w, buffer)
         told = (w.converted("ptrtoint", x.data, "i64"), ffi.last_size(w, x), ffi.product(w, x, 1), ffi.product(w, x, 3))
@@ -99,7 +102,7 @@ def _write_described(w: Writer) -> None:
 
 
 def _handler() -> str:
-    """The name under which JAX calls kernels."""
+    """Return the name under which JAX calls kernels, registering the handler on first use."""
     for name in ("cuMemsetD32Async", "cuLaunchKernel", "cuGetErrorString"):
         host.llvm.add_symbol(name, ctypes.cast(getattr(nvidia.driver(), name), ctypes.c_void_p).value)
     host.llvm.add_symbol("jourdain_jax_kernels", ctypes.addressof(_table))
@@ -108,15 +111,15 @@ def _handler() -> str:
 
 
 def registered(text: str, scratch: tuple[int, int]) -> Kernel:
-    """The kernel of a module of LLVM IR."""
+    """Return the kernel of a module of LLVM IR."""
     made_by = f"{host.llvm.llvm_version_info} {nvidia.architecture()}"
     digest = hashlib.sha256(f"{made_by} {text}".encode())
-    number = int.from_bytes(digest.digest()[:7], "big") + 1  # a whole number of 64 bits with a sign
+    number = int.from_bytes(digest.digest()[:7], "big") + 1  # fits a signed 64-bit integer
     with _loading:
         if number not in _kernels:
             if len(_kernels) == MOST_KERNELS:
-                raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most "
-                    "that it can keep; start a new one")
+                raise RuntimeError(f"this process has compiled {MOST_KERNELS} GPU kernels, the maximum; "
+                    "start a new process")
             ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
             _kernels[number] = found = nvidia.loaded(ptx, ffi.KERNEL)
             place = _WORDS * (len(_kernels) - 1)
@@ -126,8 +129,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the order of an array's axes in memory, the fastest first. Its first `lanes` axes, those of
-    lanes, are faster than all others.
+    """Return the order of an array's axes in memory, the fastest first. Its first `lanes`
+    axes are faster than all others.
     """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 
@@ -135,15 +138,17 @@ def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
 def lowered(
     ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel, batch: tuple[int, ...], samples: int
 ) -> list:
-    """Return the call of a kernel for a batch. Its lanes come last, except in samples, the first argument."""
+    """Return the call of a kernel for a batch. Batch axes come last in memory, except in
+    samples, the first argument.
+    """
     lanes = math.prod(batch)
     slot, allowed = kernel.scratch
-    # of all threads, and no more than an eighth of the device: so many slots
+    # number of scratch slots of all threads, in at most an eighth of the device's memory
     slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
-    blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # no grid is without blocks
-    each = min(4096, slots // blocks)  # of a thread
+    blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # a grid needs at least one block
+    each = min(4096, slots // blocks)  # slots per thread
     scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,), dtype=np.dtype(np.float64), weak_type=False)
-    # an array without lanes has one axis, whose layout is the same either way
+    # arrays without batch axes have one axis, whose layout is unique
     own = [aval.shape[: len(batch)] == batch and k >= samples for k, aval in enumerate(ctx.avals_in)]
     layouts = {
         "operand_layouts": [

@@ -1,13 +1,12 @@
 """The host processor: support of machine code, number of lanes, compilation, and the cache on disk.
 
-Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the
-user's cache. A file is named by the source of
-its code. It begins with a digest of that name, of what made it and of the code, so that one that is torn,
-changed or exchanged for another is made again.
-Code from others would run in this process: a folder or a file that somebody else owns or may write is not
-used. The digest holds no secret, and LLVM
-does not check loaded code: who may write as the user can make a file that runs code or ends the process, and
-may change what Python imports anyway.
+Code is cached between processes in the folder of JAX's compilation cache if one is set, otherwise in the
+user's cache folder. A file is named after the source of its code. It begins with a digest of its name, the
+tools and the code, so that incomplete, modified or exchanged files are compiled again.
+
+Cached code runs in this process, so folders and files that another user owns or may write are not used. The
+digest is no protection against someone who can write as the user, nor does LLVM check loaded code. Such a
+person could equally modify imported Python files.
 """
 
 import contextlib
@@ -37,28 +36,28 @@ except ModuleNotFoundError:  # an optional dependency
 except (ImportError, OSError) as error:
     _NOT_IMPORTED = f"llvmlite cannot be imported ({error})"
 
-_LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
-# How much LLVM does, at most; no number depends on it: nothing here allows LLVM to round differently.
-# 2: all that it can, for what runs often.
-# 1: few passes; speeds of a bicycle put onto its rows take 0.51 s to compile in place of 0.84, and 2.4 us per lane in place of 1.6.
-# 0: registers are assigned without a search; 12,000 operations in a row take 0.07 s to compile in place of 0.72 (1) and 1.33 (2), and run at half the speed.
+_LANES = (("avx512f", 8), ("avx", 4))  # doubles per register; otherwise 2, as on every 64-bit machine
+# Maximum optimisation level. It does not affect results, because LLVM is never allowed to round differently.
+# 2: full optimisation, for code that runs often. 1: few passes; projection of the speeds of a bicycle
+# compiles in 0.51 s instead of 0.84 and takes 2.4 us per lane instead of 1.6. 0: fast register allocation;
+# 12,000 sequential operations compile in 0.07 s instead of 0.72 (1) and 1.33 (2), and run at half the speed.
 EFFORT = 2
-MOST_THREADS = 1024  # each takes 8 MB of addresses for its stack
+MOST_THREADS = 1024  # each thread reserves 8 MB of address space for its stack
 _lock = threading.Lock()
-_engines: list = []  # what machine code lives in: as long as the process, which may call it
+_engines: list = []  # own the machine code, and live as long as the process, which may call it
 
 
-# Functions of C that machine code calls. LLVM ends the process where it finds one of them missing.
+# C functions that machine code calls. LLVM ends the process if one of them is missing.
 _CALLED = ("aligned_alloc", "free", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
-# A module with what llvmlite must be able to read: those of LLVM 15 and older are not.
+# Module with the syntax that llvmlite must understand; LLVM 15 and older do not.
 _TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x, splat (double 1.0)\n  ret <2 x double> %y\n}\n"
 
 
 @functools.cache
 def reason_against() -> str:
-    """Return the reason why no machine code is made here; empty if it is."""
+    """Return why machine code is not available here; empty if it is."""
     if os.name != "posix":
-        return "it is made under Linux and macOS alone"
+        return "it requires Linux or macOS"
     if llvm is None:
         return _NOT_IMPORTED
     try:
@@ -68,9 +67,9 @@ def reason_against() -> str:
         for name in _CALLED:
             getattr(process, name)
         address(object_code(_TRIAL, 0), "trial")
-    except Exception as error:  # whatever a system lacks: motions are integrated by XLA there
+    except Exception as error:  # whatever the system lacks, motions are then integrated by XLA
         version, said = ".".join(map(str, llvm.llvm_version_info)), str(error).split("\n")[0]
-        return f"LLVM {version} of llvmlite does not serve here ({said})"
+        return f"llvmlite's LLVM {version} does not work here ({said})"
     return ""
 
 
@@ -89,21 +88,21 @@ def lanes() -> int:
 
 
 def registers() -> int:
-    """Return the number of values that fit in vector registers; four registers are reserved for instructions.
+    """Return the number of values that fit in vector registers, with four
+    registers reserved for instructions.
     """
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
 
 def threads() -> int:
-    """Return the number of threads that share a batch: one for every usable core, or `JOURDAIN_JAX_THREADS`.
-    """
+    """Return the number of threads that share a batch: one per usable core, or `JOURDAIN_JAX_THREADS`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     stated = os.environ.get("JOURDAIN_JAX_THREADS", str(min(cores, MOST_THREADS)))
     return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", MOST_THREADS)
 
 
 def fuses() -> bool:
-    """Return whether products and sums are rounded once, in one instruction."""
+    """Return whether the processor has fused multiply-add."""
     return bool(features().get("fma") or features().get("neon"))
 
 
@@ -114,13 +113,13 @@ def _machine(effort: int):
 
 
 def description() -> str:
-    """Return the facts on which machine code depends besides the program."""
+    """Return everything except the program on which machine code depends."""
     machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
     return f"{EFFORT} {llvm.llvm_version_info} {machine}"
 
 
 def object_code(text: str, effort: int) -> bytes:
-    """Return the machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as of `EFFORT`."""
+    """Return the machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as for `EFFORT`."""
     effort = min(effort, EFFORT)
     with _lock:
         machine, few_passes = _machine(effort), effort < 2
@@ -131,7 +130,7 @@ def object_code(text: str, effort: int) -> bytes:
         builder = llvm.create_pass_builder(machine, options)
         passes = llvm.create_new_module_pass_manager() if few_passes else builder.getModulePassManager()
         for add in ("add_sroa_pass", "add_simplify_cfg_pass") if few_passes else ():
-            getattr(passes, add, lambda: None)()  # older versions of llvmlite have not all of them
+            getattr(passes, add, lambda: None)()  # older versions of llvmlite lack some of them
         passes.run(module, builder)
         return machine.emit_object(module)
 
@@ -139,7 +138,7 @@ def object_code(text: str, effort: int) -> bytes:
 def address(code: bytes, name: str) -> int:
     """Return the address of a compiled function in memory."""
     with _lock:
-        # an engine takes its target machine with it
+        # an engine takes ownership of its target machine
         machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -148,12 +147,12 @@ def address(code: bytes, name: str) -> int:
         return engine.get_function_address(name)
 
 
-MOST_BYTES = 200e6  # of all files; beyond, the oldest go
+MOST_BYTES = 200e6  # of all files; beyond, the oldest are deleted
 _DIGEST = 32  # bytes
 
 
 def folder() -> Path | None:
-    """Return the cache folder; None if `JOURDAIN_JAX_CACHE` is 0 or there is no place for it."""
+    """Return the cache folder; None if `JOURDAIN_JAX_CACHE` is 0 or the user has no home folder."""
     stated = os.environ.get("JOURDAIN_JAX_CACHE", "")
     if stated == "0":
         return None
@@ -168,10 +167,10 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """Return the result of `make`: from the file of this name if that is intact, otherwise made anew and
-    stored. A failing disk is no error.
+    """Return `make()` from the cache file of this name if that is intact, otherwise compute and store
+    it. Disk errors are ignored.
 
-    `made_by`: further conditions for equality, namely versions of the tools, as text.
+    `made_by`: further conditions for reuse, namely versions of the tools, as text.
     """
     place = folder()
     if place is None or not _is_ours(place):
@@ -206,25 +205,25 @@ def _is_ours(place: Path) -> bool:
 
 
 def _against(found: os.stat_result) -> str:
-    """Return the reason not to trust a folder or a file; empty if there is none."""
+    """Return why a folder or file cannot be trusted; empty if it can."""
     if found.st_uid != os.geteuid():
-        return f"it belongs to user {found.st_uid}, and its files would run as {os.geteuid()}"
+        return f"it belongs to user {found.st_uid}, but its files would run as {os.geteuid()}"
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return "others may write to it, but its files run in your process (forbid it by chmod go-w)"
+        return "others may write to it, but its files run in your process (use chmod go-w)"
     return ""
 
 
 @functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"the folder `{place}` is not used as cache of machine code, which is therefore compiled in each "
-        f"process: {against}; name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
+        f"the folder `{place}` is not used to cache machine code, which every process must then compile: "
+            f"{against}; set JOURDAIN_JAX_CACHE to a folder of your own (0: none)",
         stacklevel=2,
     )
 
 
 def _read(file: Path) -> bytes:
-    """Return the content of our own file; nothing if there is none."""
+    """Return the content of a cache file; empty if missing or not trusted."""
     try:
         with open(os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as opened:
             return b"" if _against(os.fstat(opened.fileno())) else opened.read()
@@ -233,7 +232,7 @@ def _read(file: Path) -> bytes:
 
 
 def _make_room(place: Path) -> None:
-    """Remove the oldest files where all take more than `MOST_BYTES`."""
+    """Remove the oldest files if all of them exceed `MOST_BYTES`."""
     found = sorted((file.stat().st_mtime, file.stat().st_size, file) for file in place.glob("*.o"))
     excess = sum(size for _, size, _ in found) - MOST_BYTES
     for _, size, file in found:

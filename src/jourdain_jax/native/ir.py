@@ -1,10 +1,11 @@
-"""LLVM IR as text, by operators on values: vectors with one number per lane, and scalars for loops.
+"""Builder of LLVM IR text with operators on values: vectors with one number per lane, and scalars for loops.
 
-`a + b`, `a < b`, `where(c, a, b)` each append an instruction to the function that is being written. Numbers of Python become literals. There are no
-flags that let LLVM change results: every lane is rounded as it is written here, whatever the width.
+`a + b`, `a < b`, `where(c, a, b)` each append an instruction to the current function. Python numbers become
+literals. No flags allow LLVM to change results: every lane is rounded as written here, whatever the width.
 
-On a GPU (`device`) every thread runs the same with a lane of its own; the threads of a warp come `together` where the loop over steps continues. What is local
-to a thread is in registers only where functions are written out at their calls: those that are called once, and small ones.
+On a GPU (`device`) every thread runs the same code with its own lane; the threads of a warp meet
+(`together`) where the loop over steps continues. Local values stay in registers only in inlined functions:
+those called once, and small ones.
 """
 
 import re
@@ -19,7 +20,8 @@ _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "
 
 
 def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
-    """Return the method of values that appends this operation or comparison; `turned`: of the other one."""
+    """Return the method of values that appends this operation or comparison; `turned`: with swapped operands.
+    """
 
     def appended(self: "Value", other) -> "Value":
         a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)
@@ -30,12 +32,12 @@ def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """The result of an instruction, an argument or a literal."""
+    """Result of an instruction, an argument or a literal."""
 
     writer: "Writer"
     type: str
     name: str
-    place: str = ""  # where in memory it comes from
+    place: str = ""  # its memory location, if loaded or stored
 
     __add__ = __radd__ = _operator("add")
     __sub__, __rsub__ = _operator("sub"), _operator("sub", turned=True)
@@ -54,17 +56,19 @@ class Value:
 
 
 class Writer:
-    """Writes a module of functions on vectors of `lanes` doubles; `fused`: whether `fma` rounds once.
+    """Builder of a module of functions on vectors of `lanes` doubles; `fused`: whether `fma` rounds once.
 
     `threads`: the number of threads that share the lanes on a CPU. `device`: whether it is for a GPU; then
-    `scratch` states the doubles of external memory per slot (0: none) and the bytes for all threads."""
+    `scratch` states the doubles of external memory per slot (0: none) and the bytes for all threads.
+    """
 
     eps = 2.0**-52
 
     def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
         self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device
-        self.scratch = (0, 1 << 62)  # none, of any memory
-        self.own: tuple[Value, Value]  # a kernel's own memory, the counter of lanes first, and how many doubles it has
+        self.scratch = (0, 1 << 62)  # none needed, no limit
+        # a kernel's scratch memory, with the lane counter first, and its size in doubles
+        self.own: tuple[Value, Value]
         self.real, self.truth, self.whole = f"<{lanes} x double>", f"<{lanes} x i1>", f"<{lanes} x i64>"
         self._lines: list[str] = []
         self._declared: dict[str, str] = {}
@@ -72,7 +76,7 @@ class Writer:
 
     @property
     def text(self) -> str:
-        """The module."""
+        """Return the text of the module."""
         whole = "\n".join([*self._lines, *self._declared.values(), ""])
         return _inlined(whole) if self.device else whole
 
@@ -80,7 +84,7 @@ class Writer:
 
     @contextmanager
     def function(self, name: str, result: str, arguments: dict[str, str], how: str = "internal", attributes: str = "") -> Iterator[list[Value]]:
-        """A function; inside, its arguments (name -> type) as values."""
+        """Write a function; yields its arguments (name -> type) as values."""
         self._lines.append(f"define {how} {result} @{name}({', '.join(f'{type} %{n}' for n, type in arguments.items())}) nounwind {attributes} {{")
         self._entry = len(self._lines)
         yield [Value(self, type, f"%{n}") for n, type in arguments.items()]
@@ -96,36 +100,36 @@ class Writer:
             self.give()
 
     def give(self, value: Value | None = None) -> None:
-        """Returns from the function."""
+        """Return from the function."""
         self._lines.append("  ret void" if value is None else f"  ret {value.type} {value.name}")
 
     def give_where(self, condition: Value, value: Value | None = None) -> None:
-        """Returns from the function where the condition holds."""
+        """Return from the function if the condition holds."""
         with self.when(condition):
             self.give(value)
             self.place(self.label())
 
     @property
     def null(self) -> Value:
-        """Return a pointer to nothing; from a handler of XLA it says that there was no fault."""
+        """Return a null pointer; as the result of an XLA handler it means success."""
         return Value(self, "ptr", "null")
 
     def label(self) -> str:
-        """Return a new name of a place."""
+        """Return a new label."""
         self._count += 1
         return f"at{self._count}"
 
     def place(self, label: str) -> None:
-        """The place with this name is here."""
+        """Place this label here."""
         self._lines.append(f"{label}:")
 
     def go(self, label: str, condition: Value | None = None, otherwise: str = "") -> None:
-        """Goes on at a place, or where the condition does not hold at another."""
+        """Jump to a label, or to `otherwise` if the condition does not hold."""
         self._lines.append(f"  br label %{label}" if condition is None else f"  br i1 {condition.name}, label %{label}, label %{otherwise}")
 
     @contextmanager
     def when(self, condition: Value) -> Iterator[None]:
-        """Run the code inside if the condition holds."""
+        """Run the enclosed code if the condition holds."""
         inside, after = self.label(), self.label()
         self.go(inside, condition, after)
         self.place(inside)
@@ -135,7 +139,7 @@ class Writer:
 
     @contextmanager
     def repeated(self) -> Iterator[Callable[[Value], None]]:
-        """A loop; it is given a function that leaves it where a condition holds."""
+        """Write a loop; yields a function that leaves it if a condition holds."""
         again, after = self.label(), self.label()
         self.go(again)
         self.place(again)
@@ -151,7 +155,7 @@ class Writer:
 
     @contextmanager
     def counted(self, end: Value | int, *, first: Value | int = 0) -> Iterator[Value]:
-        """A loop over whole numbers from `first` up to before `end`."""
+        """Write a loop over integers from `first` up to, but excluding, `end`."""
         number = self.room(type="i64")
         self.store(self.literal(first, "i64"), number)
         with self.repeated() as leave:
@@ -161,19 +165,19 @@ class Writer:
             self.store(now + 1, number)
 
     def each_lane(self) -> AbstractContextManager[Value]:
-        """Return a loop over the lanes."""
+        """Write a loop over the lanes."""
         return self.counted(self.lanes)
 
     # instructions
 
     def instruction(self, type: str, text: str) -> Value:
-        """Return the result of an instruction."""
+        """Append an instruction and return its result."""
         self._count += 1
         self._lines.append(f"  %v{self._count} = {text}")
         return Value(self, type, f"%v{self._count}")
 
     def literal(self, number, type: str) -> Value:
-        """Return a number of Python in this type; values pass."""
+        """Return a Python number as a literal of this type; values pass unchanged."""
         if isinstance(number, Value):
             return number
         scalar = type.split(" x ")[-1].rstrip(">")
@@ -196,26 +200,26 @@ class Writer:
         return self.instruction(found, f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}")
 
     def is_nan(self, a: Value) -> Value:
-        """Return whether a number is none."""
+        """Return whether a number is NaN."""
         return self.instruction(self.truth, f"fcmp uno {a.type} {a.name}, {a.name}")
 
     def where(self, condition: Value, a, b) -> Value:
-        """a where the condition holds, otherwise b."""
+        """Return a where the condition holds, otherwise b."""
         like = a if isinstance(a, Value) else b if isinstance(b, Value) else self.number(0.0)
         a, b = self.literal(a, like.type), self.literal(b, like.type)
         return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
 
     def call(self, function: str | Value, result: str, *arguments: Value) -> Value:
-        """Return the result of a function, of this name, or to which this points."""
+        """Call a function, given by name or pointer, and return its result."""
         name = function.name if isinstance(function, Value) else f"@{function}"
         return self.instruction(result, f"call {result} {name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def run(self, function: str, *arguments: Value) -> None:
-        """Calls a function that returns nothing."""
+        """Call a function that returns nothing."""
         self._lines.append(f"  call void @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def external(self, function: str, result: str, *arguments: Value) -> Value:
-        """As `call`, of a function from outside the module."""
+        """Call a function from outside the module and return its result."""
         self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"
         if result == "void":
             self.run(function, *arguments)
@@ -223,17 +227,17 @@ class Writer:
         return self.call(function, result, *arguments)
 
     def declare(self, name: str, text: str) -> None:
-        """A declaration at the end of the module."""
+        """Add a declaration at the end of the module."""
         self._declared[name] = text
 
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
-        """Return the result of a function that the module has once; `body(w, *arguments)` writes it."""
+        """Return the result of a function that the module contains once; `body(w, *arguments)` writes it."""
         function = f"shared_{name}"
         self.once(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, lambda w, *given: w.give(body(w, *given)))
         return self.call(function, self.real, *arguments)
 
     def once(self, function: str, result: str, arguments: dict[str, str], body: Callable) -> None:
-        """Return a function that is written once per module; `body(w, *arguments)` writes it."""
+        """Write a function once per module by `body(w, *arguments)`."""
         if function not in self._declared:
             around, self._lines = (self._lines, self._entry), []
             with self.function(function, result, arguments, attributes="noinline") as given:
@@ -242,16 +246,16 @@ class Writer:
             self._lines, self._entry = around
 
     def intrinsic(self, name: str, a: Value, *more) -> Value:
-        """Return a function of LLVM of one or more numbers of a type."""
+        """Return the result of an LLVM intrinsic of one or more numbers of one type."""
         kind = f"v{self.lanes}f64" if a.type == self.real else "f64"
         return self.external(f"llvm.{name}.{kind}", a.type, a, *(self.literal(b, a.type) for b in more))
 
     def fma(self, a: Value, b, c) -> Value:
-        """a b + c, rounded once where the machine can."""
+        """Return a b + c, rounded once if the machine can."""
         return self.intrinsic("fma", a, b, c) if self.fused else a * b + c
 
     def magnitude(self, a: Value) -> Value:
-        """|a|"""
+        """Return |a|."""
         return self.intrinsic("fabs", a)
 
     def root(self, a: Value) -> Value:
@@ -275,64 +279,70 @@ class Writer:
         return self.intrinsic("maximum", a, b)
 
     def converted(self, how: str, a: Value, to: str) -> Value:
-        """Return a conversion of LLVM, such as `sitofp`."""
+        """Return an LLVM conversion, such as `sitofp`."""
         return self.instruction(to, f"{how} {a.type} {a.name} to {to}")
 
     def spread(self, a: Value) -> Value:
-        """Return a number in all lanes, given one that is not a vector."""
+        """Return a scalar in all lanes."""
         first = self.instruction(self.real, f"insertelement {self.real} poison, double {a.name}, i64 0")
         return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
 
     def together(self, a: Value) -> Value:
-        """Return whether a value is true in any thread of a warp, whose threads wait here. On a CPU, return
-        the value."""
+        """Return whether a value is true in any thread of a warp, whose threads wait
+        here. On a CPU, return the value.
+        """
         return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
 
     def thread(self) -> tuple[Value, Value]:
-        """Return the number of a thread of a GPU, and how many there are."""
+        """Return the index of a GPU thread and the number of threads."""
         block, size, own, blocks = (
             self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64") for name in ("ctaid", "ntid", "tid", "nctaid")
         )
         return block * size + own, blocks * size
 
     def any(self, a: Value) -> Value:
-        """Return whether a truth value holds in any lane."""
+        """Return whether a boolean holds in any lane."""
         return self.external(f"llvm.vector.reduce.or.v{self.lanes}i1", "i1", a)
 
     # memory
 
     def constants(self, name: str, numbers: Iterable, type: str = "double") -> Value:
-        """Return numbers that stand in the module."""
+        """Return a pointer to constants in the module."""
         texts = [f"{type} {self.literal(x, type).name}" for x in numbers]
         self._declared[name] = f"@{name} = internal constant [{len(texts)} x {type}] [{', '.join(texts)}]"
         return Value(self, "ptr", f"@{name}")
 
     def room(self, count: int = 1, type: str = "") -> Value:
-        """Return memory for some values (by default one per lane), one piece per call of the function."""
+        """Allocate stack memory for `count` values (by default one vector of lanes each),
+        once per call of the function.
+        """
         self._count += 1
         type = type or self.real
         self._lines.insert(self._entry, f"  %v{self._count} = alloca {type}, i64 {count}, align 64")
         return Value(self, "ptr", f"%v{self._count}")
 
     def at(self, pointer: Value, index, type: str = "") -> Value:
-        """Return the place of the value with this index."""
+        """Return a pointer to the value with this index."""
         type = type or self.real
         return self.instruction("ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}")
 
     def load(self, pointer: Value, index=0, type: str = "") -> Value:
-        """Return the value in memory."""
+        """Return a value from memory."""
         type = type or self.real
         place = self.at(pointer, index, type).name
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, so that it needs no register; on a GPU, the value itself."""
+        """Return a value reloaded from memory, so that it occupies no register; on a GPU, the value itself.
+        """
         if self.device:
             return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Return pointers to rows of memory, each in its own register; LLVM uses offsets for nearby rows."""
+        """Return pointers to rows of memory, each in its own register, from which LLVM
+        reaches nearby rows by offsets.
+        """
         assert not self.device
         found, place = [], self.room(type="ptr")
         for row in rows:
@@ -341,7 +351,7 @@ class Writer:
         return found
 
     def counted_up(self, pointer: Value, index) -> Value:
-        """Increment a whole number in memory and return it; several threads may do so at once."""
+        """Atomically increment an integer in memory and return its old value."""
         return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
 
     def store(self, value, pointer: Value, index=0) -> Value:
@@ -353,7 +363,7 @@ class Writer:
 
 
 def _inlined(text: str) -> str:
-    """Return a module with small functions and those called once inlined; others are `noinline`."""
+    """Return a module that inlines small functions and those called once, and marks all others `noinline`."""
     parts = {found[1]: found[0] for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)}
     calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
     sizes: dict[str, int] = {}
@@ -368,7 +378,7 @@ def _inlined(text: str) -> str:
         return sizes[name]
 
     def is_small(name: str) -> bool:
-        # 10_000 lines of a function times its calls, up to which it is written out at these on a GPU
+        # inline a function on a GPU up to 10_000 lines in total
         return sites(name) == 1 or sites(name) * size(name) <= 10_000
 
     for name, part in parts.items():

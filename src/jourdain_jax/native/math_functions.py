@@ -1,5 +1,5 @@
-"""Functions of vectors of doubles by their names in `calculus/scalar_operations.py`: exponentials, logarithms
-and powers.
+"""Exponentials, logarithms, powers and hyperbolic functions of vectors of doubles, named as in
+`calculus/scalar_operations.py`.
 
     e^x = 2^k (1 + p),  k = round(x/ln 2),  p = r + r^2 P(r),  r = x - k ln 2
     log x = k ln 2 + log m,  sqrt(1/2) < m < sqrt(2),  log m = 2 s (1 + z/3 + z^2/5 + z^3 P(z)),  s = (m - 1)/(m + 1),  z = s^2
@@ -7,8 +7,8 @@ and powers.
     tanh x = -d/(2 + d),  d = e^(-2x) - 1
     sinh x = (d + d/(1 + d))/2,  d = e^x - 1;   cosh x = (e^x + e^-x)/2;   1/(1 + e^-x) = e^x/(1 + e^x)
 
-p and log x come in two parts, the second to some 70 bits below the first's leading one, as powers need. The polynomials P are mpmath's `chebyfit` of 11 and 7
-terms; a test finds them again. Errors are below 0.9 ulp.
+p and log x are in two parts with about 70 bits in all, as powers need. The polynomials P have 11 and 7 terms
+of mpmath's `chebyfit`, which a test reproduces. Errors are below 0.9 ulp.
 """
 
 import math
@@ -21,7 +21,7 @@ from jourdain_jax.native import angles
 from jourdain_jax.native.angles import WHOLE, polynomial, product_less, quotient, two_product, two_sum
 from jourdain_jax.native.ir import Value, Writer
 
-DoubleDouble = tuple[Value, Value]  # head and rest
+DoubleDouble = tuple[Value, Value]  # head and low part
 
 _LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # the first has 32 bits
 _THIRD = (1 / 3, 1.850371707708594e-17)
@@ -58,20 +58,20 @@ def _power_of_two(w: Writer, k: Value) -> Value:
 
 
 def _scaled(w: Writer, x: Value, k: Value) -> Value:
-    """Return 2^k x, by two factors, neither of which overflows."""
+    """Return 2^k x by two factors that do not overflow."""
     half = w.binary("ashr", k, 1)
     return x * _power_of_two(w, half) * _power_of_two(w, k - half)
 
 
 def _within(w: Writer, x: Value, low: float, high: float) -> Value:
-    """The number between the bounds that is nearest to x; NaN stays."""
+    """Clip x to the bounds; NaN stays."""
     x = w.where(x < low, low, x)
     return w.where(x > high, high, x)
 
 
 def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Value, Value]:
-    """Return k and p, the latter in two parts, for e^(x + more) = 2^k (1 + p); |x| < 2000, and `more` is
-    small relative to it.
+    """Return k and p, the latter in two parts, for e^(x + more) = 2^k (1 + p); |x| < 2000, and
+    `more` is small relative to it.
     """
     shifted = w.fma(x, 1 / math.log(2.0), WHOLE)
     turns, k = shifted - WHOLE, w.converted("bitcast", shifted, w.whole) - _bits(WHOLE)
@@ -83,19 +83,19 @@ def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Va
 
 
 def _exponential(w: Writer, x: Value, more: Value | float = 0.0) -> Value:
-    """e^(x + more)"""
+    """Return e^(x + more)."""
     k, p, rest = _less_one(w, x, more)
     head, less = two_sum(1.0, p)
     return _scaled(w, head + (less + rest), k)
 
 
 def exponential(w: Writer, x: Value) -> Value:
-    """e^x"""
+    """Return e^x."""
     return _exponential(w, _within(w, x, -800.0, 800.0))
 
 
 def _mantissa(w: Writer, x: Value) -> DoubleDouble:
-    """Return k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for an x that is positive and finite."""
+    """Return k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for positive finite x."""
     small = x < 2.0**-1022
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
     biased = w.binary("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
@@ -105,7 +105,7 @@ def _mantissa(w: Writer, x: Value) -> DoubleDouble:
 
 
 def _logarithm(w: Writer, x: Value) -> DoubleDouble:
-    """log x in two parts, for x >= 0 or none."""
+    """Return log x in two parts, for x >= 0 or NaN."""
     k, m = _mantissa(w, x)
     f, d = m - 1.0, 1.0 + m
     s, over = quotient(w, (f, w.number(0.0)), (d, (1.0 - d) + m))
@@ -127,7 +127,7 @@ def _logarithm(w: Writer, x: Value) -> DoubleDouble:
 
 
 def logarithm(w: Writer, x: Value) -> Value:
-    """log x"""
+    """Return log x."""
     k, m = _mantissa(w, x)
     f = m - 1.0
     s = f / (f + 2.0)
@@ -142,8 +142,8 @@ def logarithm(w: Writer, x: Value) -> Value:
 
 
 def _logarithm_of_more(w: Writer, x: Value, more: Value | float = 0.0, plus: Value | float = 0.0) -> Value:
-    """Return log(1 + x + more) + plus, where `more` is small relative to x, and `plus` is at most as large as
-    the logarithm.
+    """Return log(1 + x + more) + plus, where `more` is small relative to x, and `plus` is at
+    most as large as the logarithm.
     """
     near = 1.0 + x
     head, less = _logarithm(w, near)
@@ -153,12 +153,12 @@ def _logarithm_of_more(w: Writer, x: Value, more: Value | float = 0.0, plus: Val
 
 
 def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
-    """log(1 + x)"""
+    """Return log(1 + x)."""
     return w.where(w.magnitude(x) < 2.0**-54, x, _logarithm_of_more(w, x))
 
 
 def _sum(w: Writer, a: Value, b: Value | float) -> DoubleDouble:
-    """Return a + b, both non-negative, in either order of size."""
+    """Return a + b exactly, for non-negative a and b in either order of size."""
     return two_sum(w.larger(a, w.literal(b, a.type)), w.smaller(a, w.literal(b, a.type)))
 
 
@@ -168,7 +168,7 @@ def _root(w: Writer, head: Value, less: Value) -> DoubleDouble:
 
 
 def _logarithm_with(w: Writer, a: Value, x: Value, more: Value) -> Value:
-    """log(1 + x + more), which is log 2a where a is large"""
+    """Return log(1 + x + more), or log 2a if a is large."""
     large = a > 2.0**30
     return _logarithm_of_more(w, w.where(large, a - 1.0, x), w.where(large, 0.0, more), w.where(large, math.log(2.0), w.number(0.0)))
 
@@ -194,20 +194,20 @@ def hyperbolic_arccosine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_arctangent(w: Writer, x: Value) -> Value:
-    """atanh x = log(1 + 2a/(1 - a))/2, where a = |x|"""
+    """Return atanh x = log(1 + 2a/(1 - a))/2, where a = |x|."""
     a = w.magnitude(x)
     q, over = quotient(w, (a + a, w.number(0.0)), two_sum(1.0, -a))
     return w.where(a < 2.0**-28, x, w.intrinsic("copysign", 0.5 * _logarithm_of_more(w, q, -over), x))
 
 
 def cube_root(w: Writer, x: Value) -> Value:
-    """x^(1/3)"""
+    """Return x^(1/3)."""
     return w.intrinsic("copysign", _raised(w, w.magnitude(x), w.number(_THIRD[0]), _THIRD[1]), x)
 
 
 def remainder(w: Writer, x: Value, y: Value) -> Value:
-    """Return the remainder of x after whole multiples of y towards zero, without round-off: 50 bits of the
-    quotient at a time.
+    """Return the remainder of x for division by y rounded towards zero, without round-off: 50
+    bits of the quotient at a time.
     """
     a, b = w.room(), w.magnitude(y)
     w.store(w.magnitude(x), a)
@@ -224,22 +224,22 @@ def remainder(w: Writer, x: Value, y: Value) -> Value:
 
 
 def half_power(w: Writer, x: Value) -> Value:
-    """x^(1/2): unlike the root, infinite for -inf and 0 for -0."""
+    """Return x^(1/2); unlike the square root, it is infinite for -inf and 0 for -0."""
     return w.where(x.equals(-math.inf), math.inf, w.root(x) + 0.0)
 
 
 def three_halves_power(w: Writer, x: Value) -> Value:
-    """x^(3/2) = x sqrt(x), right to the last digit: forces of contacts, by Hertz."""
+    """Return x^(3/2) = x sqrt(x), correctly rounded, for Hertz contact forces."""
     root = w.root(x)
     head = x * root
     # x (root - sqrt(x)) = x (root^2 - x)/(root + sqrt(x)) = root (root^2 - x)/2
     rest = product_less(w, x, root, head) - 0.5 * root * product_less(w, root, root, x)
-    # far away a rest is too small or too large
+    # otherwise the low part over- or underflows
     return w.where((x < 2.0**650) & (x > 2.0**-600), head + rest, w.where(x.equals(-math.inf), math.inf, head))
 
 
 def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
-    """a^(exponent + more), for an a that is not negative."""
+    """Return a^(exponent + more) for a >= 0."""
     log, less = _logarithm(w, a)
     head = exponent * log
     rest = w.fma(exponent, less, product_less(w, exponent, log, head)) + more * log
@@ -247,7 +247,7 @@ def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
 
 
 def real_power(w: Writer, x: Value, y: Value) -> Value:
-    """x^y"""
+    """Return x^y."""
     found = _raised(w, w.magnitude(x), _within(w, y, -(2.0**100), 2.0**100))
     whole, half = w.intrinsic("roundeven", y).equals(y), 0.5 * y
     odd = whole & w.intrinsic("roundeven", half).differs(half)
@@ -257,17 +257,17 @@ def real_power(w: Writer, x: Value, y: Value) -> Value:
 
 
 def exponential_of_base_two(w: Writer, x: Value) -> Value:
-    """2^x"""
+    """Return 2^x."""
     return real_power(w, w.number(2.0), x)
 
 
 def power(w: Writer, x: Value, exponent: float) -> Value:
-    """x^exponent for x > 0, to some 1e-14: for the control of steps."""
+    """Return x^exponent for x > 0, to about 1e-14, for step-size control."""
     return exponential(w, logarithm(w, x) * exponent)
 
 
 def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
-    """(e^x - 1)/4"""
+    """Return (e^x - 1)/4."""
     k, p, rest = _less_one(w, x)
     quarter = _power_of_two(w, k - 2)
     most, more = two_sum(quarter, w.number(-0.25))
@@ -276,19 +276,19 @@ def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
 
 
 def _plus(a: float, head: Value, rest: Value) -> DoubleDouble:
-    """Return a + (head + rest). Either |a| is at least |head|, or the sum is far larger than a."""
+    """Return a + (head + rest), if |a| >= |head| or the sum is far larger than a."""
     total, less = two_sum(a, head)
     return total, less + rest
 
 
 def exponential_less_one(w: Writer, x: Value) -> Value:
-    """e^x - 1"""
+    """Return e^x - 1."""
     head, less = _quarter_less_one(w, _within(w, x, -50.0, 710.0))
     return w.where(w.magnitude(x) < 2.0**-54, x, 4.0 * (head + less))
 
 
 def hyperbolic_sine(w: Writer, x: Value) -> Value:
-    """sinh x"""
+    """Return sinh x."""
     a = w.magnitude(x)
     head, less = _quarter_less_one(w, _within(w, a, 0.0, 710.5))
     q, over = quotient(w, (head, less), _plus(0.25, head, less))  # d/(1 + d)
@@ -297,7 +297,7 @@ def hyperbolic_sine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_cosine(w: Writer, x: Value) -> Value:
-    """cosh x"""
+    """Return cosh x."""
     k, p, rest = _less_one(w, _within(w, w.magnitude(x), 0.0, 710.5))
     head, less = two_sum(1.0, p)
     quarter = _power_of_two(w, k - 2)
@@ -305,7 +305,7 @@ def hyperbolic_cosine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_tangent(w: Writer, x: Value) -> Value:
-    """tanh x"""
+    """Return tanh x."""
     a = w.magnitude(x)
     k, p, rest = _less_one(w, _within(w, -2.0 * a, -44.0, 0.0))
     scale = _power_of_two(w, k)
@@ -317,7 +317,7 @@ def hyperbolic_tangent(w: Writer, x: Value) -> Value:
 
 
 def logistic(w: Writer, x: Value) -> Value:
-    """1/(1 + e^-x)"""
+    """Return 1/(1 + e^-x)."""
     k, p, rest = _less_one(w, _within(w, -w.magnitude(x), -800.0, 0.0))
     head, less = two_sum(1.0, p)
     head, less = _scaled(w, head, k), _scaled(w, less + rest, k)
@@ -327,7 +327,7 @@ def logistic(w: Writer, x: Value) -> Value:
 
 
 def _sign(w: Writer, x: Value) -> Value:
-    return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0 * x))  # NaN stays; what compares as zero is zero
+    return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0 * x))  # NaN stays; -0 counts as zero
 
 
 _BY_INSTRUCTIONS: dict[str, Callable[..., Value]] = {

@@ -1,9 +1,7 @@
-"""NVIDIA GPUs: the driver, PTX from LLVM, and compiled kernels. No toolkit is needed; calls go to `libcuda`
-by ctypes.
+"""NVIDIA GPUs: driver calls, PTX from LLVM, and loaded kernels. Only `libcuda` is needed, called by ctypes.
 
-A kernel is loaded for all devices at once (`cuLibraryLoadData`, of CUDA 12), and the driver compiles it for
-each where it is first used; it keeps compiled
-code between processes.
+A kernel is loaded for all devices at once (`cuLibraryLoadData`, CUDA 12). The driver compiles it for each
+device on first use and caches the code between processes.
 """
 
 import ctypes
@@ -33,77 +31,76 @@ _CALLED = (
 
 
 class Loaded(NamedTuple):
-    """A kernel, and the resources of its threads."""
+    """Loaded kernel and the resources of its threads."""
 
     function: int
-    local: int  # bytes of memory
+    local: int  # bytes of local memory
     registers: int
 
 
 def driver() -> ctypes.CDLL:
-    """Return the library of the driver."""
+    """Return the driver library."""
     return ctypes.CDLL("libcuda.so.1")
 
 
 @functools.cache
 def reason_against() -> str:
-    """Return the reason why no machine code for GPUs is made here; empty if it is."""
+    """Return why machine code for GPUs is not available; empty if it is."""
     if reason := host.reason_against() or reason_against_text():
         return reason
     try:
         library = driver()
     except OSError as error:
-        return f"NVIDIA's driver is not there ({error})"
+        return f"NVIDIA's driver was not found ({error})"
     if missing := [name for name in _CALLED if not hasattr(library, name)]:
-        return f"NVIDIA's driver is older than CUDA 12 (it has no {missing[0]})"
+        return f"NVIDIA's driver is older than CUDA 12 (it lacks {missing[0]})"
     try:
         _checked(library.cuInit(0))
         if not _devices():
-            return "NVIDIA's driver knows of no GPU"
+            return "NVIDIA's driver finds no GPU"
     except RuntimeError as error:
         return str(error)
-    return "" if _capabilities() else "it is made for NVIDIA GPUs of compute capability 7.5 and newer ones"
+    return "" if _capabilities() else "it requires an NVIDIA GPU of compute capability 7.5 or newer"
 
 
 def reason_against_text() -> str:
-    """Return the reason why LLVM writes no PTX; empty if it does."""
+    """Return why LLVM cannot write PTX; empty if it can."""
     try:
         host.llvm.initialize_all_targets()
         host.llvm.initialize_all_asmprinters()
         host.llvm.Target.from_triple(TRIPLE)
     except Exception as error:
-        return f"LLVM of llvmlite writes nothing for NVIDIA GPUs ({str(error).splitlines()[0]})"
+        return f"llvmlite's LLVM cannot compile for NVIDIA GPUs ({str(error).splitlines()[0]})"
     return ""
 
 
 def _checked(code: int) -> None:
-    """Raise the driver's error, if there is one."""
+    """Raise the driver's error, if any."""
     if code:
         text = ctypes.c_char_p()
         driver().cuGetErrorString(code, ctypes.byref(text))
-        raise RuntimeError(f"NVIDIA's driver says: {(text.value or b'error %d' % code).decode()}")
+        raise RuntimeError(f"NVIDIA's driver reports: {(text.value or b'error %d' % code).decode()}")
 
 
 def _said(function: str, *what, found=ctypes.c_int) -> int:
-    """Return the number that the driver stores at the place to which the first argument of a function points.
-    """
+    """Return the number that a driver function stores through its first argument, a pointer."""
     number = found()
     _checked(getattr(driver(), function)(ctypes.byref(number), *what))
     return number.value
 
 
 def _devices() -> range:
-    return range(_said("cuDeviceGetCount"))  # their handles are their numbers
+    return range(_said("cuDeviceGetCount"))  # handles equal indices
 
 
 def _of_device(attribute: int) -> int:
-    """Return the least of all devices."""
+    """Return the smallest value of an attribute over all devices."""
     return min(_said("cuDeviceGetAttribute", attribute, device) for device in _devices())
 
 
 def _capabilities() -> list[int]:
-    """Return ten times the compute capability for which to compile. All present devices accept it, since a
-    GPU runs the code of older ones.
+    """Return the supported compute capabilities, times ten. All devices run code for them, because a
+    GPU runs code for older ones.
     """
     major, minor = 75, 76  # attributes of a device
     own = [10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device) for device in _devices()]
@@ -111,7 +108,7 @@ def _capabilities() -> list[int]:
 
 
 def memory() -> int:
-    """Bytes of the smallest device."""
+    """Return the bytes of memory of the smallest device."""
     return min(_said("cuDeviceTotalMem_v2", device, found=ctypes.c_size_t) for device in _devices())
 
 
@@ -121,12 +118,12 @@ def architecture() -> str:
 
 
 def text_for(module: str, architecture: str) -> str:
-    """PTX of a module of LLVM IR."""
+    """Return the PTX of a module of LLVM IR."""
     llvm = host.llvm
     machine = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=architecture, opt=3)
     parsed = llvm.parse_assembly(module)
     parsed.triple, parsed.data_layout = TRIPLE, str(machine.target_data)
-    for _ in range(2):  # loops that the first pass has unrolled no longer keep numbers in memory
+    for _ in range(2):  # after the first pass has unrolled loops, the second keeps their values in registers
         options = llvm.create_pipeline_tuning_options(speed_level=3)
         options.loop_vectorization = options.slp_vectorization = False
         builder = llvm.create_pass_builder(machine, options)
@@ -136,7 +133,7 @@ def text_for(module: str, architecture: str) -> str:
 
 @contextmanager
 def _in_context() -> Iterator[None]:
-    """Run the code inside in this process's context of the first device, which JAX shares."""
+    """Run the enclosed code in this process's context of the first device, which JAX shares."""
     context = ctypes.c_void_p()
     _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
     _checked(driver().cuCtxPushCurrent_v2(context))
@@ -157,11 +154,11 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for these `lanes`. It is as large as registers allow while local memory
-    stays in the first cache, unless that is too few.
+    """Return the number of warps for these `lanes`: as many as registers allow while local memory fits the
+    first-level cache, but at least four per multiprocessor.
     """
-    # attributes of a device: 82 its registers, 81 what of its cache can be shared memory, 16 its multiprocessors
+    # attributes of a device: 82 its registers, 81 cache usable as shared memory, 16 its multiprocessors
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(81) // max(1, WARP * kernel.local)
-    # 4 of a multiprocessor: one for each of its parts
+    # one for each of the four parts of a multiprocessor
     return min(-(lanes // -WARP), _of_device(16) * min(by_registers, WARP, max(by_cache, 4)))

@@ -1,10 +1,12 @@
-"""A graph of scalars as LLVM IR: one vector per node, one lane per motion.
+"""LLVM IR of a graph of scalars: one vector per node, one lane per motion.
 
-A product that only one sum or difference uses is fused with it. Truth values are vectors of bits; where one meets a number it counts as 0 or 1.
+A product used by only one sum or difference is fused with it. Booleans are vectors of bits; in
+arithmetic they count as 0 or 1.
 
-Of a long calculation it is decided here which values are in registers, and which wait in memory. Where a register is wanted, the value whose next use is the
-furthest away gives up its own (L. A. Belady, IBM Systems Journal 5 (1966) 78). The cotangents of a bicycle's rates take 54 kB of code so, and 73 kB by LLVM's
-choice. Code that is longer than the first cache of instructions (32 kB) costs time by its length.
+For long functions, register allocation is decided here. When a register is needed, the value with the
+furthest next use is spilled (L. A. Belady, IBM Systems Journal 5 (1966) 78). The cotangents of a
+bicycle's rates then take 54 kB of code instead of 73 kB. Code that exceeds the first-level instruction
+cache (32 kB) runs more slowly.
 """
 
 import heapq
@@ -22,25 +24,24 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 @dataclass
 class Turn:
-    """The values to load before a value is computed, and the values to store after it, each with its place.
-    """
+    """Values to load before a value is computed, and values to store after it with their memory slots."""
 
     loaded: list[int]
     stored: list[tuple[int, int]] = field(default_factory=list)
 
 
 def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int) -> tuple[list[Turn], int]:
-    """Return the loads and stores (a `Turn`) for each computed value, and the number of places in memory.
+    """Return the loads and stores (a `Turn`) for each computed value, and the number of memory slots.
 
-    `uses`: the values in order, each with its operands; `there`: values that are already in memory. A place
-    is reused once its value is no longer needed.
+    `uses`: the values in order, each with its operands; `there`: values that are already in memory. A slot is
+    reused once its value is no longer needed.
     """
     made_of = [tuple(dict.fromkeys(values)) for _, values in uses]
     coming: dict[int, list[int]] = {}
     for i in reversed(range(len(uses))):
         for value in made_of[i]:
             coming.setdefault(value, []).append(i)
-    held: dict[int, int] = {}  # value in a register -> when it is used next
+    held: dict[int, int] = {}  # value in a register -> its next use
     places: dict[int, int] = {}
     free: list[int] = []
     found, count = [], 0
@@ -69,28 +70,29 @@ def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], reg
     return found, count
 
 
-# Operations of a function in which it is decided here, and not by LLVM, which values are in registers. Measured: between 100 and 500 it makes no difference;
-# rates of a bicycle (2,115) take 10 % less time than by LLVM's choice, their cotangents 25 %.
+# Number of operations above which registers are allocated here instead of by LLVM. Measured: between 100
+# and 500 it makes no difference; rates of a bicycle (2,115) take 10 % less time than with LLVM's
+# allocation, their cotangents 25 %.
 LONG = 200
-REACH = 128  # rows on either side of a pointer to which an instruction with wide registers gets by one byte
+REACH = 128  # a one-byte displacement reaches this many rows on either side of a pointer, with wide registers
 
 _TRUTHS = {"and": "and", "or": "or"}
 
 
 def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
-    """Return why the nodes cannot be written as machine code; empty where they can."""
+    """Return why the nodes cannot be compiled to machine code; empty if they can."""
     known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "sin", "cos", "not", "select", "const", "input"}
     for node in graph.reachable(nodes):
         if graph.op[node] in ARRAYS or graph.op[node] == "entry":
-            return "a part of it is kept as a call of JAX"
+            return "a part of it is kept as a JAX call"
         if graph.op[node] not in known:
-            return f"`{graph.op[node]}` is none of its operations"
+            return f"the operation `{graph.op[node]}` is not supported"
     return ""
 
 
 def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
-    """Return values of the outputs, from inputs and from nodes computed before. `by_llvm`: whether LLVM
-    allocates the registers.
+    """Return the values of the outputs, given inputs and known nodes. `by_llvm`: let
+    LLVM allocate the registers.
     """
     return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]
 
@@ -98,8 +100,8 @@ def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int,
 def written_in_turn(
     w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
 ) -> Iterator[tuple[int, Value]]:
-    """Yield index and value of each output as soon as it is computed, so that its use is written next. Known
-    values stay in memory.
+    """Yield index and value of each output as soon as it is computed, so that the caller can use it at once.
+    Known values stay in memory.
     """
     numbers: dict[int, list[int]] = {}
     for number, node in enumerate(outputs):
@@ -127,8 +129,7 @@ def written_in_turn(
 
 
 class _AtHand:
-    """Keeps values of a long function in memory until their next use, and loads them from there, as `turns`
-    decides.
+    """Spills values of a long function to memory and reloads them before their next use, as `turns` decides.
     """
 
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
@@ -139,7 +140,7 @@ class _AtHand:
             self.rooms = w.opaque(w.room(max(rows, 1)), range(REACH, rows + REACH, 2 * REACH))
 
     def before(self, i: int) -> None:
-        """Load the operands of the value with this number."""
+        """Reload the operands of value i."""
         for node in self.turns[i].loaded if self.turns else ():
             self.values[node] = self.w.again(self.places[node])
 
@@ -154,7 +155,7 @@ class _AtHand:
 
 
 def as_real(w: Writer, a: Value) -> Value:
-    """Return a truth value as 0 or 1."""
+    """Return a boolean as 0 or 1."""
     return w.converted("uitofp", a, w.real) if a.type == w.truth else a
 
 
@@ -182,7 +183,7 @@ def _made_of(graph: Graph, node: int, fusible: set[int]) -> list[int]:
 
 
 def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[int]) -> set[int]:
-    """Products that one sum or difference uses, and nothing else."""
+    """Return the products that one sum or difference uses, and nothing else."""
     users: dict[int, list[Any]] = {n: [""] for n in outputs}
     products = set()
     for node in nodes:
@@ -194,8 +195,8 @@ def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[in
 
 
 def _fused(w: Writer, graph: Graph, op: str, args: tuple[int, ...], fusible: set[int], values: Mapping[int, Value]) -> Value:
-    """Return x y + b, b - x y or x y - b as a fused multiply-add. If both terms are products, the first one
-    is fused.
+    """Return x y + b, b - x y or x y - b as a fused multiply-add. If both terms are
+    products, the first one is fused.
     """
     which = 0 if args[0] in fusible else 1
     x, y = (as_real(w, values[a]) for a in graph.args[args[which]])
