@@ -145,8 +145,8 @@ OPTIONS |= {
 }
 
 SOLVERS = {
-    "jj.ImplicitMidpoint(step=0.0)": "`step` of `ImplicitMidpoint` is 0, expected a positive finite length of steps in s",
-    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": "whose steps are at most its `step`: give jj.ImplicitMidpoint(step=",
+    "jj.ImplicitMidpoint(step=0.0)": "`step` of `ImplicitMidpoint` is 0, expected a positive finite length in s",
+    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": "; set its step with jj.ImplicitMidpoint(step=",
     "jj.DiscreteLagrangeDAlembert('midpiont', step=0.1)": "unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
     "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), formulation=jj.Formulation('minimal'))": "leave the `state` of its `Formulation`",
     "jj.simulate(model('free-rigid-body'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": (
@@ -154,8 +154,8 @@ SOLVERS = {
     ),
     "jj.simulate(model('isokinetic-particle'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": "its constraints are nonlinear in the speeds",
     "jj.simulate(DrivenPendulum(), solver=jj.DiscreteGradient(step=0.1))": "does not apply to `DrivenPendulum`: its T + V is not constant",
-    "jj.simulate(model('double-pendulum-rods'), solver=jj.DiscreteGradient(step=0.1))": "its geometric rows would have to be projected",
-    "jj.simulate(model('skate'), solver=jj.DiscreteGradient(step=0.1))": "needs the minimal state (`jj.Formulation('minimal')` keeps to the privileged",
+    "jj.simulate(model('double-pendulum-rods'), solver=jj.DiscreteGradient(step=0.1))": "its geometric constraints would need a projection",
+    "jj.simulate(model('skate'), solver=jj.DiscreteGradient(step=0.1))": "needs the minimal state (`jj.Formulation('minimal')` uses the independent",
 }
 
 FITS = {

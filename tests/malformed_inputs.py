@@ -353,10 +353,10 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, max_steps=True)": "`max_steps` is True, expected a whole number of at least 1",
     "jj.simulate(b, {}, t1=1.0, max_step=0.0)": "`max_step` is 0, expected a positive time in s",
     "jj.simulate(b, {}, t1=1.0, max_step=nan)": "`max_step` is nan, expected a positive time in s",
-    "jj.simulate(b, {}, t1=1.0, solver='dopri5')": "`solver` is the text 'dopri5', expected an object of diffrax; write `diffrax.Dopri5()`",
-    "jj.simulate(b, {}, t1=1.0, solver=diffrax.Tsit5)": "`solver` is the class `Tsit5`, expected an object of diffrax; write `diffrax.Tsit5()`",
-    "jj.simulate(b, {}, t1=1.0, solver=jj.RadauIIA)": "`solver` is the class `RadauIIA`, expected an object of diffrax; write `jj.RadauIIA()`",
-    "jj.simulate(b, {}, t1=1.0, solver=diffrax.ForwardMode())": "`solver` is a ForwardMode, expected an object of diffrax",
+    "jj.simulate(b, {}, t1=1.0, solver='dopri5')": "`solver` is the text 'dopri5', expected a solver object; write `diffrax.Dopri5()`",
+    "jj.simulate(b, {}, t1=1.0, solver=diffrax.Tsit5)": "`solver` is the class `Tsit5`, expected a solver object; write `diffrax.Tsit5()`",
+    "jj.simulate(b, {}, t1=1.0, solver=jj.RadauIIA)": "`solver` is the class `RadauIIA`, expected a solver object; write `jj.RadauIIA()`",
+    "jj.simulate(b, {}, t1=1.0, solver=diffrax.ForwardMode())": "`solver` is a ForwardMode, expected a solver object",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation('minimum'))": "unknown state form `minimum`; did you mean `minimal`?",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(None))": "unknown state form `None`; Valid names: `auto`, `minimal`, `full`.",
     "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, formulation=jj.Formulation('minimal'))": (
@@ -390,15 +390,15 @@ MOTIONS: dict[str, Case] = {
 BATCHES: dict[str, Case] = {
     "jj.rollout(Bead)": "`scene` is the class `Bead`",
     "jj.rollout(b, 3.0, t1=0.1)": "`starts` is a float, expected a dictionary by name",
-    "jj.rollout(b, {'x': 1.0}, t1=0.1)": "no lanes: give at least one start value or parameter as an array with one entry per lane",
-    "jj.rollout(b, {'x': []}, t1=0.1)": "no lanes: give at least one start value or parameter",
+    "jj.rollout(b, {'x': 1.0}, t1=0.1)": "no lanes: pass at least one start value or parameter as an array with one entry per lane",
+    "jj.rollout(b, {'x': []}, t1=0.1)": "no lanes: pass at least one start value or parameter",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': object()}, t1=0.1)": (
-        "parameter `mass` is an object, expected real numbers; give an array with one entry per lane; a field that is a module varies by"
+        "parameter `mass` is an object, expected real numbers; pass an array with one entry per lane; to vary a field that is a module"
     ),
     "jj.rollout(b, {'x': ['a', 'b']}, t1=0.1)": "start `x` is a list, expected real numbers",
     "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": "lanes differ in number: start `x` has 2, start `y` has 1; give arrays of one length",
     "jj.rollout(b, {'z': [1.0, 2.0]}, t1=0.1)": "scene `Bead` has no coordinate or speed `z`",
-    "jj.rollout(b, rest, t1=0.1)": "`starts` has no axis of lanes; give an array with one entry per lane",
+    "jj.rollout(b, rest, t1=0.1)": "`starts` has no axis of lanes; pass an array with one entry per lane",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters=[1.0], t1=0.1)": "`parameters` is a list, expected a dictionary by name",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mas': [1.0, 2.0]}, t1=0.1)": "scene `Bead` has no parameter `mas`; did you mean `mass`?",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': 1.0}, t1=0.1)": "parameter `mass` has no axis of lanes",
@@ -408,7 +408,7 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite",
     "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": "`ts` must be finite and strictly increasing",
     "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": "`diagnose` was given a Rollout, expected a `Trajectory`; for a rollout give one",
-    "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": "`solver` is the text 'tsit5', expected an object of diffrax; write `diffrax.Tsit5()`",
+    "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": "`solver` is the text 'tsit5', expected a solver object; write `diffrax.Tsit5()`",
     "lanes_ended({'x_rate': [1.0, nan]})": ("result 8", "the start is not finite; check where its values were computed: lanes 1"),
     "lanes_ended({'x_rate': [1.0, 2.0]}, parameters={'mass': [1.0, -1.0]})": ("result 7", "a parameter is not finite or has the wrong sign (`mass`): lanes 1"),
     "lanes.lane(2)": ("IndexError", "lane 2 does not exist; this rollout has 2 lanes, 0 to 1"),
@@ -440,7 +440,7 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory('run.npz', ChaplyginSleigh)": "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass its class",
     "jj.load_trajectory(rewritten('noq.npz', q=None), Bead)": "`noq.npz` lacks `q`; it is damaged or was not written by `save`",
     "jj.load_trajectory(rewritten('shape.npz', q=ARRAYS['q'][:, :1]), Bead)": (
-        "`shape.npz` has another digest than it states; it is damaged or was not written by `save`"
+        "`shape.npz` does not match its digest; it is damaged or was not written by `save`"
     ),
     "jj.load_trajectory(rewritten('later.npz', format=9), Bead)": (
         "`later.npz` has format 9, expected 1; read it with the version of jourdain-jax that wrote it"
@@ -448,14 +448,14 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory(rewritten('bare.npz', solver=None), Bead)": "`bare.npz` lacks `solver`; it is damaged or was not written by `save`",
     "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": "`headless.npz`: is no trajectory file written by `save` (",
     "jj.load_trajectory(rewritten('broken.npz', header=np.array('{')), Bead)": "`broken.npz`: is no trajectory file written by `save` (Expecting property name",
-    "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": "`listed.npz` has a header that is no dictionary",
-    "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": "`minus.npz` has another digest than it states",
+    "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": "`listed.npz` has an invalid header",
+    "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": "`minus.npz` does not match its digest",
     "jj.save(run, 'nowhere/run.npz')": "cannot write `nowhere/run.npz`: there is no folder `nowhere`; create it first",
     "jj.save(run, '.')": "cannot write `.`: it is a folder; give the name of a file in it",
     "jj.save(run, 3.5)": "`path` is a float, expected the name of a file",
     "jj.save(b, 'b.npz')": "`save` was given a Bead, expected a `Trajectory` from `jj.simulate`",
     "jj.save(lanes.lanes, 'lanes.npz')": (
-        "`save` takes one motion, but was given a batch of shape (2,); for one axis of lanes, save `jj.Rollout(batch)`"
+        "`save` takes one motion, but was given a batch of shape (2,); for one batch axis, save `jj.Rollout(batch)`"
     ),
     "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; for a rollout give one "
     "lane: jj.animate(rollout.lane(0), 'lane-0.gif')",

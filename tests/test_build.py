@@ -64,13 +64,13 @@ def test_what_was_built_stands_wherever_its_scene_does():
 def test_a_model_says_each_choice_with_its_reason():
     sleigh, rods = ChaplyginSleigh(), DoublePendulumRods()
     assert jj.build(sleigh).way == "machine code"
-    assert jj.build(sleigh, backend="xla").way == "XLA: as asked"
+    assert jj.build(sleigh, backend="xla").way == "XLA: as requested"
     dense = jj.build(rods, jj.Formulation("full", reduction="kkt"))
-    assert (dense.state, dense.way) == ("full", "dense matrices: as asked")
-    assert "full: as asked" in str(jj.build(sleigh, jj.Formulation("full")))
-    with pytest.raises(ValueError, match="a reduction"):
+    assert (dense.state, dense.way) == ("full", "dense matrices: as requested")
+    assert "full: as requested" in str(jj.build(sleigh, jj.Formulation("full")))
+    with pytest.raises(ValueError, match="own reduction"):
         jj.build(sleigh, jj.Formulation(reduction="kkt"), backend="xla")
-    with pytest.raises(TypeError, match=r"a model has its own; give it to `jj\.build`"):
+    with pytest.raises(TypeError, match=r"a model has its own; pass it to `jj\.build`"):
         jj.simulate(dense, t1=0.1, backend="dense")
     with pytest.raises(AttributeError, match="`Model`"):
         jj.Built  # noqa: B018
@@ -118,7 +118,7 @@ def crane() -> type[jj.Scene]:
 def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_says_so():
     kind = crane()
     built = [jj.build(kind(*numbers)) for numbers in ((1.0, 1.0), (1.0, 10.0), (10.0, 1.0))]
-    chosen, told = [model.freedoms.privileged for model in built], ["which replace parameters that JAX traces" in str(model) for model in built]
+    chosen, told = [model.freedoms.privileged for model in built], ["which replace parameters traced by JAX" in str(model) for model in built]
     assert told == [privileged != chosen[0] for privileged in chosen]
     assert any(told)
 

@@ -167,15 +167,15 @@ def test_guards_and_smooth_functions_do_not_count():
 
 def test_what_is_not_watched_is_said():
     many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
-    assert "not watched: they are 40, more than 32" in str(motion(many))
+    assert "not monitored: they are 40, more than 32" in str(motion(many))
     hidden = motion(Sliding(law=lambda s, t, x, v: jnp.interp(x, jnp.array([0.6, 0.7, 0.8]), jnp.eye(3)[1])))
-    assert "not watched: the scene keeps parts as calls" in str(hidden)
+    assert "not monitored: the scene keeps parts as calls" in str(hidden)
     assert hidden.crossings == -1
     dense = motion(STRIP, backend="dense")
-    with pytest.warns(UserWarning, match="Heun does not watch the relations .* of `Sliding`.* the default solver does"):
+    with pytest.warns(UserWarning, match="Heun may step over jumps and kinks in loads or events of `Sliding`; omit `solver`"):
         by_diffrax = motion(STRIP, solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)
     assert dense.crossings == int(by_diffrax.crossings) == -1
-    assert "not watched: the scene has no scalar program" in str(dense)
+    assert "not monitored: the scene has no scalar program" in str(dense)
     assert "solvers of diffrax do not" in by_diffrax.unwatched
 
 

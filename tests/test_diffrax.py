@@ -69,5 +69,5 @@ def test_a_state_that_leaves_its_constraints_by_more_than_errors_of_its_steps_is
 
 
 def test_work_is_refused_with_what_integrates_it():
-    with pytest.raises(ValueError, match=r"diffrax.Heun\(\) cannot integrate the work .* of `Oscillator` .* give work=False, or omit `solver`"):
+    with pytest.raises(ValueError, match=r"diffrax.Heun\(\) cannot integrate the work .* of `Oscillator` .* pass work=False or omit `solver`"):
         jj.simulate(Oscillator(), t1=1.0, solver=diffrax.Heun())

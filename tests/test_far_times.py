@@ -74,7 +74,7 @@ def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
     near, far = (jj.simulate(Oscillator(stiffness=1e8, driven=1.0), t0=t0, ts=[t0, t0 + 2.0**-7]) for t0 in (0.0, 1.7e9))
     assert near.warnings == ()
     (text,) = far.warnings
-    assert text.startswith("the clock resolves 2e-07 s at these times, and steps are of ")
+    assert text.startswith("times are resolved to 2e-07 s, steps are ")
 
 
 def test_lanes_far_in_time_are_the_ones_at_zero():

@@ -447,7 +447,7 @@ def test_wrong_events_are_named():
         def velocity_constraints(self, motion):
             return {"edge": jnp.where(motion.modes.side == 0, motion.u.x_rate, motion.u.y_rate)}
 
-    with pytest.raises(ValueError, match="rows of `Row` depend on mode `side`"):
+    with pytest.raises(ValueError, match="constraints of `Row` depend on mode `side`"):
         jj.simulate(Row(), t1=1.0)
     with pytest.raises(ValueError, match="has the values"):
         jj.modes(gear="first")

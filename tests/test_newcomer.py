@@ -50,7 +50,7 @@ def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_sa
     asked = {"start": {"left_rate": 2.0, "right_rate": 3.0, "angle": 1.2}, "t1": 0.1, "ts": jnp.linspace(0.0, 0.1, 3)}
     lifted, right = (str(jj.simulate(kind(), **asked)) for kind in (Whole, page["RobotWithTrailer"]))
     assert "WOULD HAVE TO PULL" in lifted
-    assert "name those that it does in `carried=`" in lifted
+    assert "name those it carries in `carried=`" in lifted
     assert "PULL" not in right
     assert "carried" not in right
 

@@ -102,7 +102,7 @@ def test_a_mechanism_that_moves_where_others_of_its_assemblies_are_stiff_is_not_
     motions = [jj.simulate(scene, t1=1.0, rtol=1e-10, atol=1e-10) for scene in (HangingPlate(), PlateLevel())]
     assert motions[1].warnings == ()
     (warning,) = motions[0].warnings
-    assert "rows have rank 2 on the whole motion, but 3 at generic states" in warning
+    assert "constraints have rank 2 on the whole motion, but 3 at generic states" in warning
     assert_allclose(motions[0].q_end, motions[1].q_end, atol=1e-8)
 
 

@@ -50,7 +50,7 @@ def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
     """The first saved time of the one is not that of the other."""
     starts = [jj.start(ChaplyginSleigh(), t0=t0, x_rate=1.0) for t0 in (0.0, 1.0)]
     lanes = jj.rollout(ChaplyginSleigh(), jax.tree.map(lambda *x: jnp.stack(x), *starts), t1=2.0, progress=False)
-    with pytest.raises(ValueError, match="lanes were saved at different times"):
+    with pytest.raises(ValueError, match="lanes have different saved times"):
         lanes.quantiles("x")
     assert "<img" not in lanes._repr_html_()
 

@@ -70,8 +70,8 @@ def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}), "
-            f"expected {what}") from None
+        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is "
+            f"{content[error.start]:#04x}), expected {what}") from None
     if "\0" in text:
         raise ValueError(f"{path}: a binary file (it contains zero bytes), expected {what}")
     return text

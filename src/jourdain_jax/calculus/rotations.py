@@ -33,8 +33,8 @@ def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _angle(angle: Number) -> Scalar:
-    return checked_real(angle, "angle of a rotation", (), advice="pass one angle in rad; use `jax.vmap` for "
-        "many")
+    return checked_real(angle, "angle of a rotation", (),
+        advice="pass one angle in rad; use `jax.vmap` for many")
 
 
 def _turned(angle: Number, rows: Callable) -> Matrix3:

@@ -15,8 +15,8 @@ DEMO = "Rigid"  # a measured bicycle with all standard errors and a stable speed
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    job = verbs.add_parser("bicycle", help="stability speeds of measured bicycles with uncertainties, and "
-        "simulated rides")
+    job = verbs.add_parser("bicycle",
+        help="stability speeds of measured bicycles with uncertainties, and simulated rides")
     job.add_argument(
         "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements "
             "(*Measured.txt), or names of shipped bicycles"
@@ -31,8 +31,8 @@ def add(verbs) -> None:
 
 def _options(parser, folder: str) -> None:
     parser.add_argument("--out", default=folder, help=f"folder for tables and figures (default: {folder})")
-    parser.add_argument("--samples", type=int, default=2000, help="number of Monte Carlo samples (default "
-        "2000)")
+    parser.add_argument("--samples", type=int, default=2000,
+        help="number of Monte Carlo samples (default 2000)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the Monte Carlo (default 0)")
     parser.add_argument("--no-figures", action="store_true", help="numbers only")
     parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
@@ -47,8 +47,8 @@ def _job(options) -> bool:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"cannot create the folder `{out}`: {error.strerror}; choose another with "
-            "--out") from None
+        raise ValueError(
+            f"cannot create the folder `{out}`: {error.strerror}; choose another with --out") from None
     studies = run(paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr))
     write_results(studies, out / "result.json")
     written = [out / "result.json"]

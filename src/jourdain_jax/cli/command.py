@@ -28,8 +28,8 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="jourdain-jax",
         description="Dynamics of holonomic and nonholonomic mechanical systems.",
-        epilog="exit codes: 0 success; 1 failed check, incomplete motion or rejected file; 2 wrong usage or "
-            "unknown name",
+        epilog="exit codes: 0 success; 1 failed check, incomplete motion or rejected file; 2 "
+            "wrong usage or unknown name",
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version_of('jourdain-jax')}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -64,6 +64,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except OSError as error:
         where = f"`{error.filename}`: " if error.filename else ""
-        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check the path and its "
-            "permissions", file=sys.stderr)
+        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check "
+            "the path and its permissions", file=sys.stderr)
         return USAGE

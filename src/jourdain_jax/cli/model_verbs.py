@@ -24,14 +24,14 @@ from jourdain_jax.scene.scene import Scene
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    listing = verbs.add_parser("models", help="list the models, or describe one: parameters, coordinates, "
-        "speeds, example start")
+    listing = verbs.add_parser("models",
+        help="list the models, or describe one: parameters, coordinates, speeds, example start")
     listing.add_argument("model", nargs="?", help="model to describe (default: list all)")
     listing.add_argument("--json", action="store_true", help="print JSON")
     listing.set_defaults(run=_models)
 
-    about = verbs.add_parser("report", help="degrees of freedom, constraints, integrability, cyclic "
-        "coordinates")
+    about = verbs.add_parser("report",
+        help="degrees of freedom, constraints, integrability, cyclic coordinates")
     _model_options(about)
     about.set_defaults(run=_report)
 
@@ -48,8 +48,8 @@ def add(verbs) -> None:
     running.add_argument("--rtol", type=float, default=1e-8, help="relative tolerance (default 1e-8)")
     running.add_argument("--atol", type=float, default=1e-8, help="absolute tolerance (default 1e-8)")
     running.add_argument("--out", help="write the trajectory to this file (.npz)")
-    running.add_argument("--plot", metavar="FILE", help="write a plot of all coordinates to this file (.png, "
-        ".svg, .pdf)")
+    running.add_argument("--plot", metavar="FILE",
+        help="write a plot of all coordinates to this file (.png, .svg, .pdf)")
     running.add_argument("--animate", metavar="FILE", help="write an animation to this file (.gif)")
     running.set_defaults(run=_simulate)
 
@@ -81,8 +81,8 @@ def _scene(options) -> Scene:
     for name in counts_of(kind):
         if name in values:
             if not values[name].is_integer():
-                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a count, "
-                    "expected a whole number")
+                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a "
+                    "count, expected a whole number")
             values[name] = int(values[name])
     return model(options.model, **values)
 

@@ -54,11 +54,10 @@ def add(verbs) -> None:
     """Add the verb to the parser."""
     sweep = verbs.add_parser("sweep", help="run a study described by a TOML file, or `sweep "
         "status|resume|export|merge FOLDER`")
-    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="TOML file, or one "
-        "of " + ", ".join(ACTIONS) + ", "
-        "followed by folders of studies")
-    sweep.add_argument("--out", help="folder of the study (created or continued); for `export`, the .nc file "
-        "to write")
+    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER",
+        help="TOML file, or one of " + ", ".join(ACTIONS) + ", followed by folders of studies")
+    sweep.add_argument("--out",
+        help="folder of the study (created or continued); for `export`, the .nc file to write")
     sweep.add_argument("--workers", type=int, default=1, help="number of worker processes (default 1)")
     sweep.add_argument("--memory", help="total memory, such as 2GB")
     sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute only the K-th of N shares; "
@@ -78,8 +77,8 @@ def _sweep(options) -> bool:
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
-        raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a "
-            "study")
+        raise ValueError(
+            f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
@@ -100,8 +99,8 @@ def _run(text: str, source: str, out: str, options) -> bool:
         asked_here = {"processes": options.workers, "shard": _shard(options.shard), "progress": not options.quiet}
         found = study.run(out, command=text, **asked_here, **how)
     except KeyboardInterrupt as stopped:
-        print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume "
-            f"{out}", file=sys.stderr)
+        print(
+            f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
         return False
     except (RuntimeError, MemoryError) as error:
         if isinstance(error, InUseError):
@@ -118,8 +117,8 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
     check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):
-            raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with "
-                "entries below it")
+            raise ValueError(
+                f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
     known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
     check_names(asked.get("options", {}), known_options, "`{}` is not an entry of [options]")
     if "model" not in asked:
@@ -138,8 +137,8 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
 def _varying(name: str, how):
     kinds = (*VARYING, "levels", "table")
     if not isinstance(how, Mapping) or len(how) != 1:
-        raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = "
-            "[1.0, 0.1] }")
+        raise ValueError(
+            f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
     ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
         raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of "

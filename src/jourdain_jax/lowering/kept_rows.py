@@ -29,8 +29,8 @@ class KeptRows:
         """Describe the treatment for the summary."""
         if self.by_partition:
             return "all speeds in the state, accelerations from the independent ones"
-        return "constraints enforced by multipliers" + (", with inertia added along the "
-            "constraints" if self.massless else "")
+        return "constraints enforced by multipliers" + (
+            ", with inertia added along the constraints" if self.massless else "")
 
     def accelerations(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
         """Return the accelerations under all constraints, and the pivots."""

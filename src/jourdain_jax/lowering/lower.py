@@ -95,8 +95,8 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         raise NotLowered("its constraints are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise NotLowered(f"constraints {named} are redundant at all probed states, but not provably "
-            "everywhere")
+        raise NotLowered(
+            f"constraints {named} are redundant at all probed states, but not provably everywhere")
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
     try:
@@ -177,8 +177,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     check_against_dense(scene, structure, builder, best, expected)
     # try further strategies only below 1000 operations
     held, small = ignorable(scene, builder, best, expected), 1000
-    stages = [Stage("scalar program: structural zeros and ones removed, common subexpressions "
-        "shared", fewest)]
+    stages = [Stage(
+        "scalar program: structural zeros and ones removed, common subexpressions shared", fewest)]
     plainly_held = fewest
     # above 4000 operations, fixing ignorable coordinates never yields a small program
     if held and fewest < 4000:

@@ -1,1 +1,1 @@
-"""Motion in time: consistent starts, simulation, batches. The only layer that knows diffrax."""
+"""Motion in time: consistent starts, simulation, batches. No other layer uses diffrax."""

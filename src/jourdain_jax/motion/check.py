@@ -1,9 +1,9 @@
 """Likely mistakes of a scene, in one table: computable, but hardly intended.
 
-smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
-grounds           what the ground of a contact does, and what is stated of it
-bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all that is refused where a motion starts
-scalar program    its rates and slopes against JAX's
+    smoothness        poses, constraints and coordinate rates that jump or have kinks on lines through states of the domain
+    grounds           behaviour of contact grounds against their description
+    bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all conditions checked at the start of a motion
+    scalar program    its rates and slopes against JAX's
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,7 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes; a plausible subject has none. `print`
-    shows a table.
+    """Findings of `check`: subject -> sentences on likely mistakes, none if plausible. `print` shows a table.
     """
 
     scene: str
@@ -29,34 +28,34 @@ class Checked(Printed):
 
     @property
     def passed(self) -> bool:
-        """True where nothing looks wrong."""
+        """Return whether there are no findings."""
         return not any(self.found.values())
 
     def _text(self) -> str:
         rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
-        return "\n".join([f"Check of {self.scene}: "
-            f"{'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
+        return "\n".join([
+            f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
 
 
 @shown_from_users_lines
 @of_known_numbers
 def check(scene: Scene | BuiltFor) -> Checked:
-    """Check a scene for likely mistakes: kinks and jumps, grounds that other bodies carry, impossible bodies,
+    """Check a scene for likely mistakes: kinks and jumps, grounds carried by other bodies, impossible bodies,
     a program that differs from JAX.
 
         print(jj.check(scene))
 
-    It examines some states of the domain; a narrow feature between them is not found. `verify` prints the
-    table, and the first `build` of a class warns with it. When the scene is built or moves, the first finding
-    is raised as an error, except a program that differs (dense matrices replace it) and a moment of inertia
-    above the sum of the others. Raises ValueError where no admissible state is found, or a free motion has no
-    inertia.
+    It examines some states of the domain and may miss a narrow feature between them. `verify` prints
+    the table, and the first `build` of a class warns with it. Building or moving the scene raises the
+    first finding as an error. Exceptions are a program that differs (dense matrices replace it) and a
+    moment of inertia above the sum of the others. Raises ValueError without an admissible state, or if
+    a free motion has no inertia.
     """
     return _checked(as_scene(scene), None)
 
 
 def _checked(scene: Scene, every_speed: bool | None) -> Checked:
-    """Return the table, with the program of one state (`lowered`)."""
+    """Return the table, with the program for one state (as for `lowered`)."""
     known = structure_whatever_its_faults(scene)
     program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene, every_speed)
     found = {
@@ -70,6 +69,6 @@ def _checked(scene: Scene, every_speed: bool | None) -> Checked:
 
 @once_per_class
 def warn_of_mistakes(scene: Scene, every_speed: bool) -> None:
-    """Warn with the table where something looks wrong, once for each class and state."""
+    """Warn with the table if there are findings, once per class and state."""
     if not (found := _checked(scene, every_speed)).passed:
         warn(str(found))

@@ -1,9 +1,10 @@
 """Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates, with its step-size control, events and
 adjoints (`ForwardMode`, `RecursiveCheckpointAdjoint`).
 
-Steps end at the saved times (`step_ts`) and at knots of the inputs (`jump_ts`), and are no longer than `max_step` (`dtmax`). States are put onto the rows where
-they are saved, not after each step; one that has left them by more than errors of its steps explain ends in a result code. A stop event is one that has
-happened at the end of a step, located by the dense output: a value that falls and rises again within a step is none.
+Steps end at the saved times (`step_ts`) and at sample times of the inputs (`jump_ts`), and are no longer than
+`max_step` (`dtmax`). States are projected onto the constraints only where they are saved; a deviation larger
+than step errors explain gives a result code. A stop event counts only if its value is negative at the end of
+a step, and is then located by dense output. A value that falls and rises again within a step is missed.
 """
 
 from functools import partial
@@ -31,7 +32,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class _Rates(eqx.Module):
-    """Rates of coordinates and all speeds, as diffrax takes them."""
+    """Rates of coordinates and all speeds, in the form of a diffrax vector field."""
 
     field: VectorField
     scene: Scene
@@ -46,16 +47,16 @@ class _Rates(eqx.Module):
 
 @shown_from_users_lines
 def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
-    """Return the rates of a scene for `diffrax.diffeqsolve`: of the state (q, u), coordinates and all speeds.
+    """Return the rates of a scene for `diffrax.diffeqsolve`, with the state (q,
+    u): coordinates and all speeds.
 
     Use it for features of diffrax that `simulate` lacks: step-size control, saving, adjoints and events. Only
-    accelerations keep the state on the rows; `jj.consistent` projects states back onto them. `inputs`: as of
-    `simulate`. Differentiable in the scene and its inputs.
+    accelerations keep the state on the constraints; `jj.consistent` projects states back onto them. `inputs`:
+    as for `simulate`. Differentiable in the scene and its inputs.
 
     **Examples**
 
         import diffrax
-
         disc = jj.models.TiltingDisc()
         start = jj.start(disc, lean=0.3, spin_rate=-3.0)
         control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
@@ -71,10 +72,10 @@ def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
 
 
 class Diffrax(eqx.Module, Integrator):
-    """`diffrax.diffeqsolve`."""
+    """Integrator that calls `diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
-    alongside: bool = static()  # as of `OwnSteps`
+    alongside: bool = static()  # as in `OwnSteps`
     max_steps: int = static()
     event_names: tuple[str, ...] = static()
     own: ClassVar[bool] = False
@@ -84,8 +85,8 @@ class Diffrax(eqx.Module, Integrator):
         return type(self.solver).__name__
 
     def reason_against_machine_code(self, setup: Setup) -> str:
-        """It has none."""
-        return "the solver is one of diffrax"
+        """Return why machine code does not apply."""
+        return "the solver is a diffrax solver"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         forward, reverse = (partial(self._solved, adjoint) for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()))
@@ -152,19 +153,19 @@ class Diffrax(eqx.Module, Integrator):
 
 
 def check(setup: Setup) -> None:
-    """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it
-    has relations, which they do not monitor.
+    """Raise ValueError if the scene needs integrated work or continues after events; warn if it has
+    relations. diffrax supports none of these.
     """
     name, solver = type(setup.scene).__name__, setup.integrator.name
     if not all(setup.field.stops):
         raise ValueError(f"solver=diffrax.{solver}() cannot continue after events of `{name}`; omit `solver`")
     if setup.field.with_work:
         raise ValueError(
-            f"solver=diffrax.{solver}() cannot integrate the work of loads of `{name}` without a potential; "
-            "give work=False, or omit `solver`: the default solver integrates it"
+            f"solver=diffrax.{solver}() cannot integrate the work of loads of `{name}` that have no "
+                "potential; pass work=False or omit `solver`"
         )
     if reason_against_watching(setup):
-        text = f"diffrax.{solver} does not watch the relations that loads or events of `{name}` have: it may step over them; the default solver does"
+        text = f"diffrax.{solver} may step over jumps and kinks in loads or events of `{name}`; omit `solver` to end steps there"
         warn(text)
 
 
@@ -176,8 +177,8 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):
-    """Return the lowest value of all stop events. If diffrax had several events and more than one happened in
-    a step, it would take the first in their list, not in time.
+    """Return the lowest value of all stop events. With several events in one step, diffrax would report the
+    first in the list, not in time.
     """
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     return jnp.min(integrands.events(t * direction, y, args))

@@ -1,4 +1,4 @@
-"""The findings of `build`, in words: constraints, freedoms, time dependence, conserved quantities."""
+"""Findings of `build` for display: constraints, degrees of freedom, time dependence, conserved quantities."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,20 @@ from jourdain_jax.scene.names import Labels
 
 @dataclass(frozen=True)
 class Rows:
-    """Which rows hold the scene, and how far they are independent."""
+    """Constraints of the scene and their redundancy."""
 
     names: Labels
     rank: int  # at generic states
-    redundant: Labels  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: Labels  # redundant at every probed state, but by no identity
-    rank_losses: Labels  # probed configurations with fewer independent rows
+    redundant: Labels  # may be omitted together: the others have the same rank at every probed state
+    may_set_in: Labels  # redundant at every probed state, but not provably everywhere
+    rank_losses: Labels  # probed configurations of lower rank
     affine: bool  # linear or affine in the speeds
-    homogeneous: bool  # they hold at rest
+    homogeneous: bool  # satisfied at rest
 
 
 @dataclass(frozen=True)
 class Freedoms:
-    """Which speeds are independent, and how well they determine the others."""
+    """Independent speeds, and how well they determine the others."""
 
     privileged: Labels
     dependent: Labels
@@ -30,7 +30,7 @@ class Freedoms:
 
     @property
     def count(self) -> int:
-        """Degrees of freedom."""
+        """Return the number of degrees of freedom."""
         return len(self.privileged)
 
 
@@ -38,16 +38,16 @@ class Freedoms:
 class Dependence:
     """Explicit dependence on time, and quantities that change along the motion."""
 
-    on_time: Labels  # rows, poses, inertias, coordinate rates, loads, potential
+    on_time: Labels  # constraints, poses, inertias, coordinate rates, loads, potential
     driven: bool  # bodies move while all speeds are zero
     varying_inertia: bool
-    massless: bool  # nothing has inertia along some motion that the rows hold
+    massless: bool  # some motion without inertia is prevented only by constraints
 
 
 @dataclass(frozen=True)
 class Conserved:
     """Conserved quantities of a motion."""
 
-    energy: bool  # kinetic and potential energy together, without integrated work
-    ignorable: Labels  # coordinates that no acceleration depends on; empty where there is no scalar program
+    energy: bool  # sum of kinetic and potential energy; then no work is integrated
+    ignorable: Labels  # coordinates without influence on accelerations; empty without a scalar program
     invariants: Labels  # as the scene states them

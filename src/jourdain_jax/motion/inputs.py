@@ -1,19 +1,20 @@
 """Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
 
-A function of time is traced in every call to which it is given. What it closes over (arrays, traced numbers) and the plain numbers in its sums, products,
-quotients and comparisons become arguments of a program, so that they have derivatives. The remaining operations are compared by value. A new function that
-does the same with other numbers therefore compiles nothing, and a function whose globals have changed is another program.
+A function of time is traced in every call that receives it. Captured values (arrays, traced numbers) and
+plain numbers in sums, products, quotients and comparisons become arguments of a program and have derivatives.
+The remaining operations are compared by value. A new function with the same operations but other numbers
+compiles nothing; a function whose globals changed is a new program.
 
-A step sees an input at a few times only, so that a short feature between them would be lost at any tolerance. `Sampled` inputs are straight lines between
-knots. Where steps end at the knots, each step has a smooth input, and nothing is lost. Knots at which the input hardly bends may be passed: the others are
-chosen so that the straight lines between them are nowhere off by more than
+A step evaluates an input only a few times and could miss a short feature at any tolerance. `Sampled`
+inputs are piecewise linear with knots at their sample times. Steps end at knots, so every step has a smooth
+input. Knots may be skipped where the remaining polygon deviates from them by at most
 
     max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
 
-at the knots in between. They are found one after the other: from the last one, lines to later knots must pass all knots in between within that distance.
+Knots are chosen greedily: lines from one to the next must pass all knots in between within that distance.
 
-A step that ends at a knot has stages there, and so has the step that begins there. Their derivatives with respect to time, and to the times of knots, are
-those of the line within their own step (`SeenFromWithin`): the ends of steps need not move with the knots.
+Both steps at a knot evaluate the input there. Each takes derivatives with respect to time and knot times from
+the line on its own side (`SeenFromWithin`), so step ends need not move with the knots.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -40,11 +41,11 @@ from jourdain_jax.scene.names_read import now_read_by
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import checked_samples
 
-_TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # finite derivatives with respect to a plain number, where it is not zero
+_TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # differentiable in a nonzero number
 
 
 class TimeProgram:
-    """The operations of a function of time, without its numbers; equal if the operations are equal."""
+    """Operations of a function of time without its numbers; equal if the operations are equal."""
 
     def __init__(self, closed: ClosedJaxpr, real):
         taken: list[tuple[Var, Literal]] = []
@@ -60,14 +61,14 @@ class TimeProgram:
         equations = [e.replace(invars=lifted(e.invars)) if e.primitive.name in _TAKE_NUMBERS else e for e in jaxpr.eqns]
         outputs = lifted(jaxpr.outvars)
         arguments = [*(v for v, _ in taken), *jaxpr.constvars, *jaxpr.invars]
-        self.numbers = np.array([number.val for _, number in taken], real)  # of this trace: they do not count in comparisons
+        self.numbers = np.array([number.val for _, number in taken], real)  # not part of comparisons
         self.closed = ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), [])
         self._key = description(self.closed)
         self._hash = hash(self._key)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Return the shapes of the arguments before the time: the plain numbers and the captured values."""
+        """Return the shapes of the arguments before the time: plain numbers and captured values."""
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
@@ -82,12 +83,12 @@ class TimeProgram:
         return self is other or (isinstance(other, TimeProgram) and self._key == other._key)
 
     def does_the_same_as(self, other: "TimeProgram") -> bool:
-        """Return whether both are traces of one known function; rules of differentiation do not count."""
+        """Return whether both are traces of one known function, ignoring derivative rules."""
         return self._key == other._key or _without_rules(self._key) == _without_rules(other._key)
 
 
 def _without_rules(described):
-    """Return a description without the functions that are somebody's rules of differentiation."""
+    """Return a description without custom derivative rules."""
     if not isinstance(described, tuple):
         return described
     if len(described) == 4 and isinstance(described[0], Primitive) and described[0].name.startswith("custom_"):
@@ -98,7 +99,7 @@ def _without_rules(described):
 
 
 class FunctionOfTime(eqx.Module):
-    """An input as a function of time: its operations, their plain numbers, and captured arrays."""
+    """Input as a function of time: its operations, their plain numbers, and captured arrays."""
 
     program: TimeProgram = eqx.field(static=True)
     numbers: Float[Array, "*lanes numbers"]
@@ -116,12 +117,12 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     """
     try:
         kept = _trace(function)
-    except TypeError:  # it cannot be hashed
+    except TypeError:  # not hashable
         kept = _Trace()
     now = (now_read_by(function), real) if kept.again else (None,)
     if now[0] is not None and kept.now == now:
         return kept.found
-    closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))  # of a new function JAX keeps no trace
+    closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))
     found = None
     if getattr(shape, "shape", None) == ():
         program = TimeProgram(closed, real)
@@ -135,7 +136,7 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
 
 
 class _Trace:
-    """The last trace of a function, and the values it read then."""
+    """Last trace of a function, and the values it then read."""
 
     def __init__(self) -> None:
         self.again = False
@@ -155,12 +156,12 @@ def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hash
 
 
 class Sampled(eqx.Module):
-    """An input with `values` at given times `ts` (s, increasing), linear between, constant beyond.
+    """Input with `values` at given times `ts` (s, increasing), linear between, constant beyond.
 
-    Steps end at its knots, so that no feature is missed, however short: a blow of 1 ms in a motion of 10 s
-    has its effect at any tolerance. Knots on a straight line between others, to within a tenth of `rtol` (at
-    most 1e-5) of the range of the values, do not count. Samples of a rough signal cost a step each. Functions
-    of time, by contrast, are evaluated at the times of steps only, even if they interpolate."""
+    Steps end at its knots, so no feature is missed, however short. Knots on a straight line between others
+    are skipped, to within a tenth of `rtol` (at most 1e-5) of the range of values. A rough signal costs a
+    step per sample. Other functions of time are evaluated only at the times of steps.
+    """
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
     values: Float[Array, "samples"] = eqx.field(converter=as_real)
@@ -169,12 +170,12 @@ class Sampled(eqx.Module):
         self.ts, self.values = in_default_precision(checked_samples("Sampled", ts, values, 1, "input"))
 
     def __call__(self, t):
-        """Return value at time t."""
+        """Return the value at time t."""
         return jnp.interp(t, self.ts, self.values)
 
 
 class Constant(eqx.Module):
-    """One value at all times."""
+    """Input with one value at all times."""
 
     value: Float[Array | np.ndarray, "*lanes"]
 
@@ -184,15 +185,15 @@ class Constant(eqx.Module):
 
 
 class Mode(eqx.Module):
-    """A mode: the number of its value at the start, and after each transition."""
+    """Mode: the number of its value at the start, and after each transition."""
 
     value: Float[Array | np.ndarray, ""]
-    ts: Float[Array, "transitions"] | None = None  # s, times the direction of time; infinite after the last one
+    ts: Float[Array, "transitions"] | None = None  # s, times `direction`; infinite after the last one
     values: Float[Array, "transitions"] | None = None
-    direction: Float[Array, ""] | None = None  # 1, or -1 where time runs back
+    direction: Float[Array, ""] | None = None  # 1, or -1 if time runs backwards
 
     def __call__(self, t):
-        """Return the number at time t; at a transition the one after it."""
+        """Return the number at time t; at a transition, the one after it."""
         if self.ts is None or self.values is None:
             return self.value
         passed = jnp.searchsorted(*jax.lax.stop_gradient((self.ts, t * self.direction)), side="right")
@@ -210,12 +211,12 @@ class Inputs(eqx.Module):
 
     @property
     def constant(self) -> bool:
-        """Whether all are numbers."""
+        """Return whether all inputs are constant."""
         return all(isinstance(channel, Constant) for channel in self.channels)
 
     @property
     def programs(self) -> tuple:
-        """Return the operations on time of the channels that are functions."""
+        """Return the programs of the inputs that are functions of time."""
         return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
@@ -226,7 +227,8 @@ class Inputs(eqx.Module):
         except (ValueError, TypeError, NotImplementedError) as error:
             said = str(error).splitlines()[0]
             raise ValueError(
-                f"constraints depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
+                "constraints depend on inputs and need their rates, but one cannot be differentiated "
+                    f"({said}); pass it as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
 
@@ -234,7 +236,7 @@ class Inputs(eqx.Module):
 def in_phases(
     inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
 ) -> Inputs:
-    """Return inputs whose modes change after each transition; those that did not happen are at infinity."""
+    """Return inputs whose modes change at each transition; missing transitions are at infinity."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
@@ -244,7 +246,7 @@ def in_phases(
 
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
-    """Return the vector of inputs at time t, on NumPy or compiled if all is known."""
+    """Return the vector of inputs at time t, in NumPy or compiled if all values are concrete."""
     if inputs.channels and is_traced(inputs, t):
         return inputs(t)
     if inputs.constant:
@@ -256,12 +258,12 @@ _compiled_inputs = for_programs(lambda inputs, t: inputs(t))
 
 
 _NOTHING = object()
-_ZERO = Constant(np.zeros(()))  # made once: a module takes some 20 us
+_ZERO = Constant(np.zeros(()))  # made once, because a module takes some 20 us
 
 
 def _as_channel(f: Callable, where: str) -> Callable:
-    """Return a function of time as a channel. Raises ValueError unless `f` of one time is one number."""
-    advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
+    """Return a function of time as an input channel; ValueError unless `f` maps a time to one number."""
+    advice = "pass a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
         channel, found = traced(f, real_type())
     except TypeError as error:
@@ -273,7 +275,7 @@ def _as_channel(f: Callable, where: str) -> Callable:
     if jnp.issubdtype(found.dtype, jnp.complexfloating):
         raise ValueError(f"{where} returned a number of type {found.dtype}, expected a real number; {advice}")
     leaves = jax.tree.leaves(f)
-    plain = len(leaves) == 1 and leaves[0] is f  # a module may hold arrays to be differentiated, and is kept as it is
+    plain = len(leaves) == 1 and leaves[0] is f  # keep a module, whose arrays may be differentiated
     return channel if plain and channel is not None else f
 
 
@@ -281,7 +283,8 @@ def as_inputs(scene: Scene, given) -> Inputs:
     """Return inputs from name -> number, function of time or `Sampled`; omitted ones are zero."""
     if isinstance(given, Inputs):
         if len(given.channels) != len(scene.inputs):
-            raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has {len(scene.inputs)} inputs; give them by name")
+            raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has "
+                f"{len(scene.inputs)} inputs; pass them by name")
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
@@ -293,11 +296,11 @@ def as_inputs(scene: Scene, given) -> Inputs:
     modes = dict(scene.modes.pairs)
     for name in scene.inputs.entries:
         value = given.get(name, _NOTHING)
-        advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
+        advice = "pass a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
         if name in modes:
             channels.append(Mode(np.asarray(scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type())))
-        elif isinstance(value, Sampled):  # its own numbers are checked where it is made
+        elif isinstance(value, Sampled):  # checked on construction
             channels.append(value)
         elif callable(value):
             channels.append(_as_channel(value, where))
@@ -311,13 +314,14 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
-            raise ValueError(f"rows of `{type(scene).__name__}` depend on mode `{name}`; only loads and potentials may switch")
+            raise ValueError(f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
+                "loads and potentials may switch")
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
     for name, node, channel in zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True):
         if isinstance(channel, Constant | Sampled) or not any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
             continue
-        with jax.ensure_compile_time_eval():  # all is known, also inside a `jit`
+        with jax.ensure_compile_time_eval():  # all values are concrete, also inside a `jit`
             values, ts = uncompiled_lanes(channel), np.linspace(float(t0), float(t1), 257)[:, None]
             for _, _, behind in jumps(lambda t, values=values: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:]):
                 raise ValueError(
@@ -326,17 +330,16 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Return times since `t0` of the knots at which steps must end, of all samples in `holders`, in the order
-    of the motion to `t1` and without the times `ts`; then at least one infinite time. None: no samples.
-    """
+    """Return the knots (times since `t0`) at which steps must end, of all samples in `holders`, in the order
+    of the motion, without the times `ts`, then at least one infinite time. None without samples."""
     samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
     if not samples:
         return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
     direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
-    # so far off the straight lines may be, in parts of the range of values; 1e-12 of the span: times nearer to each other than this are one
+    # tolerance of the polygon relative to the range of values; times nearer than 1e-12 of the span coincide
     share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
-    # which times these are is a number to differentiation, the times are not: steps end where a knot is moved to
+    # the choice of knots has no derivative, but their times do
     since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
     ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))
     number = jax.lax.stop_gradient(since)
@@ -349,15 +352,12 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return the knots at which steps must end. Between them, straight lines differ from the samples by at
-    most `share` of the range of values.
-    """
+    """Return the knots at which steps must end, for lines that differ by at most `share` of the range."""
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
     def next_knot(carry, here):
-        # lines from the anchor: to the knot before, and the slopes between which a line passes all knots since
-        t_a, v_a, t_b, v_b, low, high = carry
+        t_a, v_a, t_b, v_b, low, high = carry  # anchor, last knot, range of slopes that pass all knots since
         t_k, v_k = here
         slope = (v_k - v_a) / (t_k - t_a)
         straight = (slope >= low) & (slope <= high)
@@ -368,21 +368,21 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
 
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
-    # `bent` tells at a knot that steps end at the one before
+    # `bent` at a knot marks the one before as a step end
     return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
 
 
 class SeenFromWithin(eqx.Module):
-    """A sampled input as seen within a step: at a knot it continues the line of this step."""
+    """Sampled input within one step: at a knot it continues the line of this step."""
 
     sampled: Sampled
-    middle: PerLane  # s, of the step; infinite if there is none
+    middle: PerLane  # middle of the step, s; infinite if there is none
 
     def __call__(self, t):
         """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
         ts, values = self.sampled.ts, self.sampled.values
         at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
-        # 2.0**-10 of the way to the middle of a step: so far inside a time at its end lies to see on which side of a knot it is
+        # shift t towards the middle of the step, by 2.0**-10 of the distance, to select the side of a knot
         at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
         k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
         after = jnp.minimum(k + 1, len(ts) - 1)
@@ -391,7 +391,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples as seen within the step around this time (s; infinite: no step)."""
+    """Return `inputs` with samples continued within the step around this time (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

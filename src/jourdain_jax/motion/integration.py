@@ -1,18 +1,20 @@
-"""One motion from start to end as one compiled program, by one of two integrators: our own loop over steps, or diffrax.
+"""One motion from start to end as one compiled program, by this package's loop over steps or by diffrax.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; then
-speeds are computed, and all is put into a
-`Trajectory`.
+Both return the states at the saved times, which of them were reached, and where and why the motion ended.
+Speeds are then computed, and everything is returned as a `Trajectory`.
 
-Two more checks are result codes, inside `jit` and in every lane. Where nothing does work that no potential accounts for, T + V is constant for a right motion.
-Step-size control leaves in each number y of the state an error of about `atol + rtol |y|` per step. With dE the change of the energy by errors of that size in
-all numbers together, N steps change the energy by some N dE, and round-off by some N eps of it. Over all models, at tolerances from 1e-4 to 1e-11, no drift is
-larger than half of N dE; ten times as much, and at least 1 % of the energy that moves, means that the motion is not that of the
-scene: it went through a singular position, or over a feature, without notice. And rows that depend on each other may contradict each other on the way,
+Two further checks set result codes, also inside `jit` and for each sample of a batch.
 
-    A u + phi_0 = 0,   rank A < number of rows:   a row that is omitted holds by itself only where phi_0 is in the range of A
+*Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about
+`atol + rtol |y|` per step in each number y of the state. If errors of this size in all numbers change the
+energy by dE, N steps change it by about N dE, and round-off by about N eps of it. Over all models, at
+tolerances from 1e-4 to 1e-11, no drift exceeded half of N dE. A drift of ten times N dE and at least 1 % of
+the varying energy therefore means an error, such as an unnoticed singular position.
 
-although the start meets all of them; where phi_0 = 0 they never do.
+*Constraints.* Redundant constraints that the start satisfies may contradict each
+other later, unless phi_0 = 0:
+
+    A u + phi_0 = 0,   rank A < number of rows:   an omitted constraint holds only if phi_0 is in the range of A
 """
 
 from collections.abc import Callable
@@ -59,13 +61,14 @@ def _one_motion(setup: Setup) -> Trajectory:
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
 
-# The options save most for what is compiled, of which the steps by machine code are no part: a first motion of a disc takes 0.9 s of processor time in place
-# of 1.8, of a bicycle 1.1 in place of 1.8; a motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
+# The options minimise compile time; steps in machine code are not affected. A first motion of a disc takes
+# 0.9 s of processor time instead of 1.8, of a bicycle 1.1 instead of 1.8. A motion with 201 saved times takes
+# 0.34 ms instead of 0.27 (bicycle: 2.10 instead of 2.05).
 _compiled = for_programs(_one_motion, lambda setup: None if setup.reason_against_machine_code else RUN_SELDOM)
 
 
 def _numbers(setup: Setup) -> dict:
-    """Return the numbers with respect to which a motion is differentiated."""
+    """Return the numbers with respect to which a motion can be differentiated."""
     return {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
 
 
@@ -75,8 +78,8 @@ def _prepared(setup: Setup) -> Setup:
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup. If machine code integrates it, quantities beside the steps use machine code as well,
-    if possible.
+    """Return the setup so that, if machine code integrates it, other quantities use
+    machine code as well if possible.
     """
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
@@ -85,10 +88,11 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
-    """Return the motions of all lanes. A scalar program takes `own_steps.width` lanes at a time; otherwise
-    lanes run under `vmap`.
+    """Return the motions of a batch. A scalar program runs `own_steps.width` samples at a time;
+    otherwise they run under `vmap`.
 
-    `lane`: the varying part of the setup. On a GPU constant numbers have no lanes: kernels receive them once.
+    `lane`: the varying part of the setup. On a GPU constant numbers have no batch axis,
+    so kernels receive them once.
     """
     setups = eqx.filter_vmap(lane)(*varied)
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
@@ -101,18 +105,18 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
 
 
 def _entered(setup: Setup) -> tuple[Setup, Scalar]:
-    """Return the setup, and a zero by which `_finish` recognises whether a motion failed
-    (`calculus/markers.py`). Derivatives of the setup are zero if nothing of its motion is used, and NaN after
-    a failure.
+    """Return the setup and a zero by which `_finish` recognises whether a motion failed
+    (`calculus/markers.py`). Derivatives of the setup are zero if its motion is not
+    used, and NaN after a failure.
     """
     numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
-    each, asked = entered(*lanes_first(leaves))  # also of what all motions share
+    each, asked = entered(*lanes_first(leaves))  # also numbers that all motions share
     return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
 def _plain(setup: Setup) -> Plain:
-    """Return the numbers of a setup before it is `_entered`; those that all motions share have no lanes."""
+    """Return the numbers of a setup before `_entered`; numbers shared by all motions have no batch axis."""
     setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
     own = setup.fitting()
     times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
@@ -127,8 +131,8 @@ def _plain(setup: Setup) -> Plain:
 
 
 def _in_contact(setup: Setup) -> Setup:
-    """Return the setup with switching contacts in the modes of the start. Bodies that touch the ground at the
-    start are projected onto it.
+    """Return the setup with switching contacts in their modes at the start. Bodies that then touch the
+    ground are projected onto it.
     """
     scene, t0, start = setup.scene, setup.t0, setup.start
     if not scene.switching.contacts:
@@ -149,7 +153,8 @@ def _begin(setup: Setup) -> Begun:
     right, start = _without_faults(setup, start)
     args = field, scene, setup.inputs, field.fixed(scene), setup.t0
     timely = times_fit(setup.ts, setup.t0, setup.t1)
-    timely &= (setup.t1 > setup.t0) | (not scene.switching.contacts)  # what slipped, struck or came to rest has forgotten whence
+    # slip, impact and rest cannot be reversed in time
+    timely &= (setup.t1 > setup.t0) | (not scene.switching.contacts)
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
@@ -166,7 +171,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
 
     def saved_state(tau, y, valid):
-        # what was never reached holds anything: compute at the end state instead, then mark
+        # unreached times may hold any value: compute at the end state, then mark as NaN
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
         _, at = integrands.at_time(tau, y, args)
@@ -174,13 +179,14 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         work = None if y.work is None else y.work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (at.t, y), _step_errors(setup, free, y) if puts_back else None
 
-    # start and end as two more saved states, so that all this is compiled once
+    # append start and end to the saved states, so that this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
     found, pivots, states, moved_by = jax.vmap(saved_state)(*all_states)
     found = jax.tree.map(lambda x: jnp.where(begun.right, x, jnp.nan), found)
-    # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
-    # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
+    # Negative if A_z was singular along the motion; fmin ignores NaN, which marks a lost end. The
+    # barrier hides from XLA that all pivots are one without constraints, which it would otherwise
+    # evaluate for seconds while compiling.
     pivots = jax.lax.optimization_barrier(pivots)
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
@@ -193,10 +199,10 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     unwatched = reason_against_watching(setup)
     result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
     failed = result > results.EVENT
-    # what the steps did not notice happened at a time that is not known
+    # a failure that no step detected happened at an unknown time
     over = (result == results.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > results.EVENT)
     noticed = over | (result == solved.code) | (result == results.NOT_FINITE)
-    beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
+    beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states and of the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     saved, treedef = jax.tree.flatten(at_index(found, slice(1, None)))
@@ -259,8 +265,8 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
-    """Check parameters, bodies, contacts and the start. Invalid ones become NaN, so that such a sample ends
-    at once.
+    """Check parameters, bodies, contacts and the start. A faulty sample gets a NaN
+    start, so that it ends at once.
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
@@ -281,57 +287,56 @@ def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     start, end = begun.start, solved.y_end
     eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite(end.q, end.v), code, results.NOT_FINITE)
-    # a change of sign, or so small, means that the partition into privileged and dependent speeds was lost
+    # a pivot that changed sign or is this small means that independent speeds no longer determine the others
     code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
     code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, results.INCONSISTENT_START)
     code = jnp.where((code == results.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), results.UNRESOLVED, code)
-    # no step, however short: the accelerations themselves are at fault
+    # if no step succeeds, however short, the accelerations themselves are at fault
     code = jnp.where((code == results.STEP_TOO_SMALL) & (solved.accepted == 0), results.NOT_FINITE, code)
     code = jnp.where(finite(start.q, start.u), code, results.BAD_START)
     code = jnp.where(begun.timely, code, results.BAD_TIMES)
     return jnp.where(begun.right, code, results.BAD_PARAMETER).astype(jnp.int32)
 
 
-MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
+MOST_STEP_ERRORS = 10  # times the change from N steps at their tolerance
 
 
 def conserves(setup: Setup) -> bool:
-    """Return whether T + V is constant along a motion whose steps are controlled by tolerances.
+    """Return whether T + V is constant along a motion with step-size control.
 
-    Integrated work is excluded. It may be a small difference of large powers, whose errors step-size control
-    does not bound.
+    False if work is integrated, because it may be a small difference of large powers whose errors
+    step-size control does not bound.
     """
     return setup.field.conserves and all(setup.field.stops) and not isinstance(setup.integrator.solver, FixedStepMethod)
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
-    """Return T and V (J) at states, and again with each coordinate and speed increased by the possible error
-    of a step.
+    """Return T and V (J) at states, and again with each coordinate and speed increased by
+    the possible error of a step.
     """
     field, scene, inputs, fixed, _ = args
     rtol, atol = setup.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
     every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
     at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))  # noqa: E731
-    # loads by matrices may be callbacks, which need not know batches
+    # loads of dense matrices may be callbacks without batching
     found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
     return found.reshape(2, -1, 2)
 
 
 def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
-    """Return whether T + V changed by more than N `steps` explain."""
+    """Return whether T + V changed by more than the errors of N `steps` explain."""
     at, off = energies
     T, V = at.T
     E, error = T + V, jnp.sum(jnp.abs(off - at) + eps_of(at) * jnp.abs(at), axis=1)
-    most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # passes over NaN
+    most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # ignores NaN
     return most[4] + most[5] > jnp.fmax(diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
 
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
-    """Return whether some constraint is violated at some of these states. Unreached states are NaN and do not
-    count.
+    """Return whether some constraint is violated at some of these states, ignoring unreached ones (NaN).
 
-    |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest
+        |phi| > 1 % of max over time of (|phi - A u| + |A| |u|)
     """
     scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
 
@@ -339,6 +344,6 @@ def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times
         phi, A = linearised_rows(scene, *state, inputs(state[0]))
         return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
 
-    left, size = jax.lax.map(left_and_size, states)  # rows may be callbacks, which need not know batches
+    left, size = jax.lax.map(left_and_size, states)  # constraints may be callbacks without batching
     # 1 % is far more than steps at loose tolerances leave
     return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

@@ -1,6 +1,4 @@
-"""Models: scenes with the choices of `build`. `simulate` and similar functions accept a model in place of a
-scene.
-"""
+"""Models: scenes with the choices of `build`, which `simulate` and others accept instead of a scene."""
 
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
@@ -42,27 +40,27 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Model(BuiltFor, Printed):
-    """A scene with the choices for its integration, made by `build`. Printed as a table.
+    """Scene with the choices for its integration, made by `build`. Prints as a table.
 
-    It is a tree whose leaves are the parameters of `scene`. `model.replace(radius=r)` has other parameters
-    and keeps the state and the backend; where JAX traces `r`, it also keeps all choices that depend on
-    numbers. It is pickled as its scene, and built again when loaded.
+    It is a pytree whose leaves are the parameters of `scene`. `model.replace(radius=r)` changes parameters
+    and keeps the state and the backend; if JAX traces `r`, it keeps all choices that depend on numbers. A
+    model is pickled as its scene and built again when loaded.
     """
 
     scene: Scene
-    formulation: Formulation  # of what `build` returns, its state is settled
-    backend: str  # the argument of `build`
-    decided: Reference | None  # the scene whose numbers decided; None: the model's own, and those of the class's defaults where these are traced
-    memory: int | None = None  # bytes that batches of its motions, and what reverse mode keeps of them, may take, if stated
-    made: Any = None  # found by `modelled`: what is kept for these numbers, vector fields and sizes of rows, by what tells their cases apart
+    formulation: Formulation  # with a decided state, if returned by `build`
+    backend: str  # argument of `build`
+    decided: Reference | None  # scene that decided; None: this one, class defaults for traced parameters
+    memory: int | None = None  # bytes for batches of motions and for the records of reverse mode, if given
+    made: Any = None  # vector fields and constraint sizes by case, cached by `modelled`
 
     def replace(self, **parameters) -> "Model":
-        """Return the model with other values of the parameters named."""
+        """Return the model with new values of the named parameters."""
         return replace(self, scene=self.scene.replace(**parameters), made=None)
 
     @property
     def reference(self) -> Reference:
-        """The scene whose numbers replace traced ones."""
+        """Return the scene whose numbers replace traced ones."""
         return self.decided or Reference(self.scene)
 
     @property
@@ -72,31 +70,30 @@ class Model(BuiltFor, Printed):
 
     @property
     def structure(self) -> Structure:
-        """The findings of probing."""
+        """Return the structure found by probing."""
         return structure_of(self.scene if self.decided is None else self.decided.scene)
 
     def field(self, constant: bool = True, work: bool = True) -> VectorField:
-        """Return the integrated vector field, with `constant` or other inputs, and with the `work` of loads
-        without a potential."""
+        """Return the integrated vector field for `constant` or other inputs, with or without `work`."""
         return self.once((constant, work), lambda: _vector_field(self, constant, work))
 
     def usual(self, determined: bool) -> Usual:
-        """Return the typical sizes for projecting states; `determined`: constraints determine the free
-        speeds."""
+        """Return typical sizes for projections; `determined`: constraints determine the free speeds."""
 
         def sizes() -> Usual:
-            found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))  # what it traces must not be computed at once
+            # its traces must not be evaluated at once
+            found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))
             with jax.ensure_compile_time_eval():
-                return jax.device_put(found)  # handed over in a fifth of the time that arrays of NumPy take
+                return jax.device_put(found)  # passing it on takes a fifth of the time of a NumPy array
 
         return self.once(determined, sizes)
 
     def inputs(self, given) -> Inputs:
-        """Return the inputs that are given by name; constant ones are made once."""
+        """Return inputs given by name; the default is cached."""
         return self.once("inputs at rest", lambda: as_inputs(self.scene, None)) if given is None else as_inputs(self.scene, given)
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the result of `make` for these numbers, computed once for each case."""
+        """Return the result of `make` for these parameters, computed once per case."""
         if self.made is None:
             return modelled(self).once(case, make)
         if case not in self.made:
@@ -106,43 +103,43 @@ class Model(BuiltFor, Printed):
 
     @property
     def state(self) -> str:
-        """The integrated state: "minimal", coordinates and privileged speeds, or "full", all speeds."""
+        """Return the integrated state: "minimal" (independent speeds) or "full" (all speeds)."""
         return self.formulation.state
 
     @property
     def rows(self) -> Rows:
-        """The constraints of the scene: names, rank, redundant ones."""
+        """Return the constraints of the scene: names, rank, redundant ones."""
         known = self.structure
         return Rows(known.row_names, known.rank, known.redundant_rows, known.may_set_in, known.rank_losses, known.affine, known.homogeneous)
 
     @property
     def freedoms(self) -> Freedoms:
-        """The independent speeds."""
+        """Return the independent speeds."""
         known, names = self.structure, self.scene.speed_names.entries
         dependent = tuple(name for i, name in enumerate(names) if i not in known.independent)
         return Freedoms(tuple(names[i] for i in known.independent), dependent, known.chosen_by_user, known.worst_pivot, known.typical_pivot)
 
     @property
     def dependence(self) -> Dependence:
-        """Quantities that depend on time and on the motion."""
+        """Return the quantities that depend on time and on the motion."""
         known = self.structure
         return Dependence(known.timed, known.driven, known.varying_inertia, known.massless)
 
     @property
     def conserved(self) -> Conserved:
-        """Conserved quantities of a motion."""
+        """Return the conserved quantities of a motion."""
         held = () if self.program is None else self.program.held
         return Conserved(not needs_work(self.reference.scene, self.structure), held, names_of_invariants(self.scene))
 
     @property
     def program(self) -> Lowered | None:
-        """The scalar program; None if there is none."""
+        """Return the scalar program; None if there is none."""
         found = self._lowered
         return found if isinstance(found, Lowered) else None
 
     @property
     def not_lowered(self) -> str:
-        """The reason why there is no scalar program; empty if there is one."""
+        """Return why there is no scalar program; empty if there is one."""
         found = self._lowered
         return "" if isinstance(found, Lowered) else str(found)
 
@@ -152,46 +149,47 @@ class Model(BuiltFor, Printed):
 
     @property
     def events(self) -> Labels:
-        """Names of the events."""
+        """Return the names of the events."""
         return names_of_events(self.scene)
 
     @property
     def way(self) -> str:
-        """Return the integrator of motions with constant inputs (machine code, XLA or dense matrices), and
-        the reason why a faster one does not apply.
-        """
+        """Return the integrator for constant inputs, and why no faster one applies."""
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
-            return f"dense matrices: {self.not_lowered or 'as asked'}"
-        reason = "as asked" if self.backend == "xla" else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
+            return f"dense matrices: {self.not_lowered or 'as requested'}"
+        reason = "as requested" if self.backend == "xla" else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
         return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 
     @property
     def warnings(self) -> Sentences:
-        """Sentences on points to check."""
+        """Return sentences on points to check."""
         said, rows = [], self.rows
         if rows.rank_losses:
-            said.append(f"the rows lose rank at {len(rows.rank_losses)} of the probed configurations, first at {rows.rank_losses[0]}")
+            said.append(f"constraints lose rank at {len(rows.rank_losses)} of the probed configurations, "
+                f"first at {rows.rank_losses[0]}")
         if rows.may_set_in:
-            said.append(f"rows {', '.join(rows.may_set_in)} follow from the others at all probed states, but by no identity: they may set in elsewhere")
+            said.append(f"constraints {', '.join(rows.may_set_in)} are redundant at all probed states, but "
+                "may become independent elsewhere")
         if self.structure.chosen_by_user and self.state == "full":
-            said.append("the privileged speeds that the scene states do not determine the others everywhere in its domain: all speeds are integrated")
+            said.append("the scene's privileged speeds do not determine the others everywhere in its domain, "
+                "so all speeds are integrated")
         if self.structure.decisions != _decisions_where_traced(self.reference.scene):
             said.append(
-                "numbers near the class's defaults, which replace parameters that JAX traces, lead to other choices; "
-                "under `jit` and derivatives use `model.replace(...)`, which keeps those of this model"
+                "class defaults, which replace parameters traced by JAX, would lead to other choices; under "
+                    "`jit` and derivatives use `model.replace(...)`, which keeps the choices of this model"
             )
         return tuple(said)
 
     def save(self, path: FilePath) -> None:
-        """Write the results of `build` for the numbers of the scene to the file `path`, for `jj.load_model`.
+        """Write the results of `build` to the file `path`, for `jj.load_model`.
 
-        Raises ValueError for a model with its own reduction or stabilisation, and where parts of the scene
-        are kept as calls of JAX.
+        Raises ValueError for a model with its own reduction or stabilisation, or parts kept as JAX calls.
         """
         scene, formulation = self.reference.scene, self.formulation
         if formulation.reduction is not None or formulation.baumgarte is not None:
-            raise ValueError("a model with its own reduction or stabilisation cannot be saved; build it again instead")
+            raise ValueError(
+                "a model with its own reduction or stabilisation cannot be saved; build it again instead")
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
         every = self.state == "full"
         found: dict[Hashable, Any] = {("_structure",): self.structure, ("_lowered", every or not self.structure.row_names): lowered(scene, every)}
@@ -211,7 +209,7 @@ class Model(BuiltFor, Printed):
             "privileged speeds": f"{listed(freedoms.privileged)}; {pivots}",
             "state": f"{self.state}: {self._why_state()}",
             "depends on time": listed(self.dependence.on_time),
-            "energy": "conserved" if self.conserved.energy else "work is integrated beside the motion",
+            "energy": "conserved" if self.conserved.energy else "work is integrated along with the motion",
             "ignorable": listed(self.conserved.ignorable),
             "scalar program": f"none: {self.not_lowered}" if program is None else f"{program.operations} operations, {program.way}",
             "integrated by": self.way,
@@ -223,10 +221,10 @@ class Model(BuiltFor, Printed):
     def _why_state(self) -> str:
         known = self.structure
         if (self.state == "minimal") != known.has_minimal_state:
-            return "as asked"
+            return "as requested"
         if self.state == "minimal":
-            return "privileged speeds determine the others over the domain"
-        return "privileged speeds do not determine the others over the whole domain" if known.affine else "rows are nonlinear in the speeds"
+            return "independent speeds determine the others over the domain"
+        return "independent speeds do not determine the others over the whole domain" if known.affine else "constraints are nonlinear in the speeds"
 
 
 def _decisions_where_traced(scene: Scene) -> tuple:
@@ -242,7 +240,7 @@ def _flattened(model: Model) -> tuple[tuple, tuple]:
 
 
 def _unflattened(static: tuple, children: tuple) -> Model:
-    model = object.__new__(Model)  # anything may stand in place of numbers
+    model = object.__new__(Model)  # JAX may pass placeholders instead of numbers
     (scene, arrays), (formulation, backend, decided, memory) = children, static
     vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, memory=memory, made=None)
     return model
@@ -253,30 +251,30 @@ jax.tree_util.register_pytree_node(Model, _flattened, _unflattened)
 
 @shown_from_users_lines
 def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto", memory: int | float | str | None = None) -> Model:
-    """Decide once how motions of a scene are integrated: rank, redundant constraints, privileged speeds, time
-    dependence, conserved quantities, the state, the scalar program, the backend.
+    """Decide once how motions of a scene are integrated: rank, redundant constraints, independent speeds,
+    time dependence, conserved quantities, the state, the scalar program, the backend.
 
         model = jj.build(disc)
         print(model), model.freedoms.privileged, model.program.operations
         motion = jj.simulate(model, {"lean": 0.3}, t1=5.0)
         slope = jax.grad(lambda r: jj.simulate(model.replace(radius=r), {"lean": 0.3}, t1=5.0).q_end[0])(0.5)
 
-    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB": the bound for chunks
-    of a `rollout` and for records of reverse mode (default: 4 GiB), and, if stated, for the processes of a
-    `Study`. All functions of a scene build on first use and keep the result. `start`, `simulate`, `rollout`,
-    `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the model in
-    place of `scene`; all others take its `.scene`. The first call for a class warns with the table of `check`
-    if it has findings. Raises ValueError as `structure_of` does (no admissible state, no inertia along a free
-    motion, impossible bodies), and where the formulation or the backend does not apply to the scene.
+    `formulation`, `backend`: as for `simulate`. `memory`: bytes, or a text such as "2GB": limit for the
+    chunks of a `rollout` and the records of reverse mode (default: 4 GiB) and, if given, for the processes of
+    a `Study`. All functions of a scene build on first use and cache the result. `start`, `simulate`,
+    `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the
+    model instead of `scene`; for others use its `.scene`. The first call for a class warns with the findings
+    of `check`, if any. Raises ValueError as `structure_of` does (no admissible state, no inertia along a free
+    motion, impossible bodies), and if formulation or backend do not suit the scene.
     """
     scene = as_scene(scene)
-    structure_of(scene)  # says what is wrong
+    structure_of(scene)  # raises an error for an invalid scene
     model = modelled(scene, formulation, backend)
     model.usual(False), model.usual(True), model.way
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
     settled = Model(scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory))
     modelled(settled).made.update(model.made)
-    if backend != "dense" and formulation.reduction is None:  # dense matrices ask for no program to compare
+    if backend != "dense" and formulation.reduction is None:  # dense matrices need no program to compare
         warn_of_mistakes(settled.reference.scene, settled.state == "full")
     return settled
 
@@ -287,9 +285,9 @@ def load_model(path: FilePath, scene: Scene) -> Model:
         jj.build(bicycle).save("bicycle.model")
         model = jj.load_model("bicycle.model", bicycle)
 
-    `path`: of the file; `scene`: of the same class, methods and values. Nothing in a file is executed, but it
-    determines the integrated equations: load only files of your own. Raises ValueError where the file is
-    damaged, or belongs to another scene, version or precision.
+    `path`: file; `scene`: a scene of the same class, methods and parameter values. Loading executes no code,
+    but the file determines the integrated equations, so load only files you trust. Raises ValueError if the
+    file is damaged or belongs to another scene, version or precision.
     """
     found, how = model_file.read(path, as_scene(scene))
     formulation = Formulation(how["state"], stabilisation="projection" if how["projects"] else None)
@@ -298,8 +296,7 @@ def load_model(path: FilePath, scene: Scene) -> Model:
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return a scene, or a model, with this formulation and backend (by default the model's), and the choices
-    stored for its values."""
+    """Return a scene or model with this formulation and backend, and the choices cached for its values."""
     decided = memory = None
     if isinstance(scene, Model):
         if formulation is None:
@@ -309,7 +306,7 @@ def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, ba
         decided, memory, scene = scene.decided, scene.memory, scene.scene
     asked, scene = as_formulation(formulation), as_scene(scene)
     stabilisation = asked.stabilisation
-    in_words = isinstance(stabilisation, str | None) and isinstance(backend, str) and asked.reduction is None  # these are compared in no time
+    in_words = isinstance(stabilisation, str | None) and isinstance(backend, str) and asked.reduction is None
     made = _kept(scene, asked.state, stabilisation, backend) if in_words else {}
     return Model(scene, asked, backend, decided, memory, made)
 
@@ -354,16 +351,16 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
         return MinimalByMatrices(**common, rows=structure.kept_rows)
     loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
     branches = cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank
-    known = 1.0 if structure.affine else trust(scene)  # how far usual sizes are; where not, nonlinear rows count as long a thousand times longer
+    # how uncertain usual sizes are; nonlinear constraints may be a thousand times larger
+    known = 1.0 if structure.affine else trust(scene)
     return FullByMatrices(**common, undecided=undecided(real_type()) / known if branches else None)
 
 
 def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
-    """Return the scalar program to integrate; None for dense matrices. Raises ValueError where a backend
-    requires a program and there is none."""
+    """Return the scalar program, or None for dense matrices; ValueError if the backend requires a program."""
     reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
-        reason = "a reduction or a stabilisation of its own needs dense matrices"
+        reason = "its own reduction or stabilisation requires dense matrices"
     if backend == "dense" or (backend == "auto" and reason):
         return None
     program = reason or lowered(scene, every_speed=not minimal)
@@ -378,20 +375,22 @@ def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation
 def _check(scene: Scene, structure: Structure, state, backend) -> None:
     check_name(backend, _BACKENDS, f"unknown backend `{backend}`")
     if state == "minimal" and not structure.affine:
-        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds, so there is no minimal state; use jj.Formulation('full')")
+        raise ValueError(f"constraints of `{type(scene).__name__}` are nonlinear in the speeds, so there is "
+            "no minimal state; use jj.Formulation('full')")
     if state == "minimal" and structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise ValueError(f"rows {named} of `{type(scene).__name__}` may become independent of the others during a motion; use jj.Formulation('full')")
+        raise ValueError(f"constraints {named} of `{type(scene).__name__}` may become independent during a "
+            "motion; use jj.Formulation('full')")
 
 
 def _cutoff(structure: Structure) -> float | None:
-    """Return a wider cut-off if usually well conditioned constraints lose rank; None: round-off."""
+    """Return a wider cutoff if usually well-conditioned constraints lose rank; None: round-off."""
     return passing_cutoff(real_type()) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
 def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
-    """Return the default reduction. For the minimal state it uses the privileged velocities. For the full
-    state it is that of a lowered program, or else the null space by QR.
+    """Return the default reduction: independent speeds for the minimal state; for the full state the
+    reduction of the lowered program, or else the null space by QR.
     """
     if independent is not None:
         return Privileged(independent)

@@ -1,9 +1,10 @@
 """Files of models: the findings of `build` as JSON, after a line with digests.
 
-    {"format", "version", "jax", "precision", "scene", "sha256"}      digests of the class, its methods and values, and of what follows
-    [how, {what: finding}]                                            what: the function that finds it, and which case
+    {"format", "version", "jax", "precision", "scene", "sha256"}      digests of the scene (class, methods, values) and of the next line
+    [how, {what: finding}]                                            what: the function that computes the finding, and its case
 
-A dataclass of `KINDS` or a graph is {its name: its fields}, an array {"array": [type, entries]}, a tuple {"tuple": [...]}, a dictionary {"dict": pairs}.
+A dataclass in `KINDS` or a graph is {its name: its fields}, an array {"array": [type, entries]}, a tuple
+{"tuple": [...]}, a dictionary {"dict": pairs}.
 """
 
 import hashlib
@@ -28,28 +29,28 @@ KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram,
 
 
 def write(path: FilePath, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
-    """Write the findings about a scene and `how` to build it. Findings are keyed by the functions that find
-    them and the first part of their key.
+    """Write the findings about a scene and `how` to build it. Keys of findings are the names of the functions
+    that compute them and the first part of their cache key.
     """
     check_place(path)
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
     except TypeError as error:
-        raise ValueError(f"`{type(scene).__name__}` has parts that are kept as calls of JAX, so its model "
-            f"cannot be saved; build it again instead ({error})") from None
+        raise ValueError(f"`{type(scene).__name__}` has parts kept as JAX calls, so its model cannot be "
+            f"saved ({error}); build it again instead") from None
     write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
 
 
 def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
-    """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file is
-    damaged or does not match.
+    """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file
+    is damaged or does not match.
     """
     head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
     if stated != expected:
         other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)
-        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in {other}; "
-            "build and save it again")
+        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in "
+            f"{other}; build and save it again")
     how, found = _decoded(json.loads(content))
     return found, how
 

@@ -29,18 +29,18 @@ class Options:
     """Options of integration.
 
     - `rtol`, `atol`: tolerances of a step, relative and absolute.
-    - `solver`: a solver of diffrax, which runs `diffrax.diffeqsolve` (except Tsit5, Dopri5 and Dopri8, for
-      which this package has its own loop), or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`,
+    - `solver`: a diffrax solver, run by `diffrax.diffeqsolve` (except Tsit5, Dopri5 and Dopri8, which run in
+      this package's loop), or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`,
       `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their
       `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
-    - `max_steps`: the largest number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so
-      that a load that acts briefly, or a dip of an event, is not missed; inf: no bound.
+    - `max_steps`: maximum number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so that
+      brief loads and dips of events are not missed; inf: no limit.
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
       motion, but not those at which it continues. `work`: integrate the work of loads without a potential.
-    - `max_transitions`: the largest number of events at which a motion continues (`jj.Event`).
-    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that is
-      stiff (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report
-      it. Inside your own `jit` or `vmap`, and without it, the result code stays.
+    - `max_transitions`: maximum number of events at which a motion continues (`jj.Event`).
+    - `retry`: repeat a motion whose independent speeds became invalid (with the full state), or that is stiff
+      (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report it. Inside
+      your own `jit` or `vmap`, or if False, the result code stays.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
@@ -69,12 +69,12 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
-    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: `setup.MEMORY`
-    alongside: bool = False  # whether one run gives values and tangents: for derivatives by `jvp` and `jacfwd` alone
+    memory: int | None = None  # of a model: limit in bytes for batches and reverse mode; None: `setup.MEMORY`
+    alongside: bool = False  # whether one run gives values and tangents, for `jvp` and `jacfwd` only
 
 
 class OptionFields(TypedDict, total=False):
-    """The fields of `Options` by name, and all further settings of the integration."""
+    """Fields of `Options` by name, and all further settings of the integration."""
 
     rtol: Number
     atol: Number
@@ -90,7 +90,7 @@ class OptionFields(TypedDict, total=False):
 
 
 class MotionFields(OptionFields, total=False):
-    """The span and inputs of a motion by name, and `OptionFields`."""
+    """Span and inputs of a motion by name, and `OptionFields`."""
 
     t0: Number
     t1: Number
@@ -104,7 +104,7 @@ OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
 def _register(kind: type[Options]) -> None:
-    """Register a kind of options as a pytree whose leaves is arbitrary."""
+    """Register a class of options as a pytree whose leaves may be any object."""
     names = [field.name for field in fields(kind)]
     leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
 
@@ -123,14 +123,14 @@ _register(Options)
 _register(AllOptions)
 _DEFAULT = AllOptions()
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
-GONE = {  # options that there were once -> what serves now
-    "adjoint": "all motions have derivatives in forward and in reverse mode; for an adjoint of diffrax "
-        f"{_BY_DIFFRAX}",
-    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in "
+GONE = {  # removed options -> replacements
+    "adjoint": "all motions have derivatives in forward and in reverse mode; for a "
+        f"diffrax adjoint {_BY_DIFFRAX}",
+    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers have their own, as in "
         "solver=jj.ImplicitMidpoint(step=0.01)",
-    "memory": "a model has its own; give it to `jj.build`",
-    "saveat": f"give times to save at as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
-    "stepsize_controller": "give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); "
+    "memory": "a model has its own; pass it to `jj.build`",
+    "saveat": f"pass times to save as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
+    "stepsize_controller": "pass `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); "
         f"for another control {_BY_DIFFRAX}",
 }
 
@@ -140,16 +140,16 @@ def as_options(
 ) -> AllOptions:
     """Return the options of a call of `function`: the fields of the object, overridden by options by name.
 
-    `refused`: names that have no meaning for this function, with the reason; `scene`: a model supplies its
-    formulation, backend and memory. Raises TypeError for these and for unknown names, ValueError for wrong
-    values.
+    `refused`: names that do not apply to this function, with reasons; `scene`: a model, which
+    supplies formulation, backend and memory. Raises TypeError for these and for unknown names,
+    ValueError for wrong values.
     """
     of_model = {name: getattr(scene, name) for name in ("formulation", "backend", "memory")} if isinstance(scene, BuiltFor) else {}
     if not (by_name or of_model) and (options is None or type(options) is AllOptions):
         return _DEFAULT if options is None else options
     if options is not None and not isinstance(options, Options):
         raise ValueError(f"`options` is {described(options)}, expected `jj.Options(...)`")
-    refusals = dict.fromkeys(of_model, "a model has its own; give it to `jj.build`") | dict(refused or {})
+    refusals = dict.fromkeys(of_model, "a model has its own; pass it to `jj.build`") | dict(refused or {})
     for name in by_name:
         if name in refusals:
             raise TypeError(f"{function}() takes no `{name}`: {refusals[name]}")
@@ -157,8 +157,8 @@ def as_options(
             raise TypeError(f"`{name}` is no longer an option: {GONE[name]}")
         if name not in OPTION_NAMES:
             known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refusals]
-            raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; "
-                f"{nearest(name, known)}")
+            raise TypeError(
+                f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
     found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
@@ -170,8 +170,8 @@ def bytes_of(memory: Any) -> int:
     """
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
     if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
-        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as "
-            "'2GB' or '500MB'")
+        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a "
+            "text such as '2GB' or '500MB'")
     return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
@@ -181,24 +181,24 @@ def alongside(options: AllOptions) -> AllOptions:
 
 
 def stated(options: AllOptions) -> dict[str, Any]:
-    """Return the options that differ from the default ones, by name."""
+    """Return the options that differ from the defaults, by name."""
     return {name: value for name, value in vars(options).items() if value is not getattr(_DEFAULT, name) and value != getattr(_DEFAULT, name)}
 
 
-_POSITIVE = lambda x: (x > 0) & (x < np.inf), "a positive finite number; give a tolerance such as 1e-8", "give one number, such as 1e-8"
-_NUMBERS = {  # what fits, what is expected, and what to give
+_POSITIVE = lambda x: (x > 0) & (x < np.inf), "a positive finite number; pass a tolerance such as 1e-8", "pass one number, such as 1e-8"
+_NUMBERS = {  # condition, expected value, and advice
     "rtol": _POSITIVE,
     "atol": _POSITIVE,
     "max_step": (
         lambda x: x > 0,
-        "a positive time in s; None bounds steps by the span, inf does not bound them",
-        "give the longest step in s, None for a part of the span, or inf for no bound",
+        "a positive time in s; None limits steps by the span, inf sets no limit",
+        "pass the longest step in s, None for a part of the span, or inf for no limit",
     ),
 }
 
 
 def _check(options: AllOptions) -> None:
-    """Raise ValueError for numbers out of range and for objects of another kind."""
+    """Raise ValueError for numbers out of range and for objects of a wrong type."""
     for name, (fits, expected, advice) in _NUMBERS.items():
         value = getattr(options, name)
         if (type(value) is float and fits(value)) or (value is None and name == "max_step"):
@@ -209,19 +209,19 @@ def _check(options: AllOptions) -> None:
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    checked_whole(options.max_steps, "`max_steps`", 1, expected="of at least 1; give the number of steps "
-        "after which to stop")
-    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; give the number "
+    checked_whole(options.max_steps, "`max_steps`", 1,
+        expected="of at least 1; pass the number of steps after which to stop")
+    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; pass the number "
         "of events after which to stop")
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):
-        raise ValueError(f"`solver` is {described(solver)}, expected an object of diffrax; write "
+        raise ValueError(f"`solver` is {described(solver)}, expected a solver object; write "
             f"`{_meant(solver) or 'diffrax.Dopri8()'}`")
 
 
 def _meant(value) -> str:
-    """Return the solver that a text or a class may mean."""
+    """Return the solver that a string or class probably means."""
     kind = diffrax.AbstractSolver
     if isinstance(value, type) and issubclass(value, kind | ImplicitMethod | Taylor):
         return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"

@@ -1,7 +1,5 @@
-"""Our own loop over steps as an integrator, with its derivatives: by machine code where possible, otherwise
-on arrays of JAX.
-
-There lanes of a scalar program run side by side in blocks of `width`.
+"""This package's loop over steps as an integrator with derivatives: by machine code if possible, otherwise in
+JAX, where batches of a scalar program run in blocks of `width` samples.
 """
 
 from collections.abc import Callable
@@ -44,16 +42,16 @@ from jourdain_jax.scene.scene import Scene
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class OwnSteps(Integrator):
-    """Our own loop, by a tableau, an implicit method or Taylor series."""
+    """This package's loop over steps, by a Runge-Kutta tableau, an implicit method or Taylor series."""
 
     solver: Method | ImplicitMethod
-    alongside: bool  # whether one run gives values and tangents, of `jvp` and `jacfwd` alone
+    alongside: bool  # whether one run gives values and tangents, for `jvp` and `jacfwd` only
     max_steps: int
     event_names: tuple[str, ...]
     native: bool  # whether machine code may integrate
-    order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
-    memory: int  # bytes that the record of reverse mode may take
-    most: int  # events after which a motion continues
+    order: int | None  # order of the Taylor series, which machine code uses instead of the solver's tableau
+    memory: int  # limit in bytes for the record of reverse mode
+    most: int  # maximum number of events after which a motion continues
     stopping: bool  # whether other events end it
     own: ClassVar[bool] = True
 
@@ -80,7 +78,7 @@ class OwnSteps(Integrator):
         return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
 
     def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
-        """Return the loop on arrays, its arguments, and the number of lanes side by side."""
+        """Return the loop in JAX, its arguments, and the number of samples per block."""
         program = setup.field.lowered
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
         return *on_arrays.loop_of(self.solver, setup, begun, self._events(setup)), at_once
@@ -90,7 +88,7 @@ class OwnSteps(Integrator):
         return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
 
     def _pulled_on_arrays(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Return cotangents of varying values, from those of the motion."""
+        """Return cotangents of varying values from the cotangents of the motion."""
         setup, begun = arguments
         of, start, at_once = self._loop(setup, begun)
         varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
@@ -114,7 +112,7 @@ class OwnSteps(Integrator):
         return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
 
     def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Return cotangents of varying values, from those of the motion."""
+        """Return cotangents of varying values from the cotangents of the motion."""
         setup, begun = arguments
         sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
         if any(jax.tree.leaves(sampled)):
@@ -132,29 +130,30 @@ class OwnSteps(Integrator):
 
 
 def _by_start(perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]) -> tuple:
-    """Return cotangents of a setup and of the initial state from those of the state and of the arguments of
-    rates.
+    """Return cotangents of a setup and of its start from the cotangents of the state
+    and of the rates' arguments.
     """
     by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments)
     return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None)
 
 
 def own_steps(solver, **static) -> OwnSteps | None:
-    """Return our own loop where it has the solver; None for solvers of diffrax."""
+    """Return this package's loop if it supports the solver, otherwise None (use diffrax)."""
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None
     if isinstance(method, FixedStepMethod):
-        method = eqx.tree_at(lambda method: method.step, method, None)  # another step is no other program
+        # another step size needs no other program
+        method = eqx.tree_at(lambda method: method.step, method, None)
     return OwnSteps(method, **static)
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
-    """Return the motion of `run`, which works on plain numbers, with start and saved states moved to the
-    times of the setup so that these have derivatives.
+    """Return the motion of `run`, whose times have no derivatives, with start and saved states shifted to the
+    setup's times so that they have derivatives.
 
-    A reached time is its goal. The time of a stop event comes from the loop itself. A time that was not
-    reached has a constant distance from the start.
+    A reached time equals its goal; the loop itself gives the time of a stop event. A time that was not
+    reached keeps its distance from the start.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
     goals, later = setup.goals(setup.ts), start - numbers(start)
@@ -186,8 +185,8 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
 
 
 def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
-    """Return the motion with a mode and an event for each relation (`lowering/sides.py`). Functions of time
-    are part of its program.
+    """Return the motion with a mode and an event for each relation (`lowering/sides.py`), and with functions
+    of time merged into its program.
     """
     field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
     if _reason_against_sides(setup) or not isinstance(field, ByProgram):
@@ -208,8 +207,8 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Return why steps do not monitor all relations in a scene's loads or stop events; empty if they do, or
-    there are none. A call may hide some.
+    """Return why steps do not monitor all relations of a scene's loads or stop events; empty if they do, or
+    there are none. JAX calls may hide some.
     """
     program = setup.field.lowered
     hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
@@ -217,7 +216,9 @@ def reason_against_watching(setup: Setup) -> str:
 
 
 def _reason_against_sides(setup: Setup) -> str:
-    """Return why no step monitors the relations of the scalar program; empty if steps do, or it has none."""
+    """Return why steps do not monitor the relations of the scalar program; empty
+    if they do, or there are none.
+    """
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
         return "the scene has no scalar program" if jump else ""
@@ -227,7 +228,7 @@ def _reason_against_sides(setup: Setup) -> str:
     if not setup.integrator.own:
         return "solvers of diffrax do not"
     if getattr(setup.integrator.solver, "even", False):
-        return "steps of one length do not"
+        return "fixed-step methods do not"
     if has_events and not setup.field.lowers_events:
         return "an event has no scalar form"
     if any(program.graph.op[n] in ARRAYS for n in program.fixed):
@@ -239,9 +240,9 @@ def _reason_against_sides(setup: Setup) -> str:
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
-    """Return whether rates may jump at a time whose derivatives are not taken into account. Such a time
-    depends on the state, on numbers of inputs or, if the `scene_varies`, on parameters. `watched`: whether
-    steps end at relations.
+    """Return whether rates may jump at a time whose derivatives are neglected: a time that
+    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`:
+    whether steps end at relations.
     """
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
@@ -260,22 +261,19 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, Indices]:
-    """Return the program and its relations. Functions of time among its inputs, if there are any, are part of
-    it.
-    """
+    """Return the program, with functions of time merged into it, and its relations."""
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
 
 
 def width(program: Lowered) -> int:
-    """Return the number of lanes of a lowered scene that run in lockstep.
+    """Return the number of samples of a lowered scene that run in lockstep.
 
-    A step of a batch lasts until its slowest lane has ended, and the data of the step should stay in a core's
-    fastest cache. Few lanes at a time are therefore best, if a step of few lanes costs little beside its
-    arithmetic. On a CPU it does if XLA compiles the whole loop over steps into one function, as it does for
-    loops that use little memory (see `jourdain_jax`). Otherwise every operation is started separately, and
-    many lanes must share that cost.
+    A block lasts until its slowest sample ends, and its data should fit a core's fastest cache, so small
+    blocks are best if they have little overhead. On a CPU this is so if XLA compiles the whole loop into one
+    function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise it starts every
+    operation separately, and many samples must share that cost.
     """
-    # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
+    # larger loops use too much memory to become one function (the bicycle, with 2016 operations, still does)
     return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

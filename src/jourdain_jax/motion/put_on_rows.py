@@ -1,12 +1,14 @@
-"""Projection of coordinates and speeds onto the constraints: by machine code where possible, otherwise and
-for derivatives by XLA.
+"""Projection of coordinates and speeds onto the constraints, by machine code if possible; otherwise,
+and for derivatives, by XLA.
 
-g(t, q) = 0,  phi(t, q, u) = 0
+    g(t, q) = 0,  phi(t, q, u) = 0
 
-By machine code, the rows and the mass matrix are functions that JAX can differentiate: a derivative has two calls in it, in place of the scene itself.
+With machine code, constraints and mass matrix are functions that JAX can differentiate: a derivative contains
+two calls instead of the traced scene.
 
-g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
-d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`motion/native/values.py`)
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
+    d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs
+                                 J: derived on the graph (`motion/native/values.py`)
 """
 
 from collections.abc import Sequence
@@ -42,13 +44,13 @@ from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
 
-OFF = 1e4  # units of round-off: a residual that is more
+OFF = 1e4  # a residual above this many eps is more than round-off
 
 
 class State(Printed, eqx.Module):
-    """A state on the constraints, and its distance from the guess; `state["yaw"]`, `print(state)`.
+    """State on the constraints, and its distance from the guess; `state["yaw"]`, `print(state)`.
 
-    q and u in the units of the scene's coordinates and speeds (SI, rad).
+    q and u are in the units of the scene's coordinates and speeds (SI, rad).
     """
 
     t: Scalar  # s
@@ -56,9 +58,10 @@ class State(Printed, eqx.Module):
     u: Speeds
     moved_q: Scalar  # largest change of a coordinate by the projection
     moved_u: Scalar  # largest change of a speed by the projection
-    residual: Scalar  # what is left of rows and quaternion norms
+    residual: Scalar  # remaining residual of constraints and quaternion norms
     names: tuple[Names, Names] = static()
-    # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
+    # index of the successful guess: 0, the given values; then others (`start`). A float, so that losses can
+    # be differentiated with respect to a whole state
     guess: Scalar = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
     def __getitem__(self, name: str):
@@ -76,51 +79,53 @@ class State(Printed, eqx.Module):
         pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
         moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
         if int(self.guess):
-            moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"
+            moved += f"; from guess {int(self.guess)}: omitted coordinates start elsewhere in the domain, because the reference led to no solution"
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
 def state_of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> State:
-    """Return a state of a scene that has not been projected yet."""
+    """Return a state of a scene before projection."""
     t, moved_q, moved_u, residual = (jnp.asarray(x, real_type()) for x in (t, moved_q, moved_u, residual))
     return State(t, q, u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
 
 
 class Usual(eqx.Module):
-    """Typical sizes of constraints and coordinates, and kinds of constraints."""
+    """Typical sizes of constraints and coordinates, and properties of the constraints."""
 
     closures: Float[Entries, "closures"]
-    rows: Float[Entries, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
+    # in scaled speeds, or in plain speeds if constraints determine the free speeds
+    rows: Float[Entries, "rows"]
     width: Float[Entries, "coordinates"]  # of the domain
-    low: Float[Entries, "coordinates"]  # where a coordinate is found by the rows; infinite where it may be anywhere
+    # bounds of coordinates that constraints determine; infinite if unbounded
+    low: Float[Entries, "coordinates"]
     high: Float[Entries, "coordinates"]
-    affine: bool = static()  # rows are, in the speeds
-    determined: bool = static()  # rows determine the speeds that are free
-    program: RowProgram | None = static()  # by which machine code puts a start onto them; None: XLA does
+    affine: bool = static()  # constraints are affine in the speeds
+    determined: bool = static()  # constraints determine the free speeds
+    program: RowProgram | None = static()  # program for projection by machine code; None: use XLA
 
 
 def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
-    """Return the sizes for the parameters of a scene; `determined`: as of `Usual`; `native`: whether machine
-    code may project states onto the rows.
+    """Return the sizes for the parameters of a scene; `determined`: as in `Usual`; `native`: whether
+    machine code may project states.
     """
     low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
     width = np.where(high > low, high - low, 1.0).astype(real_type())
     program = row_program(scene) if native and not ffi.reason_against() else None
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
-        # the domain, and a little more, of the coordinates for which a scene states it and on which rows depend
+        # the stated domain, slightly widened, for coordinates on which constraints depend
         bounded, more = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries], NEARLY_INSIDE * (high - low)
         low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
         affine = structure_whatever_its_faults(scene).affine
         return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), affine, determined, program)
-    except ValueError:  # of a scene that is wrong in itself; said where its structure is requested
+    except ValueError:  # the scene is invalid, which is reported when its structure is requested
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
 
 
 def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
-    """Return the coordinates on the geometric constraints nearest to q, and the residual. Both have
-    derivatives with respect to the `known` values.
+    """Return the coordinates on the geometric constraints nearest to q, and the residual, without repeating
+    the projection if both are `known`.
     """
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
@@ -154,7 +159,7 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
-    """Return the evaluation of rows for projections by XLA, for derivatives, and for searches."""
+    """Return the constraint functions for projection by XLA, derivatives and searches."""
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
@@ -179,17 +184,17 @@ def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
 
 
 class Guess(NamedTuple):
-    """Coordinates and speeds that are to be projected, and which of them may move."""
+    """Coordinates and speeds to project, and which of them may change."""
 
     q: Float[Entries, "coordinates"]
     u: Float[Entries, "speeds"]
     free_q: Bool[Entries, "coordinates"]
     free_u: Bool[Entries, "speeds"]
-    bounded: Bool[Entries, "coordinates"]  # which must end inside the domain that the scene states
+    bounded: Bool[Entries, "coordinates"]  # whether it must end inside the scene's stated domain
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
-        """Return which coordinates are where they may be found."""
+        """Return which coordinates are within their bounds."""
         q = jax.lax.stop_gradient(q)
         return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
@@ -209,7 +214,7 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
     """Project the start onto the constraints; also return whether the position solve converged within the
     domain. Without `guesses` there is no search.
 
-    The residual is infinite where a number is not finite, or a coordinate lies outside its permitted range.
+    The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
     """
     given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
     q = given_q
@@ -221,7 +226,7 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
         better = ~arrived & (left_of(other.g) <= left_of(g))
         found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
         q = jnp.where(better & free, found.begin, q)
-    # derivatives are those of Newton's method from where it began; where the rows cannot be met, they would run away
+    # derivatives of Newton's method from its starting point; without a solution they would diverge
     near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
     near_q, guess = jnp.where(found.met, near_q, q), found.guess
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
@@ -234,8 +239,8 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
-    """Return coordinates for the states `elsewhere`, on the geometric rows; NaN for states without a solution
-    in the domain.
+    """Return coordinates of the states `elsewhere`, projected onto the geometric constraints; NaN
+    without a solution in the domain.
 
     `native`: whether machine code may project them.
     """
@@ -250,28 +255,28 @@ def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordin
         near_q, g = put_positions(here, t, q, every, usual)
         return jnp.where(_arrived(q, near_q, g, Guess(q, u[0], every, every, every, usual)), near_q, jnp.nan)
 
-    return jax.lax.map(put, (t, q))  # rows may be callbacks, which need not know batches
+    return jax.lax.map(put, (t, q))  # constraints may be callbacks without batching
 
 
 @eval_numpy
 def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return for each fault whether a scene of known numbers has it, at this state or elsewhere."""
+    """Return for each fault whether a concrete scene has it, at this state or elsewhere."""
     return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
 def left_of(g: Float[Array, "closures"]) -> Scalar:
-    """Return the largest significant residual of the geometric constraints. NaN counts as infinite, round-off
-    as zero.
+    """Return the largest significant residual of the geometric constraints. NaN counts as
+    infinite, round-off as zero.
     """
     left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
     return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
 def _arrived(q, near_q, g, start: Guess) -> Flag:
-    """Return whether the rows are satisfied, with coordinates within their permitted range and without a far
-    excursion.
+    """Return whether the constraints are satisfied, with coordinates in their
+    permitted range and near the guess.
     """
-    # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
+    # moving a coordinate by more than ten widths of the domain counts as divergence; NaN counts as far
     close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
     return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
 
@@ -282,14 +287,12 @@ class _Put(NamedTuple):
     q: Float[Array, "coordinates"]
     g: Float[Array, "closures"]
     guess: Count
-    begin: Float[Array, "coordinates"]  # where Newton's method began
-    met: Flag  # whether it was worth while
+    begin: Float[Array, "coordinates"]  # starting point of Newton's method
+    met: Flag  # whether a solution was found
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
-    """Return coordinates from the first of several guesses that leads to the rows. The first of these guesses
-    is q itself.
-    """
+    """Return the solution from the first successful guess. The first guess is q itself."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
@@ -297,7 +300,8 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
     given = by.given(scene)
     G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
     low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
-    every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)  # coordinates that no row depends on stay
+    # coordinates on which no constraint depends stay
+    every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(eps_of(q))
     scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
@@ -310,20 +314,21 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
 
 def contradiction(dtype) -> float:
     """Return the residual (m, rad) above which given values count as contradictory. It allows for numbers
-    typed with a few digits, and for round-off.
+    with few digits, and for round-off.
     """
-    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: of numbers typed with a few digits
+    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: for numbers with few digits
 
 
 def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
-    """Return whether held values (entries that are not free) may contradict each other; `known`: those of the
-    scene.
+    """Return whether held values (entries that are not free) may contradict each other.
+    `known`: structure of the scene.
 
-    rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: their columns of what is free
+        rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: columns of the free variables
 
-    Under this condition there is no contradiction, except at isolated configurations.
+    If this holds, there is no contradiction, except at isolated configurations.
     """
-    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))  # otherwise rows determine the dependent ones
+    # otherwise the constraints determine the dependent ones
+    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))
     of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
     if of_speeds and not known.affine:
         return True
@@ -336,8 +341,8 @@ def _loses_rank(matrices, free) -> bool:
 
 @lru_cache(maxsize=64)
 def row_functions(program: RowProgram) -> RowFunctions:
-    """Return g and G, phi and A, and M, by the program; parts without machine code by automatic
-    differentiation.
+    """Return g and G, phi and A, and M, by the program; parts without machine code
+    use automatic differentiation.
     """
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
     if unsupported(program.graph, nodes) or program.graph.operations(nodes) > projection.LARGEST_PROGRAM:

@@ -1,12 +1,14 @@
 """Retries of failed motions, with `retry=True`: one rule for single motions and for batches.
 
-FULL_STATE    it left the domain in which its privileged speeds, or its program, serve: the full state, dense matrices
-IMPLICIT      an explicit solver ran out of steps that stability kept short: Radau's method
+    FULL_STATE    its independent speeds or its program became invalid: use the full state and dense matrices
+    IMPLICIT      an explicit solver with steps limited by stability ran out of steps: use Radau's method
 
-Retries add up, and each is made once: a stiff motion that left the domain runs with the full state by Radau's method.
+Retries add up, and each is made once: a stiff motion with invalid independent speeds runs with the
+full state by Radau's method.
 
-An explicit method of a step h follows a mode exp(-r t) only while h r stays below a small number (about 3 for Tsit5, 6 for Dopri8), however
-little of the mode is left. A motion that ran out of steps with h r near that number ran out of them for stability: `h r >= 1` is called stiff here.
+With an explicit method, a mode exp(-r t) limits the step h to a small number h r (about 3 for Tsit5, 6
+for Dopri8), however small the mode is. A motion that ran out of steps near that limit is stiff; the
+criterion here is `h r >= 1`.
 """
 
 from collections.abc import Callable
@@ -32,7 +34,8 @@ from jourdain_jax.motion.vector_fields.field import Instant, VectorField, as_for
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 
-RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
+# static fields of a trajectory, which tell how a sample was repeated
+RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")
 
 
 def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
@@ -47,18 +50,19 @@ def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup,
 def lanes_retried(
     run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
 ):
-    """Run failed lanes again in the way of single motions. Return all lanes, and for each kind of retry the
-    `RERUN_FIELDS` of its lanes.
+    """Repeat failed samples by the rule for single motions. Return all samples, and for each kind of retry
+    the `RERUN_FIELDS` of its samples.
 
-    `run`: the motions of lanes with these indices and options; `form`: their integrated state; `begun`: their
-    start times; `chunk`: that of `rollout`.
+    `run`: returns motions of samples with these indices and options; `form`: returns their integrated state;
+    `begun`: their start times; `chunk`: as in `rollout`.
     """
     reruns: dict[int, tuple] = {}
     while (again := _next_retries(form, lanes, begun, options)).any():
         for way in np.unique(again[again > 0]).tolist():
             chosen, changed = np.flatnonzero(again == way), _with_retries(way, options)
             for first in range(0, len(chosen), chunk):
-                size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))  # a power of two, so that few programs are compiled
+                # a power of two, so that few programs are compiled
+                size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))
                 index = chosen[np.minimum(np.arange(first, first + size), len(chosen) - 1)]
                 new = run(changed, index)
                 lanes, reruns[way] = _replaced(lanes, _marked(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
@@ -72,7 +76,7 @@ def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, 
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
-        # all lanes come to the host where one may run again
+        # copy all samples to the host only if one may run again
         known = jax.tree.map(np.asarray, lanes) if again.size else lanes
         for i in again:
             found[i] = _next_retry(field, at_index(known, i), begun[i], options)
@@ -89,14 +93,13 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 
 
 def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:
-    """Return the retries of a `motion` from `t0`: those already made and one more; AS_ASKED if none is left.
-
-    `field`: the integrated field; `options`: the given ones.
+    """Return the retries of a `motion` from `t0`: all earlier ones and one more; AS_ASKED if none is left.
+    `field`: the integrated field; `options`: the original options.
     """
     if np.all(known_numbers(motion.result) <= results.EVENT):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
-    another = field.name == "minimal" or field.lowered is not None  # the full state by dense matrices
+    another = field.name == "minimal" or field.lowered is not None  # the full state with dense matrices
     lost = another and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
@@ -107,19 +110,20 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
 
 
 def _with_retries(retries: int, options: AllOptions) -> AllOptions:
-    """Return the options that make these retries."""
+    """Return the options for these retries."""
     if retries & results.FULL_STATE:
-        solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver  # dense matrices have no series
+        # dense matrices support no Taylor series
+        solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver
         options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
     if retries & results.IMPLICIT:
-        # a step of the implicit solver costs tens of explicit ones: it gets a tenth of their number
+        # an implicit step costs tens of explicit ones, so allow a tenth of their number
         options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
     return options
 
 
 def _marked(motion: Trajectory, retries: int) -> Trajectory:
-    """Return one or several motions, marked as repeated by these retries. One that runs out of steps again
-    counts as stiff.
+    """Return one or several motions, marked as repeated by these retries. One that runs out of
+    steps again counts as stiff.
     """
     code = motion.result
     if retries & results.IMPLICIT:
@@ -128,15 +132,15 @@ def _marked(motion: Trajectory, retries: int) -> Trajectory:
 
 
 def lost_codes(field: VectorField) -> tuple[int, ...]:
-    """Result codes after which another form of the state may do better."""
+    """Return the result codes after which another form of the state may succeed."""
     guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
     by_guards = results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP, results.UNRESOLVED
     return results.SINGULAR_PARTITION, *(by_guards if guarded else ())
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
-    """Return whether a `motion` from `t0` ran out of steps because stability kept the steps short; False if
-    its numbers are unknown.
+    """Return whether a `motion` from `t0` ran out of steps because stability limited them;
+    False if its numbers are traced.
     """
     known = numbers_where_known((field, motion, t0))
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or known is None:
@@ -150,7 +154,7 @@ def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
 
 @eqx.filter_jit
 def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state state"]:
-    """Return the derivative of the rates at the end state with respect to the state without the work."""
+    """Return the Jacobian of the rates at the end state, without the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
     y = field.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))

@@ -1,22 +1,22 @@
-"""Warnings about derivatives through motions that amplify errors, as measured by differentiation itself, or
-that cross a jump of their loads.
+"""Warnings about derivatives of motions that amplify errors, as measured during differentiation, or that
+cross a jump of their loads.
 
-A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
-control lets pass at one state,
+In reverse mode, a value L of a motion has cotangents g = dL/dy at the states it uses and g_0 = dL/dy_0 at the
+start. With the error s = atol + rtol |y| that step-size control allows at one state,
 
     amplification = sum |g_0| s_0 / sum |g| s          relative error of a derivative <~ steps amplification rtol
 
-for every step adds an error of s, the derivative is taken along a path that is off by their sum, and changes along it as much as the motion itself does.
-Forward mode has tangents d instead, of the states saved and of the start, and s of the largest |y| of each:
+because every step adds an error s, and the derivative is evaluated along a path that is off by their sum. In
+forward mode, with tangents d of the saved states and of the start, and s for the largest |y| of each,
 
-    amplification = max |d_1|/s / max |d_0|/s                  where nothing but the start depends on what is varied
-                    (max |d_1|/s / max |d_middle|/s)^2         otherwise, and the smaller of both where the start does, too
+    amplification = max |d_1|/s / max |d_0|/s                  if everything depends only on the start
+                    (max |d_1|/s / max |d_middle|/s)^2         otherwise; the smaller of both if also on the start
 
-Where rates are f_1 before and f_2 after the time s(p) of a jump,
+If the rates are f_1 before and f_2 after a jump at time s(p),
 
-    dy/dp = (what JAX finds) + (f_1 - f_2) ds/dp
+    dy/dp = (JAX's derivative) + (f_1 - f_2) ds/dp
 
-and relations that a motion crossed are counted by its steps (`lowering/sides.py`).
+Steps count the relations that a motion crosses (`lowering/sides.py`).
 """
 
 import warnings
@@ -35,26 +35,26 @@ from jourdain_jax.scene.arguments import warn
 
 
 class SensitivityWarning(UserWarning):
-    """A derivative through a motion that amplifies errors so much that few of its digits are right, or whose
-    loads jump.
+    """Warning that few digits of a derivative are right because the motion amplifies
+    errors, or that its loads jump.
     """
 
 
 def _judge(amplification: float, rtol: float, steps: int) -> None:
-    """Warn if so many steps, each wrong by the tolerance, spoil a derivative."""
+    """Warn if the tolerances of all steps together spoil a derivative."""
     error = steps * amplification * rtol
     if error > 0.05:
         text = (
-            f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with "
-            f"rtol = {rtol:g} in each of {steps} steps its relative error may be {error:.0e}; tighten `rtol` "
-            "and `atol` (in float64), or shorten the span"
+            f"the motion amplifies errors {amplification:.1e} times: with rtol = {rtol:g} and {steps} steps, "
+                f"its derivative may have a relative error of {error:.0e}; tighten `rtol` and `atol` (in "
+                "float64), or shorten the span"
         )
         warnings.warn(text, SensitivityWarning, stacklevel=3)
 
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
-    """Return `integrate(setup)`. Its derivative, taken outside of `jit`, warns where the motion amplifies
-    errors too much.
+    """Return `integrate(setup)`, whose derivative, outside `jit`, warns if the
+    motion amplifies errors too much.
     """
     varies = tuple(name for name, part in setup._asdict().items() if is_traced(part))
     if not varies:
@@ -65,10 +65,10 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
         return integrate(setup)
     rtol, atol = float(known[2]), float(known[3])
     begun: list[np.ndarray] = []  # tangents of the start
-    looked_at: list[float] = []  # the ends that are looked at, weighed by their cotangents
+    looked_at: list[float] = []  # sizes of the states used, weighted by their cotangents
 
     def weighed(values, cotangents) -> float:
-        """Return `sum |g| (atol + rtol |y|)`; values that are not finite do not count."""
+        """Return `sum |g| (atol + rtol |y|)`, ignoring values that are not finite."""
         return float(sum(np.sum(np.nan_to_num(np.abs(g) * (atol + rtol * np.abs(y)), posinf=0.0)) for y, g in zip(values, cotangents, strict=True)))
 
     def start_varies(tangents):
@@ -82,17 +82,17 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
             return np.maximum(*(np.max(np.abs(d) / (atol + rtol * top), axis=1, initial=0.0) for d, top in zip(tangents, tops, strict=True)))
 
         ended = sizes(tangents[2:])
-        first = sizes(begun) if begun else np.zeros_like(ended)  # a start that nothing varies is not asked
+        first = sizes(begun) if begun else np.zeros_like(ended)  # zero if nothing varies the start
         half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
         with np.errstate(divide="ignore", invalid="ignore"):
             from_start, from_middle = np.where(first > 0, ended / first, np.inf), np.where(half > 0, (ended / half) ** 2, 0.0)
         grown = np.where(first > 0, from_start, 0.0) if varies == ("start",) else np.minimum(from_start, from_middle)
         _judge(float(np.max(grown)), rtol, steps)
 
-    def start_is_asked(cotangents):  # which comes last
+    def start_is_asked(cotangents):  # called last in reverse mode
         ended = sum(looked_at)
         looked_at.clear()
-        if ended > 0:  # nothing is known of the ends of a motion that JAX traces
+        if ended > 0:  # ends of a traced motion are unknown
             _judge(weighed(known[:2], cotangents) / ended, rtol, steps)
 
     at_start = tap_cotangents(tap_tangents((start.q, start.u), start_varies), start_is_asked)
@@ -109,8 +109,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """Warn if one of the differentiated `motions` crossed relations at which rates jump. If crossings are
-    unknown, there is no warning.
+    """Warn if a differentiated motion crossed relations at which rates jump.
+    Traced crossings give no warning.
     """
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
@@ -119,16 +119,14 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
     if moving_jumps(field, names, motions.inputs, scene_varies, bool(np.all(crossings >= 0))):
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
-            f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, "
-            "`where`, `sign`, `floor`, ...) at which loads jump: its derivatives omit the shift of the time "
-            "of the jump. Let loads change within a short time or length, as by `jnp.tanh`, or end the "
-            "motion there by an event and start another; the motion itself is right"
+            f"a motion of `{type(motions.scene).__name__}` {met} a jump of its loads (`<`, `where`, `sign`, "
+                "`floor`, ...); its derivatives omit the shift of the jump's time. Smooth the load, as by "
+                "`jnp.tanh`, or end the motion there by an event and start another"
         )
         warn(text, SensitivityWarning)
 
 
 def numbers_where_known(values):
-    """Return the values with numbers if they are differentiated outside `jit`; None if they have no numbers.
-    """
+    """Return the values as numbers if they are differentiated outside `jit`; None if they are traced."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
     return None if is_traced(bare) else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)

@@ -1,7 +1,8 @@
-"""The integration problem of a motion, and the results of an integrator.
+"""Setup of a motion for an integrator, and the results of an integrator.
 
-Time counts from the start, tau = t - t0: far from zero a clock has few digits, and what does not depend on it is to be as right there as at t0 = 0.
-Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
+Integrators use the time since the start, tau = t - t0, because a clock far from zero has few digits;
+time-independent scenes are then equally accurate at any t0. Rates, projection and events receive tau, the
+scene and its inputs t0 + tau.
 """
 
 import abc
@@ -22,23 +23,23 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
-MEMORY = 2**32  # bytes, where no model states others
-LONGEST = 1 / 16  # of the span: the longest step, by default
+MEMORY = 2**32  # bytes, unless a model sets a limit
+LONGEST = 1 / 16  # default of the longest step, relative to the span
 
 
 class Passed(eqx.Module):
-    """The events after which a motion continued."""
+    """Events after which a motion continued."""
 
-    ts: Float[Entries, "transitions *lanes"]  # since the start; infinite beyond the last one
+    ts: Float[Entries, "transitions *lanes"]  # since the start; infinite after the last one
     events: Int[Entries, "transitions *lanes"]
-    lost: Float[Entries, "transitions *lanes"]  # J, by which the energy fell
-    modes: Float[Entries, "modes transitions *lanes"]  # after each
+    lost: Float[Entries, "transitions *lanes"]  # loss of energy, J
+    modes: Float[Entries, "modes transitions *lanes"]  # after each event
 
     def times(
         self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
     ) -> Float[Array, "transitions"]:
-        """Return the times of transitions, rounded consistently: a transition before a goal (measured from
-        the start) is also before the saved time in `ts` that belongs to the goal.
+        """Return the times of transitions, rounded consistently with the saved times. `goals` are the saved
+        times `ts` measured from the start; a transition before a goal must also precede its saved time.
 
         Adding the `origin` to a time since the start may round it onto the wrong side.
         """
@@ -47,7 +48,7 @@ class Passed(eqx.Module):
         found = origin + self.ts
         known = jax.lax.stop_gradient((ts, origin + goals, self.ts, goals, found))
         ts, also, tau, goals, now = (direction * x for x in known)
-        number = jnp.searchsorted(goals, tau)  # of saved states that are before it
+        number = jnp.searchsorted(goals, tau)  # number of saved states before it
         least = jnp.append(-jnp.inf, jnp.nextafter(jnp.maximum(ts, also), jnp.inf))[number]
         most = jnp.append(jnp.minimum(ts, also), jnp.inf)[number]
         return found + direction * (jnp.clip(now, least, most) - now)
@@ -57,9 +58,9 @@ NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((
 
 
 class Solved(eqx.Module):
-    """The result of an integrator."""
+    """Result of an integrator."""
 
-    ts: Float[Array, "times *lanes"]  # as t_end, since the start
+    ts: Float[Array, "times *lanes"]  # since the start, like t_end
     ys: PyTree
     reached: Bool[Array, "times *lanes"]
     t_end: PerLane
@@ -68,14 +69,15 @@ class Solved(eqx.Module):
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
-    last_step: PerLane  # s, that the step-size control would take next; NaN where it keeps that to itself
-    pivot: PerLane  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
+    last_step: PerLane  # s, proposed by step-size control for the next step; NaN if unknown
+    # smallest pivot magnitude over all steps, negative after a change of sign; infinite if none was monitored
+    pivot: PerLane
     crossings: Int[Array, "*lanes"]  # as in `Trajectory`
     passed: Passed
 
 
 class Integrator(abc.ABC):
-    """The integrator of a motion: our own steps (`motion/own_steps.py`) or diffrax
+    """Integrator of a motion: this package's steps (`motion/own_steps.py`) or diffrax
     (`motion/diffrax_steps.py`).
 
     Numbers that change with every call are in the `Setup`.
@@ -89,28 +91,28 @@ class Integrator(abc.ABC):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """The solver, as shown in a trajectory."""
+        """Return the name of the solver, as shown in a trajectory."""
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
-        """Return in words why XLA compiles the loop over steps, in place of our machine code; empty if
-        machine code runs it.
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
         """
 
     @abc.abstractmethod
     def solved(self, setup: "Setup", begun: "Begun") -> Solved:
-        """One motion."""
+        """Return one motion."""
 
     def lanes_solved(self, setups: "Setup", begun: "Begun") -> Solved:
-        """Lanes; all arrays have a leading axis of lanes."""
-        # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
+        """Return the motions of a batch; all arrays have a leading batch axis."""
+        # hide times shared by all samples from XLA, which otherwise propagates them through diffrax's
+        # `nextafter` one operation per pass
         times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0))
         timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, times)
         return eqx.filter_vmap(self.solved)(timed, begun)
 
 
-class Setup(NamedTuple):  # an Equinox module takes 50 us to make
-    """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
+class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes 50 us
+    """Motion to be integrated; in a batch all arrays have a leading batch axis."""
 
     scene: Scene
     start: State
@@ -121,72 +123,70 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     field: VectorField
     tolerances: tuple  # rtol, atol
     dt0: Float[Entries, "*lanes"] | float
-    longest: Float[Entries, "*lanes"] | float  # step, s
+    longest: Float[Entries, "*lanes"] | float  # longest step, s
     integrator: Integrator
-    usual: Usual | None  # sizes by which the start is projected; None where it is on its constraints
-    judged: bool  # whether parameters were known where the scene was probed, and so judged there, at many states
-    reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
+    usual: Usual | None  # typical sizes for projecting the start; None if it is on its constraints
+    judged: bool  # whether probing has already checked these parameters, at many states
+    reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
 
     def fitting(self) -> "Setup":
-        """Return the setup with times that any loop accepts. No time lies beyond the end by round-off, and
-        inconsistent times are replaced by times of a short span.
+        """Return the setup with times that any loop accepts: none beyond the end by round-off, and
+        inconsistent ones replaced by a short span.
         """
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
         shares = {"ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype), "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
-        # 1e-9 s: of motions that are not requested
+        # 1e-9 s, for motions that are not requested
         return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x) for name, x in shares.items()})
 
     @property
     def reason_against_machine_code(self) -> str:
-        """Return in words why XLA compiles the loop over steps, in place of our machine code; empty if
-        machine code runs it.
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
         """
         return self.integrator.reason_against_machine_code(self)
 
     def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
-        """Return the largest number of steps; those that end at knots do not count."""
+        """Return the maximum number of steps, including those forced by sample times of inputs."""
         return self.integrator.max_steps + (0 if knots is None else len(knots))
 
     def goals(self, ts) -> Float[Array, "times *lanes"]:
-        """Return times since the start to reach: the saved times, and the end."""
+        """Return the times since the start at which steps must end: the saved times and the end."""
         return jnp.concatenate([ts, self.t1[None]]) - self.t0
 
     @property
     def shortest(self) -> PerLane:
-        """The shortest step, s."""
+        """Return the shortest step, s."""
         return 1e-14 * jnp.abs(self.t1 - self.t0)
 
     @property
     def knots(self) -> Float[Array, "knots"] | None:
-        """Times since the start at which steps must end for the inputs' sake."""
+        """Return the sample times of inputs at which steps must end, measured from the start."""
         return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as given: without derivatives, and without lanes where all samples of a batch share
-    them.
+    """Numbers of a motion as given: without derivatives, and without a batch axis if all samples share them.
     """
 
-    times: dict  # as of a `Setup`
+    times: dict  # as in a `Setup`
     known: tuple  # `native_motion.known_of`
 
 
 class Begun(eqx.Module):
-    """The start of the integration, marked for the adjoint."""
+    """Start of the integration, marked for the adjoint."""
 
-    right: Flag  # whether all parameters are, and the masses and inertias that they make
-    timely: Flag | np.bool_  # whether the times go together
+    right: Flag  # whether parameters, masses and inertias are valid
+    timely: Flag | np.bool_  # whether the times are consistent
     start: State
-    args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
+    args: tuple  # vector field, scene, inputs, the scene's fixed values, origin of time
     y0: Integrated
-    plain: Plain | None = None  # where kernels of a GPU are given numbers once
+    plain: Plain | None = None  # for GPU kernels, which receive shared numbers once
 
 
 def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
-    """Return whether the span is finite and not empty, and the saved times lie in it in order; also for
-    traced times.
+    """Return whether the span is finite and not empty, and the saved times lie in it in
+    order; also for traced times.
     """
     xp = array_module((ts, t0, t1))
     direction = xp.sign(t1 - t0)

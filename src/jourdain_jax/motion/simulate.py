@@ -1,8 +1,8 @@
-"""Simulation: from a scene and a start to a `Trajectory`, by our own loop over steps or by a solver of
-diffrax.
+"""Simulation: from a scene and a start to a `Trajectory`, by this package's loop over steps or by diffrax.
 
-The default state is the minimal one (coordinates and privileged speeds) where the privileged velocities are well conditioned over the scene's
-domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
+The default state is minimal (coordinates and independent speeds) if the independent speeds are well
+conditioned over the scene's domain and the constraints are linear or affine. Otherwise it is full
+(coordinates and all speeds), projected after every step.
 """
 
 from collections.abc import Mapping
@@ -54,28 +54,29 @@ def simulate(
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
     **Arguments**
-    - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
-    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
-      `example_span` after t0); `ts`: times to save at (default: 201 even ones), at each of which a step ends.
-    - `inputs`: name -> number, function of time, or `Sampled`.
-    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as `rtol=1e-10`, which take precedence.
 
-    By name alone: - `formulation`: the equations to integrate, a `jj.Formulation(state, reduction,
-    stabilisation)` (default: chosen for the scene). - `backend`: "native", the scene's scalar program
-    (`jj.lower`) as machine code, where llvmlite is installed and the solver is a default one; "xla", that
-    program compiled by XLA, which also has what machine code lacks: third derivatives, derivatives with
-    respect to samples, `jax.export`, other devices; "dense", the dense matrices; "auto" (default), the first
-    of these that applies. The first two take the same steps.
+    - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for
+      the scene's example.
+    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the
+      scene's `example_span` after t0); `ts`: times to save (default: 201 even ones), at each of which a step ends.
+    - `inputs`: name -> number, function of time, or `Sampled`.
+    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as
+      `rtol=1e-10`, which take precedence, and two further settings:
+    - `formulation`: the equations to integrate, a `jj.Formulation(state, reduction, stabilisation)` (default:
+      chosen for the scene).
+    - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code, which needs llvmlite and a
+      default solver; "xla", that program compiled by XLA, which also supports third derivatives, derivatives
+      with respect to samples, `jax.export` and other devices; "dense", dense matrices; "auto" (default), the
+      first that applies. The first two take the same steps.
 
     All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in
-    all combinations
-    (`jax.hessian`); elsewhere forward mode of forward mode works, to any order.
+    all combinations (`jax.hessian`); other backends support forward mode of forward mode, to any order.
 
-    **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
-    `SimulationError`.
+    **Returns** a `Trajectory`. Failures set a result code, with a message that says what to do;
+    `trajectory.raise_if_failed()` raises `SimulationError`.
 
-    **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` for
-    unsupported derivatives.
+    **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the
+    constraints, `DifferentiationModeError` for unsupported derivatives.
 
     **Examples**
 
@@ -103,8 +104,8 @@ def simulate(
 
 
 def _integrated(setup: Setup) -> Trajectory:
-    """Integrate the motion. Under `jax_debug_nans` the NaN after an event is only a marker; a motion that
-    failed is integrated again, so that JAX finds the operation that made the NaN.
+    """Integrate the motion. Under `jax_debug_nans`, NaN after an event is only a marker; a failed motion is
+    integrated again, so that JAX reports the operation that made the NaN.
     """
     if not jax.config.jax_debug_nans:
         return integrate(setup)
@@ -123,16 +124,16 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     scene, max_step, (solver, order) = model.scene, options.max_step, solver_of(options)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
-            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`, whose steps are at most "
-                f"its `step`: give jj.{solver.name}(step=...)")
+            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`; set its step with "
+                f"jj.{solver.name}(step=...)")
         max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
     constant = inputs.constant
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
-        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, and time runs from t0 = {t0} "
-            f"back to t1 = {t1} s; give t1 > t0")
+        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, which cannot run back in "
+            f"time from t0 = {t0} to t1 = {t1} s; pass t1 > t0")
     start, usual = _start(model, start, t0, inputs)
     field, dtype = model.field(constant, bool(options.work)), start.q.dtype
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
@@ -142,8 +143,10 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": events, "alongside": options.alongside}
     own = own_steps(solver, **static, native=native, order=order, memory=options.memory or MEMORY, most=options.max_transitions, stopping=options.events)
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
-    tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
-    first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
+    # as arrays, so that another tolerance needs no other program
+    tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))
+    # diffrax's own guess would compile two more copies of the vector field
+    first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     judged = model.once("judged", lambda: is_judged(scene))
     steps = tolerances, first_step, longest, integrator
@@ -151,8 +154,8 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
-        asked, advice = ("backend='native'", "use backend='auto', which chooses the fastest "
-            "possible") if order is None else _BY_SERIES
+        asked, advice = ("backend='native'",
+            "use backend='auto', the fastest possible") if order is None else _BY_SERIES
         raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
 
@@ -161,8 +164,8 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
-    """Return the start on its constraints. A `State` stays unchanged; the integrating program projects it, by
-    the sizes that are returned with it.
+    """Return the start on its constraints. A `State` stays unchanged; the integrating program projects it
+    with the typical sizes returned here.
     """
     if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
@@ -172,19 +175,20 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
 
 
 def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMethod | Method", int | None]:
-    """Return the solver (by default the one for the tolerance) and, for Taylor series, the order. Raises
-    ValueError if a traced tolerance would have to decide.
+    """Return the solver (by default chosen by tolerance) and, for Taylor series, the order. Raises ValueError
+    if a traced tolerance would have to decide.
 
-    Warns where the precision cannot satisfy the tolerance.
+    Warns if the precision cannot satisfy the tolerance.
     """
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
-        warn(f"rtol = {rtol} needs more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5")
+        warn(f"rtol = {rtol} is too small for float32; set jax.config.update('jax_enable_x64', True), or "
+            "raise rtol and atol to 1e-5")
     if isinstance(solver, Taylor):
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):
-        raise ValueError("`rtol` is traced, but the default solver is chosen by its value; give a `solver` "
-            "too, such as diffrax.Dopri8()")
+        raise ValueError(
+            "`rtol` is traced, but decides the default solver; pass a `solver` too, such as diffrax.Dopri8()")
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
@@ -196,8 +200,8 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
     """Return a state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`),
     or None for the scene's example.
 
-    `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); velocity rows may
-    depend on them.
+    `inputs`: the scene's inputs at that time, a vector or by name (default: zero); velocity
+    constraints may depend on them.
     """
     if isinstance(given, State):
         return given
@@ -212,7 +216,7 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):
-    """Return t0, the saved times, and t1. Raises ValueError if known values are inconsistent."""
+    """Return t0, the saved times, and t1. Raises ValueError if concrete values are inconsistent."""
     from_state = isinstance(start, State)
     if from_state and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or "
@@ -225,19 +229,19 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         t1 = as_array(t0 + scene.example_span if ts is None else ts[-1], t0.dtype)
     ends = known_numbers((t0, t1)).tolist()
     if ends and not 0 < abs(ends[1] - ends[0]) < np.inf:
-        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` "
-            "different from `t0`")
+        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; pass a "
+            "finite `t1` different from `t0`")
     if ts is None:
-        ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # of known ends: nothing to compile
+        ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # in NumPy if concrete, without compilation
     elif not known_numbers(times_fit(ts, t0, t1)).all():
         raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
-            f"{t1} s or in the opposite direction; give `t0` and `t1` that enclose it")
+            f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose it")
     return t0, ts, t1
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
-    """Return the saved times, on NumPy if known. Raises ValueError unless they are a monotonic vector of
-    finite numbers.
+    """Return the saved times, in NumPy if concrete. Raises ValueError unless they are a
+    monotonic vector of finite numbers.
     """
     ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))

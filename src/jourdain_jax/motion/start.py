@@ -1,6 +1,6 @@
-"""Consistent starts: a guess of q and u projected onto the constraints, with the size of the change.
+"""Consistent starts: a guess of q and u projected onto the constraints, and the size of the change.
 
-g(t, q) = 0,  phi(t, q, u) = 0
+    g(t, q) = 0,  phi(t, q, u) = 0
 """
 
 from collections.abc import Callable, Mapping
@@ -47,10 +47,11 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
     """Return the state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds
     M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
-    `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
+    `inputs`: values of the scene's inputs (default: zero). `held`: names of
+    coordinates and speeds that stay fixed.
 
-    Differentiable in any mode. The remaining violation is in `residual`; it is infinite where numbers are not
-    finite, without an error, since this also runs inside jit and vmap. The quaternion (0, 0, 0, 0) has no
+    Differentiable in any mode. The remaining violation is in `residual`. It is infinite for numbers that are
+    not finite; no error is raised, so that this works inside jit and vmap. The quaternion (0, 0, 0, 0) has no
     direction and stays unchanged, with a residual of 1/2. Raises ValueError for wrong shapes.
     """
     model, scene = modelled(scene), as_scene(scene)
@@ -63,27 +64,30 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
 
 
 def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None = None) -> State:
-    """Return the nearest state; if Newton's method fails, the result of a damped search from q, then from
-    other configurations, `guesses()`.
+    """Return the nearest state; if Newton's method fails, search by damped steps from q, then from other
+    configurations, `guesses()`.
     """
     given = scene, t, start, inputs
-    if not nothing_is_traced() and is_traced(given):  # the first takes less time
+    if not nothing_is_traced() and is_traced(given):  # the first check is cheaper
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
-    # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
+    # project concrete numbers at once, also inside a trace, which would otherwise
+    # compile constants one by one
     with at_once():
         state, arrived = _compiled_projection(*given, None)
-        if guesses is not None and len(start.usual.closures) and not np.asarray(arrived):  # rare, and long to compile
+        # rare, and slow to compile
+        if guesses is not None and len(start.usual.closures) and not np.asarray(arrived):
             by_xla = start._replace(usual=replace(start.usual, program=None))
             state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
     return state
 
 
 def _as_input_vector(scene: Scene, inputs, dtype):
-    """Return a vector on NumPy unchanged, without tracing."""
+    """Return the input vector; a NumPy vector is returned without tracing."""
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-_compiled_projection = compiled_quickly(put_onto_constraints)  # one program for every choice of what is held
+# one program for every choice of held variables
+_compiled_projection = compiled_quickly(put_onto_constraints)
 _uncompiled_projection = eval_numpy(put_onto_constraints)
 
 
@@ -92,24 +96,31 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
     """Return a consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`,
     or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
-    `values`, by keyword or in a dictionary `given` (a keyword takes precedence), are kept, at time `t0` (s).
-    Values that contradict each other by at most 1.5e-5, as numbers typed with a few digits may, move onto the
-    constraints. Omitted coordinates begin at zero (a quaternion at the identity) and follow from the rows;
-    where that fails or leaves the scene's `domain`, they begin at states of the domain, nearest first, as
-    `guess` of the state reports. `near`: coordinates by name with starting values at which they are not held;
-    these may end outside of the domain, as may coordinates that the rows determine uniquely. If a quaternion
-    is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other parts are zero. Omitted
-    privileged speeds stay zero, and the dependent speeds follow from the rows; if dependent speeds are given,
-    all others are solved for: the smallest change that satisfies the constraints, in the metric of the mass
-    matrix. `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; velocity rows may
-    depend on their values at `t0`. In a program to export, pass `jj.build(scene, backend="xla")` in place of
-    the scene. Raises ValueError, where values are known, for an unknown name, a value that is not finite, and
-    given values that contradict the constraints or lie in no state of the domain. For unknown values
-    `residual` is infinite instead, and a motion from there ends with a code.
+    `values`, by keyword or in a dictionary `given` (keywords take precedence), are held at time `t0` (s).
+    Values that contradict each other by at most 1.5e-5, as rounded numbers may, move onto the constraints.
+
+    Omitted coordinates start at zero (a quaternion at the identity) and follow from the constraints. If that
+    fails or leaves the scene's `domain`, they start at other states of the domain, nearest first, which the
+    `guess` of the state counts. `near`: initial guesses of coordinates by name. These may end outside the
+    domain, as may coordinates that the constraints determine uniquely. If a quaternion is partly given,
+    `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other components are zero.
+
+    Omitted privileged speeds stay zero, and the dependent speeds follow from the constraints. If dependent
+    speeds are given, all others are determined by the smallest change that satisfies the constraints, in
+    the metric of the mass matrix.
+
+    `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; velocity constraints
+    may depend on their values at `t0`. In a program to export, pass `jj.build(scene,
+    backend="xla")` instead of the scene.
+
+    Raises ValueError for an unknown name, a value that is not finite, and concrete values that contradict the
+    constraints or belong to no state of the domain. For traced values `residual` is infinite instead, and a
+    motion from there ends with a code.
     """
     model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
+        raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, "
+            "lean=0.3)`, or a dictionary of them")
     check_kind(near, Mapping | None, "`near`", 'a dictionary of coordinates: near={"z": -0.4}')
     t = one_time(t0)
     _check_finite("t0", t)
@@ -118,8 +129,8 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
 
 
 def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NOTHING) -> State:
-    """Return the start that `start` describes; `inputs` at time `t` (an array): a vector, or by name (None:
-    zero).
+    """Return the start that `start` describes; `inputs` at time `t` (an array): a
+    vector, or by name (None: zero).
     """
     scene = model.scene
     q, u, given = vectors_named(scene, {**near, **values})
@@ -156,11 +167,11 @@ def _check_finite(name: str, value) -> None:
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
-    """Return marks of the coordinates and speeds that constraints determine, and whether given values may
-    contradict each other. Given values and guesses are as in `Guess`.
+    """Return masks of free coordinates and free speeds and of bounded coordinates, typical sizes, and whether
+    given values may contradict each other.
 
-    Omitted privileged speeds stay zero, unless a dependent speed is given. Coordinates that are neither given
-    nor guessed must lie in the domain, unless the rows are affine and determine them uniquely.
+    Omitted privileged speeds stay zero unless a dependent speed is given. Coordinates that are neither given
+    nor guessed must lie in the domain, unless the constraints are affine and determine them uniquely.
     """
     scene, known = model.scene, structure_of(model.scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
@@ -173,18 +184,19 @@ def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
         slopes = [n for (_, k), n in program.G.items() if free_q[k]]
         bounded = bounded & any(depend_on(program.graph, slopes, np.array(program.q)[free_q].tolist()))
     with at_once():
-        on_device = jax.device_put((free_q, free_u, bounded))  # handed over in a third of the time that arrays of NumPy take
+        # passing these on takes a third of the time of NumPy arrays
+        on_device = jax.device_put((free_q, free_u, bounded))
     return (*on_device, usual), may_contradict(scene, known, free_q, free_u)
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
-    """Move the start as a whole if its residual is too small for a contradiction.
+    """Move the whole start onto the constraints if its residual is too small for a contradiction.
 
-    If the residual is only round-off, the numbers stay. Traced values nevertheless get the derivatives of a
-    moved start, since values that agree at these parameters may contradict each other at others.
+    If the residual is only round-off, the numbers stay. Traced values still get the derivatives of a moved
+    start, because values that agree at these parameters may contradict each other at others.
     """
     near = start.residual < contradiction(start.q.dtype)
-    if not known_numbers(near & (start.residual > OFF * eps_of(start.q))).all():  # more than round-off is left
+    if not known_numbers(near & (start.residual > OFF * eps_of(start.q))).all():  # more than round-off
         return start
     state = consistent(model, start.t, start.q, start.u, inputs)
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
@@ -200,20 +212,18 @@ def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> 
     for k in outside[:1] if float(left_of(jnp.asarray(g))) == 0 else ():
         name, found = scene.coordinate_names.entries[k], float(state.q[k])
         raise ValueError(
-            f"no start of `{who}` was found with `{name}` in its `domain`, "
-            f"{scene.domain[name]}, with the given values held ({held}): the nearest one has "
-            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, to search '
-            'near it, also outside the domain'
+            f"no start of `{who}` has `{name}` in its `domain`, {scene.domain[name]}, with the given values "
+                f"held ({held}); the nearest has {found:.6g}. Change the values or the `domain`, or pass "
+                f'near={{"{name}": {found:.2g}}} to search outside'
         )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
     names += [f"norm of quaternion {k + 1}" for k in range(len(g) - len(names))] + list(names_of_rows(scene))
     worst = int(np.argmax(np.concatenate([g, phi])))
     within = any(bounded and name in scene.domain for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True))
-    elsewhere = ", give some as guesses by `near=`, which are looked for outside of the `domain` as well" if within else ""
+    elsewhere = ", pass some as guesses by `near=` to search outside the `domain`" if within else ""
     raise ValueError(
         f"the start of `{who}` violates constraint `{names[worst]}`: residual "
-        f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}); give fewer "
-        f"values and let the constraints decide the rest{elsewhere}, or use `jj.consistent(scene, t, q, u)` "
-        "to move all of them"
+            f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}). Give fewer "
+            f"values{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )

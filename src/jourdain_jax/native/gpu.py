@@ -118,8 +118,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
     with _loading:
         if number not in _kernels:
             if len(_kernels) == MOST_KERNELS:
-                raise RuntimeError(f"this process has compiled {MOST_KERNELS} GPU kernels, the maximum; "
-                    "start a new process")
+                raise RuntimeError(
+                    f"this process has compiled {MOST_KERNELS} GPU kernels, the maximum; start a new process")
             ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
             _kernels[number] = found = nvidia.loaded(ptx, ffi.KERNEL)
             place = _WORDS * (len(_kernels) - 1)

@@ -30,8 +30,8 @@ def draw_eigenvalues(study: Study, path: FilePath) -> None:
     _mark_range(study, (real, imaginary))
     real.axhline(0.0, color="0.3", lw=0.8)
     real.set(ylim=(-_CEILING, _CEILING), ylabel="real part in 1/s")
-    imaginary.set(ylabel="imaginary part in rad/s", xlabel="forward speed in "
-        "m/s", xlim=(study.grid[0], study.grid[-1]))
+    imaginary.set(ylabel="imaginary part in rad/s",
+        xlabel="forward speed in m/s", xlim=(study.grid[0], study.grid[-1]))
     imaginary.set_ylim(bottom=0.0)
     real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands (grey for the speeds) "
         f"contain 95 % of {len(samples)} samples", fontsize=10)
@@ -94,5 +94,5 @@ def animate_ride(study: Study, path: FilePath) -> None:
     """Animate the first ride (below the stable range), with the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)
-    animate(lane, path, follow=True, paths=[], title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, "
-        f"{rides.labels[0]}")
+    animate(lane, path, follow=True, paths=[],
+        title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}")

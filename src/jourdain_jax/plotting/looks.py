@@ -70,8 +70,8 @@ def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None
     """
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
-        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; pass "
-            "earlier `ts`")
+        raise ValueError(
+            f"the motion reached none of its saved times, so there is nothing to {what}; pass earlier `ts`")
     if most is not None and most < reached.size:
         reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
     return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))

@@ -202,8 +202,8 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
     strongest = float(sizes.max())
     usual = 2.0 * float(np.quantile(sizes[1:], 0.9)) if strongest else 0.0
     longest = usual if 0.0 < 2.0 * usual <= strongest else strongest
-    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} "
-        "N" if longest < strongest else "") if strongest else ""
+    told = f"longest arrow: {longest:.3g} N" + (
+        f" and more, up to {strongest:.3g} N" if longest < strongest else "") if strongest else ""
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         return 0.4 * size * vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest or 1.0)

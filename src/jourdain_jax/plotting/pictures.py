@@ -131,8 +131,8 @@ def scene_picture(scene) -> str:
 
 def _check_one(trajectory, where: str, example: str) -> None:
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
-        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a rollout "
-            f"pass one lane: {example}")
+        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a "
+            f"rollout pass one lane: {example}")
 
 
 def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:

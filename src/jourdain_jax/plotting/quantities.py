@@ -142,8 +142,8 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
         axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
     axes = np.atleast_1d(axes)
     if len(axes) != len(names):
-        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names; pass one for each of "
-            f"{', '.join(names)}")
+        raise ValueError(
+            f"`axes` holds {len(axes)} axes for {len(names)} names; pass one for each of {', '.join(names)}")
     for axis in axes:
         axis.grid(alpha=0.3)
     return axes

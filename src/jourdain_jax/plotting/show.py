@@ -73,8 +73,8 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath |
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
     check_names(display.colours, names, "`colours` names `{}`, which is not a body")
     if np.shape(display.view) != (2,):
-        raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as "
-            "(22, -60)")
+        raise ValueError(
+            f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
     description, numbers = page_data(motions, display)
     shown = View(_page(display.title, description, numbers.bytes()), display.title, display.height)
     if path is not None:
@@ -92,8 +92,8 @@ def _motions(given) -> list[Trajectory]:
         return [given]
     if isinstance(given, list | tuple) and given:
         return [one for several in given for one in _motions(several)]
-    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a rollout, "
-        "or a list of these")
+    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a "
+        "rollout, or a list of these")
 
 
 def _page(title: str, description: dict, numbers: bytes) -> str:

@@ -1,1 +1,2 @@
-"""Motions on arrays of JAX, by the source of a step (`motion/native/step.py`), where there is no machine code."""
+"""Motions in JAX, from the source of a step (`motion/native/step.py`), where machine code is not available.
+"""

@@ -1,9 +1,9 @@
-"""Reverse mode of the loop on arrays, by the source of machine code (`motion/native/back.py`).
+"""Reverse mode of the loop in JAX, by the source of machine code (`motion/native/back.py`).
 
-The motion is integrated once more, and each try of a step is recorded in a window of bounded length. When
-the last window has been traversed backwards, each earlier one is integrated again, with the same bits,
-from the nearest checkpoint: a state at the beginning of a window. The number of checkpoints is bounded,
-too; when there is no room for another one, every second one is dropped.
+The motion is integrated once more, and each trial step is recorded in a window of limited length.
+After the last window, each earlier one is integrated again, bit for bit, from the nearest checkpoint:
+a state at the beginning of a window. The number of checkpoints is limited, too; when it is reached,
+every second one is dropped.
 """
 
 import math
@@ -26,13 +26,14 @@ from jourdain_jax.motion.native.start import Start
 from jourdain_jax.motion.native.transitions import is_noted, reset_back
 
 SLOTS = (
-    256  # tries of steps in a window, or fewer where memory is short: at least a sixteenth, as of checkpoints
+    # trial steps per window, or fewer if memory is short, but at least a sixteenth; the same for checkpoints
+    256
 )
 
 
 class _Record(NamedTuple):
-    """The forward steps of a motion: their number, the window that is kept in memory, and checkpoints, each
-    after `every` given number of windows.
+    """Forward steps of a motion: their number, the window in memory, and
+    checkpoints at every `every` windows.
     """
 
     going: Going
@@ -52,7 +53,7 @@ def cotangents(
     g_t: Array,
     g_log: Array,
 ) -> tuple[Array, list[Array]]:
-    """Return cotangents of the initial state, and of the known arrays with the numbers `asked`.
+    """Return cotangents of the initial state, and of the known arrays with the indices `asked`.
 
     `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and its time, and of
     times of transitions. `memory`: bytes; the window and the checkpoints each take at most a quarter.

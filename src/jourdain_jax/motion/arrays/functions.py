@@ -1,7 +1,7 @@
-"""Rates, projection and stop events as JAX functions, where machine code has a scalar program.
+"""Rates, projection and stop events as JAX functions, which replace the scalar program of machine code.
 
 The source of a step differentiates the step; JAX differentiates only these functions. A state is followed by
-its tangents (`motion/native/layout.py`), and so are the arrays that all steps share: `pushed` returns the
+its tangents (`motion/native/layout.py`), and so are the arrays shared by all steps: `pushed` returns the
 values of a function with all its tangents, by nested `jvp`.
 """
 
@@ -26,7 +26,7 @@ from jourdain_jax.motion.vector_fields.field import Integrated
 
 @dataclass(frozen=True)
 class ArrayForm(Form):
-    """Hold the sizes of the integrated state without a scalar program."""
+    """Sizes of the integrated state without a scalar program."""
 
     program: None  # type: ignore[assignment]
     coordinates: int = 0  # type: ignore[assignment]
@@ -38,7 +38,7 @@ class ArrayForm(Form):
 
     @property
     def monitored(self) -> range:  # type: ignore[override]
-        """Return the monitored quantities at all stages of a step, as of a program."""
+        """Return the indices of quantities monitored at all stages of a step, as for a program."""
         return range(self.pivots + self.turning + len(self.squares))
 
     @property
@@ -48,8 +48,8 @@ class ArrayForm(Form):
 
 
 def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
-    """Return the values of `f` at the first part, then the tangents for the other parts in their order (None:
-    zero).
+    """Return the values of `f` at the first part, then its tangents for the other
+    parts in order (None: zero).
     """
     if len(parts) == 1:
         return [f(*parts[0])]
@@ -73,26 +73,26 @@ def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
 
 @dataclass
 class Functions:
-    """Evaluates rates, projection, events and their cotangents on rows in memory, as a step calls them."""
+    """Rates, projection, events and their cotangents on rows in memory, as a step calls them."""
 
     w: ArrayWriter
     form: Form
-    rest: tuple  # of the arguments of rates, without arrays
-    shared: tuple[Sequence, ...]  # these arrays, then tangents of them
-    asked: tuple[int, ...]  # of which of them cotangents are asked
+    rest: tuple  # arguments of rates without arrays
+    shared: tuple[Sequence, ...]  # these arrays, then their tangents
+    asked: tuple[int, ...]  # indices of arrays whose cotangents are requested
     method: Any
-    middle: Array | None = None  # of the step whose stages are computed
+    middle: Array | None = None  # middle of the step whose stages are computed
     modes: Sequence[Array] = ()
 
     def __post_init__(self) -> None:
         self.y, self.count = Rows(0, self.form.y), self.form.y
 
     def take_modes(self, state: Pointer) -> None:
-        """Take all functions in the modes that the lanes are in."""
+        """Set the modes of all functions to the current modes of the lanes."""
         self.modes = [self.w.load(state, row) for row in self.form.rows["mode"]]
 
     def in_step(self, t, h) -> None:
-        """Take the rates as within this step: samples have one slope there."""
+        """Restrict the rates to this step, in which samples have one slope."""
         self.middle = t + 0.5 * h
 
     def _args(self, shared: Sequence, middle: Array | None = None) -> PyTree:
@@ -139,7 +139,7 @@ class Functions:
         for k, x in enumerate(found):
             self.w.store(x, place, Rows(k * rows, rows))
 
-    # the counterparts of `motion/native/functions.py` and `projection.py`
+    # counterparts of `motion/native/functions.py` and `projection.py`
 
     def rates(self, state: Pointer, t, y: Pointer, k: Pointer, monitored: Pointer) -> None:
         """Store the rates of the state, and the monitored numbers."""
@@ -160,11 +160,11 @@ class Functions:
         self._store(found, k, self.count)
 
     def project(self, state: Pointer, t, y: Pointer) -> None:
-        """Put a state back onto its rows."""
+        """Project a state onto the constraints."""
         self._store(pushed(self._projected, self._parts(state, t, y)), y, self.count)
 
     def along(self, state: Pointer, t, y: Pointer) -> None:
-        """Project an error, stored after its state, onto the directions along the rows."""
+        """Project an error, stored after its state, onto directions along the constraints."""
         at, error = self.w.load(y, self.y), self.w.load(y, self.y + self.count)
         self.w.store(
             jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1],
@@ -184,7 +184,7 @@ class Functions:
         """Store the tangents of the values of stop events."""
         self._store(pushed(self._events, self._parts(state, t, y))[1:], dc, self.form.events)
 
-    # of events after which the motion continues (`motion/native/transitions.py`)
+    # events after which the motion continues (`motion/native/transitions.py`)
 
     def _reset(self, event, t, y, *shared) -> Float[Array, "rows *lanes"]:
         """Return the state and the modes after an event."""
@@ -197,7 +197,7 @@ class Functions:
         """Return the state after an event and the time of the event, both with their tangents.
 
         `parts`: the state and the varying arrays, with tangents; `fixed`: the other arrays, by index;
-        `modes`: those after the event.
+        `modes`: modes after the event.
         """
         given = lambda at: (dict(zip((k for k in range(len(fixed) + len(at)) if k not in fixed), at, strict=True)) | fixed)  # noqa: E731
         whole = lambda at: [given(at)[k] for k in range(len(fixed) + len(at))]  # noqa: E731
@@ -246,7 +246,7 @@ class Functions:
 
     def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
         """Pull cotangents back through the state after an event. The cotangent of the event's time is added
-        after those of the arrays.
+        after the arrays' cotangents.
         """
         known, of_state = sum(self.sizes()), lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
         self._pull(of_state, y, g, self.count, to_y, to_known)
@@ -254,10 +254,12 @@ class Functions:
         by_time = jax.vjp(lambda t: self._reset(event, t, at, *self.shared[0])[: self.count], t)[1](g_y)[0]
         self.w.store(self.w.load(to_known, known) + by_time + self.w.load(g, self.count), to_known, known)
 
-    # of implicit methods
+    # implicit methods
 
     def solve(self, state: Pointer, t, h, y1: Pointer, error: Pointer, told: Pointer) -> None:
-        """Take an implicit step; store its end, its error estimate if any, and whether its equations were solved."""
+        """Take an implicit step; store its end, its error estimate if any, and
+        whether its equations were solved.
+        """
 
         def f(t, y, *shared):
             after, estimate, solved = self._solved(t, h, y, *shared)
@@ -272,15 +274,15 @@ class Functions:
         self.w.store(solved, told)
 
     def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
-        """Project a state onto its constraints. Store the size of the change, relative to the step, as
-        `told[1]`.
+        """Project a state onto its constraints. Store the size of the change,
+        relative to the step, as `told[1]`.
         """
         free = self.w.load(y, self.y)
         self.project(state, t, y)
         rows = jax.lax.stop_gradient((self.w.load(state, self.y), free, self.w.load(y, self.y)))
         ratios = []
         for before, given, after in zip(*(jax.tree.leaves(self._state(x)) for x in rows), strict=True):
-            # 1e-6 of the size of the state: a step that changes less counts as one that changes so much
+            # at least 1e-6 of the size of the state
             change = jnp.max(jnp.abs(after - before), initial=0.0) + 1e-6 * (
                 1 + jnp.max(jnp.abs(after), initial=0.0)
             )
@@ -290,8 +292,8 @@ class Functions:
     # cotangents, of motions without tangents
 
     def _pull(self, f: Callable, y: Pointer, g: Pointer, rows: int, to_y: Pointer, to_known: Pointer) -> None:
-        """Store the cotangent of the state, pulled back through `f`, and add those of the requested arrays to
-        `to_known`.
+        """Store the cotangent of the state, pulled back through `f`, and add cotangents of the
+        requested arrays to `to_known`.
         """
 
         def of(y, asked):
@@ -315,11 +317,11 @@ class Functions:
         return [self.shared[0][i] for i in self.asked]
 
     def sizes(self) -> list[int]:
-        """Return how many numbers a lane has in each array whose cotangent is requested."""
+        """Return the number of values per sample in each array whose cotangent is requested."""
         return [math.prod(x.shape[len(self.w.lanes) :]) for x in self._asked()]
 
     def leaves(self, by_known: Array) -> list[Array]:
-        """Return the cotangents of the requested arrays, with the axis of lanes first."""
+        """Return the cotangents of the requested arrays, with the batch axis first."""
         lanes = len(self.w.lanes)
         parts = jnp.split(by_known, [sum(self.sizes()[: k + 1]) for k in range(len(self.asked))])
         return [
@@ -342,8 +344,7 @@ class Functions:
         self._pull(partial(self._events, t), y, g, self.form.events, to_y, to_known)
 
     def pull_step(self, state: Pointer, t, h, y: Pointer, g: Pointer, added: Pointer) -> None:
-        """Pull cotangents back through an implicit step and its projection, in the lanes that took the step.
-        """
+        """Pull cotangents back through an implicit step and its projection, in lanes that took it."""
 
         def f(y, *shared):
             end = self._solved(t, h, y, *shared)[0].rows

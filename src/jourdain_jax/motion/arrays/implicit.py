@@ -1,8 +1,8 @@
-"""A step of an implicit method (`implicit_steps.py`) on arrays, under `vmap` for batches.
+"""Step of an implicit method (`implicit_steps.py`) in JAX, under `vmap` for batches.
 
-Trials of the search for an event are steps of the method too; its last shifts, which are tiny, are steps of
-Tsit5, with the derivatives of the motion. A step whose equations are not solved has an infinite error. Methods
-with equal steps cannot try one again: whatever would refuse it ends the motion with a result code.
+Trial steps of the event search use the method, too; its last, tiny shifts are Tsit5 steps, which have the
+derivatives of the motion. A step whose equations are not solved has an infinite error. Methods with equal
+steps cannot repeat one: a rejection ends the motion with a result code.
 """
 
 import math
@@ -18,7 +18,7 @@ from jourdain_jax.motion.trajectories import results
 
 
 def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
-    """Try a step; store rates at its start, middle and end in `k` where events or pivots need them."""
+    """Try a step; store rates at its start, middle and end in `k` if events or pivots need them."""
     reach, y = p["h"], p.pointer
     if method.even:
         reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
@@ -53,8 +53,8 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
-    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its sign or
-    a row turned round.
+    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its
+    sign or a constraint reversed.
     """
     at, pivots, halves, every = (
         w.room(form.integrated),

@@ -1,12 +1,12 @@
-"""The loop over steps on arrays of JAX: the source of machine code (`motion/native/step.py`) with JAX functions.
+"""The loop over steps in JAX: the source of a step (`motion/native/step.py`) with JAX functions.
 
-Lanes are the last axes of arrays. In each pass of one loop all of them try a step, each towards its own next
-time; a lane that has ended stands still. Tangents are integrated with the state, and JAX differentiates only
-the rates,
+The batch axis is the last one. In each pass of one loop all samples try a step, each towards its own next
+time; a sample that has ended stays unchanged. Tangents are integrated with the state, and JAX
+differentiates only the rates,
 
     (y, dy)' = (f(y, p), df/dy dy + df/dp dp)
 
-and of derivatives of higher order the tangents of these (`layout.py`).
+For higher derivatives, tangents of these follow (`layout.py`).
 """
 
 from collections.abc import Sequence
@@ -30,21 +30,21 @@ from jourdain_jax.motion.native.step import IDLE, step, tried_by_stages
 
 
 class Going(NamedTuple):
-    """Hold a motion on its way."""
+    """A motion during integration."""
 
     y: Float[Array, "y *lanes"]  # with its tangents
-    rows: dict[int, PerLane]  # the others that steps change
+    rows: dict[int, PerLane]  # other rows that steps change
     log: list[Float[Array, "transitions *lanes"]]
-    passed: Int[Array, "*lanes"]  # how many times were saved
+    passed: Int[Array, "*lanes"]  # number of saved times
 
 
 class Loop(NamedTuple):
-    """Integrate a motion step by step; a `Start` holds all arrays."""
+    """Step-by-step integration of a motion; a `Start` holds all arrays."""
 
     form: Form
     method: Method | ImplicitMethod
-    rest: tuple  # of the arguments of rates, without arrays
-    most: int  # steps
+    rest: tuple  # arguments of rates without arrays
+    most: int  # maximum number of steps
 
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
         """Return the start, and the rows that steps do not change."""
@@ -77,7 +77,7 @@ class Loop(NamedTuple):
         return w
 
     def rows_in(self, w: ArrayWriter, going: Going, fixed: dict) -> Pointer:
-        """Put the rows of all lanes into memory."""
+        """Put the rows of all samples into memory."""
         state = w.holding(going.y)
         logged = {row: (array, i) for block, array in zip(self.log, going.log, strict=True) for i, row in enumerate(block)}
         rows = going.rows | fixed | logged
@@ -85,7 +85,7 @@ class Loop(NamedTuple):
         return state
 
     def tried(self, going: Going, fixed: dict, start: Start) -> tuple[Going, Array]:
-        """Try a step in all lanes that are still under way. Return also the rates at its stages."""
+        """Try a step in all running samples. Return also the rates at its stages."""
         w = self.writer(start)
         state, k = self.rows_in(w, going, fixed), w.room(self.form.integrated * self.method.needed)
         step(
@@ -106,9 +106,7 @@ class Loop(NamedTuple):
         return self.form.rows[name].start
 
     def saving(self, start: Start, going: Going, ys: Array | None) -> tuple[Going, Array | None]:
-        """Pass the times that were reached, save the states there (with `ys`), and set the next time to
-        reach.
-        """
+        """Count the times reached, save the states there (with `ys`), and set the next time."""
         code_, t_, goal_ = map(self._row, ("code", "t", "goal"))
         times, y = len(start.goals), going.y
 
@@ -142,7 +140,7 @@ class Loop(NamedTuple):
         return going._replace(rows=going.rows | {code_: code, goal_: goal}, passed=passed), ys
 
     def on_its_way(self, going: Going) -> Array:
-        """Return whether any lane is on its way."""
+        """Return whether any sample is still running."""
         code = going.rows[self._row("code")]
         return eqxi.unvmap_any(jnp.any((code == RUNNING) | (code == LOCATING)))
 
@@ -167,10 +165,10 @@ class Loop(NamedTuple):
 
 
 def at_number(x: Float[Array, "times *lanes"], i) -> PerLane:
-    """Return the time number `i` of each lane."""
+    """Return the time with index `i` for each sample."""
     return x[i] if x.ndim == 1 else jnp.take_along_axis(x, i[None], 0)[0]
 
 
 def numbers(times: int, y: Float[Array, "y *lanes"]) -> Int[Array, "times *ones"]:
-    """Return the numbers of the times, shaped to broadcast against states `y`."""
+    """Return the indices of the times, shaped to broadcast against states `y`."""
     return jnp.reshape(jnp.arange(times), (-1, *[1] * y.ndim))

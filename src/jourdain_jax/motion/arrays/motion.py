@@ -1,6 +1,6 @@
-"""The loop on arrays (`loop.py`) as a JAX function, with derivatives in forward and reverse mode.
+"""The loop in JAX (`loop.py`) as a function with derivatives in forward and reverse mode.
 
-Lanes that `vmap` makes run side by side, some at a time, where the rates take lanes.
+If the rates support batches, `vmap` runs blocks of samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,10 +33,7 @@ def loop_of(
     begun: Begun,
     of_events: dict[str, Any],
 ) -> tuple[Loop, Start]:
-    """Return the loop, and the start of one motion.
-
-    `of_events`: the events of the form.
-    """
+    """Return the loop, and the start of one motion. `of_events`: the events of the form."""
     goals, knots, field, y0 = setup.goals(setup.ts), setup.knots, setup.field, begun.y0
     args, most, eps = (
         integrands.within(goals[0], begun.args),
@@ -62,7 +59,7 @@ def loop_of(
         sides=field.lowered.sides if field.lowered else (),
         **of_events,
         compensated=most * eps
-        > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
+        > eps**0.5,  # the round-off of so many steps may exceed half of the digits
     )
     known, rest = split(begun.args)
     numbers = jax.lax.stop_gradient(
@@ -72,7 +69,8 @@ def loop_of(
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """Return the motion as a function of its start; `at_once`: lanes in a block (0: all lanes of `vmap`)."""
+    """Return the motion as a function of its start; `at_once`: samples per block (0: all samples of `vmap`).
+    """
     return differentiated(
         lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
     )
@@ -91,8 +89,8 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
 
 
 def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
-    """Return the reverse mode of `flow` as a function of the start and of cotangents, by `cotangents` in
-    `back.py`.
+    """Return the reverse mode of `flow` as a function of the start and of cotangents,
+    by `cotangents` in `back.py`.
     """
     back = partial(cotangents, of, asked, memory)
     if not at_once:
@@ -112,8 +110,8 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """Run blocks of lanes one after another. Outside, the axis of lanes is the first. Inside it is the last,
-    except for known arrays.
+    """Run blocks of samples in sequence. Outside, the batch axis is first. Inside it is
+    last, except for known arrays.
     """
     given = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched)
@@ -135,7 +133,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function (state, time t, shift d) -> state that moves the state along its rates by d. The
+    """Return a function (state, time t, shift d) -> state that shifts the state along its rates by d. The
     value of d is zero: it only carries derivatives.
     """
     known, others = eqx.partition(args, eqx.is_inexact_array)

@@ -1,7 +1,7 @@
-"""The writer that runs the source of a step (`motion/native/step.py`) on arrays of JAX.
+"""Writer that evaluates the source of a step (`motion/native/step.py`) on JAX arrays.
 
-Lanes are the last axes of arrays, stages are one loop with one copy of the rates to compile, and a branch is
-`lax.cond`. What a branch or a loop stores to is found by tracing it first.
+The batch axis is the last one, stages are one loop, so that the rates are compiled once, and a branch is
+`lax.cond`. A first trace of a branch or loop finds the memory to which it stores.
 """
 
 from collections.abc import Callable
@@ -17,33 +17,33 @@ from jaxtyping import Array
 
 
 class Rows(NamedTuple):
-    """Stand for many rows where one is expected."""
+    """Range of rows in place of a single row."""
 
     first: Any
     many: int
 
     def __add__(self, by) -> "Rows":
-        """Return as many rows, so many further on."""
+        """Return the same number of rows, shifted."""
         return Rows(self.first + by, self.many)
 
 
 @dataclass(eq=False)
 class Room:
-    """Holds rows, each as an array of its own or as a pair (an array of several rows, the index in it)."""
+    """Memory whose rows are separate arrays or pairs (an array of several rows, the index in it)."""
 
     rows: list
-    number: int  # of the rooms that a writer has made
+    number: int  # serial number
 
 
 class Pointer(NamedTuple):
-    """Point to a row of a room."""
+    """Pointer to a row of a `Room`."""
 
     room: Room
     first: Any
 
 
 class ArrayWriter:
-    """Runs the source of a step on arrays of JAX. `functions`: the object whose methods `run` calls."""
+    """Writer for JAX arrays. `functions`: the object whose methods `run` calls."""
 
     real, truth = "real", "truth"
     where, magnitude, larger, smaller, root = map(
@@ -54,14 +54,14 @@ class ArrayWriter:
     def __init__(self, like: Array, functions: Any = None) -> None:
         self.functions, self._numbers = functions, count()
         self.lanes, self.dtype, self.eps = like.shape, like.dtype, float(jnp.finfo(like.dtype).eps)
-        self._stored: dict[Room, list] = {}  # rooms that were stored to, as they were before
+        self._stored: dict[Room, list] = {}  # rooms stored to, with their previous rows
 
     def number(self, value: float) -> Array:
-        """Return a number in all lanes."""
+        """Return a number for all lanes."""
         return jnp.full(self.lanes, value, self.dtype)
 
     def literal(self, value: Any, type: str) -> Any:
-        """Return a number, or a truth value."""
+        """Return a number or a boolean."""
         return bool(value) if type == self.truth else value
 
     def fma(self, a, b, c):
@@ -79,19 +79,19 @@ class ArrayWriter:
         return Pointer(Room(rows, next(self._numbers)), 0)
 
     def room(self, rows: int = 1) -> Pointer:
-        """Return memory for some rows, zero at first."""
+        """Return memory for some rows, initially zero."""
         return self._holding([jnp.zeros(self.lanes, self.dtype)] * rows)
 
     def holding(self, *parts: Array) -> Pointer:
-        """Return memory that holds arrays of rows, one after the other."""
+        """Return memory that holds the rows of several arrays."""
         return self._holding([(part, i) for part in parts for i in range(len(part))])
 
     def at(self, pointer: Pointer, index) -> Pointer:
-        """Return the place of the row with this index."""
+        """Return a pointer to the row with this index."""
         return Pointer(pointer.room, pointer.first + index)
 
     def _place(self, pointer: Pointer, index) -> tuple[Any, int]:
-        """Return the first row, and how many."""
+        """Return the first row and the number of rows."""
         return (
             (pointer.first + index.first, index.many)
             if isinstance(index, Rows)
@@ -108,7 +108,7 @@ class ArrayWriter:
         return self._of(rows[first : first + count]) if isinstance(index, Rows) else self._row(rows[first])
 
     def store(self, value, pointer: Pointer, index=0) -> None:
-        """Put a row, or several, into memory."""
+        """Store one or several rows in memory."""
         (first, rows), room = self._place(pointer, index), pointer.room
         value = jnp.broadcast_to(jnp.asarray(value, self.dtype), (rows, *self.lanes))
         self._stored.setdefault(room, list(room.rows))
@@ -120,7 +120,7 @@ class ArrayWriter:
         return row[0][row[1]] if isinstance(row, tuple) else row
 
     def _of(self, rows: list) -> Array:
-        """Return rows as one array, made of the longest available parts of other arrays."""
+        """Return rows as one array, joined from the longest available slices."""
         parts: list[tuple[Array, int, int]] = []
         for row in rows:
             array, i = row if isinstance(row, tuple) else (row[None], 0)
@@ -138,8 +138,8 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return the rooms into which the body stores, and the shapes of its results. A trace finds them
-        without changing the rooms.
+        """Return the rooms to which the body stores, and the shapes of its results. The
+        trace leaves the rooms unchanged.
         """
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)
@@ -157,7 +157,7 @@ class ArrayWriter:
         return [self.whole(room) for room in rooms], found
 
     def if_any(self, condition: Array | bool, body: Callable[[], object]) -> None:
-        """Run the body where the condition holds in any lane."""
+        """Run the body if the condition holds in any lane."""
         rooms, _ = self._traced(lambda: body() and None)
         arrays = [self.whole(room) for room in rooms]
         yes = eqxi.unvmap_any(jnp.any(condition))
@@ -167,7 +167,7 @@ class ArrayWriter:
         self._within(rooms, found, lambda: None)
 
     def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
-        """Return the result of the body on the stages, stage by stage."""
+        """Return the result of applying the body to all stages in order."""
         rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))
         found = jax.tree.map(
             lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes
@@ -185,17 +185,17 @@ class ArrayWriter:
             body(Rows(rows.start, len(rows)))
 
     def in_step(self, t: Array, h: Array) -> None:
-        """Begin with the stages of a step."""
+        """Begin the stages of a step."""
         self.functions.in_step(t, h)
 
-    # what the source of a step asks of stages and rows
+    # operations on stages and rows
 
     def is_first(self, i) -> bool:
         """Return whether this is known to be the first stage."""
         return False
 
     def intrinsic(self, name: str, a: Array) -> Array:
-        """Return a function of LLVM that JAX has under the same name."""
+        """Return the JAX counterpart of an LLVM function."""
         return getattr(jnp, name)(a)
 
     def at_first(self, i, first, otherwise):
@@ -203,12 +203,12 @@ class ArrayWriter:
         return jnp.where(i == 0, first, otherwise)
 
     def table(self, numbers) -> Array:
-        """Return numbers that stages look up, whole ones as such."""
+        """Return numbers that stages look up, integers as integers."""
         found = np.asarray(numbers)
         return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
 
     def put_at(self, place: Pointer, rows: int, index: Array, value: Array, where: Array) -> None:
-        """Put a value into the row whose index each lane has, in lanes for which `where` is true. Indices
+        """Store a value in the row with each lane's own index, in lanes where `where` is true. Indices
         beyond the last row are skipped.
         """
         every = Rows(0, rows)
@@ -216,13 +216,13 @@ class ArrayWriter:
         self.store(jnp.where(here & where, value, self.load(place, every)), place, every)
 
     def may_count(self, weights, j: int) -> bool:
-        """Return whether a weight may be other than zero."""
+        """Return whether a weight may be nonzero."""
         return isinstance(weights, jax.Array) or bool(weights[j] != 0)
 
     def sum_of_squares(self, rows: range, value: Callable[[Rows], Array]) -> Array:
-        """Return the sum of the squares of the values of all rows."""
+        """Return the sum of squares of the values of all rows."""
         return jnp.sum(value(Rows(rows.start, len(rows))) ** 2, axis=0)
 
     def largest(self, rows: range, value: Callable[[Rows], Array]) -> Array:
-        """Return the largest of the values of all rows, all of them non-negative."""
+        """Return the largest of the values of all rows, which are non-negative."""
         return jnp.max(value(Rows(rows.start, len(rows))), axis=0, initial=0.0)

@@ -1,1 +1,1 @@
-"""Many motions at once: lanes in lockstep, rollouts."""
+"""Batches of motions: integration in lockstep, rollouts."""

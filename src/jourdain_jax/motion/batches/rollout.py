@@ -1,7 +1,8 @@
-"""Batches of motions with different starts, parameters, or both; each sample has its own result, and a
+"""Batches of motions with different starts, parameters, or both. Each sample has its own result, and a
 failing one does not affect the others.
 
-Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
+Samples of one chunk run in lockstep as one vmapped integration; chunks run in sequence
+through the same compiled program.
 """
 
 import dataclasses
@@ -39,16 +40,16 @@ from jourdain_jax.scene.scene import Scene, state_names
 
 
 class Rollout(Printed, eqx.Module):
-    """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
+    """Many motions of one scene: a `Trajectory` whose arrays have a leading batch axis."""
 
     lanes: Trajectory
-    reruns: tuple[tuple[int, tuple], ...] = static(default=())  # fallback -> `RERUN_FIELDS` of such lanes
+    reruns: tuple[tuple[int, tuple], ...] = static(default=())  # fallback -> `RERUN_FIELDS` of such samples
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
 
     def __getitem__(self, name: str) -> Float[Array, "lanes times *shape"]:
-        """Return a coordinate or speed by name, of all lanes at all times."""
+        """Return a coordinate or speed by name, of all samples at all times."""
         return jax.vmap(lambda lane: lane[name])(self.lanes)
 
     def __contains__(self, name: str) -> bool:
@@ -66,18 +67,20 @@ class Rollout(Printed, eqx.Module):
 
     @property
     def result(self) -> np.ndarray:
-        """Result code of every sample, shape (lanes,); see `jourdain_jax.motion.trajectories.results`."""
+        """Return the result code of every sample, shape (lanes,); see
+        `jourdain_jax.motion.trajectories.results`.
+        """
         return np.asarray(self.lanes.result)
 
     @property
     def failed(self) -> np.ndarray:
-        """Numbers of the samples that reached neither their end nor an event."""
+        """Return the indices of samples that reached neither their end nor an event."""
         return np.flatnonzero(self.result > results.EVENT)
 
     @property
     def continued(self) -> np.ndarray:
-        """Return the indices of samples that lost their privileged speeds and were repeated with the full
-        state.
+        """Return the indices of samples whose independent speeds became invalid, and which were
+        repeated with the full state.
         """
         return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
 
@@ -85,13 +88,14 @@ class Rollout(Printed, eqx.Module):
         """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
         `levels` (0 to 1), shape (levels, times).
 
-        Lanes that have ended are omitted from then on; NaN where none remain. Raises ValueError where lanes
-        were saved at different times.
+        Samples that have ended are omitted from then on; NaN if none remain. Raises ValueError for
+        samples with different saved times.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
-            raise ValueError("lanes were saved at different times, so there are no common quantiles; give "
-                "all of them one start time, or one `ts`")
-        values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
+            raise ValueError("lanes have different saved times, so there are no common quantiles; pass one "
+                "start time for all, or one `ts`")
+        values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`",
+            advice="pass numbers from 0 to 1"))
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
         out = np.full((len(levels), *values.shape[1:]), np.nan)
@@ -100,16 +104,17 @@ class Rollout(Printed, eqx.Module):
         return out
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
-        """Return coordinates, speeds, result codes and parameters as an `xarray.Dataset` along `lane` and
-        `time` (s).
+        """Return coordinates, speeds, result codes and parameters as an `xarray.Dataset`
+        along `lane` and `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, as in `Trajectory.to_xarray`. ImportError without xarray.
+        `units`: name of a coordinate or speed -> its unit, as in
+        `Trajectory.to_xarray`. ImportError without xarray.
         """
         return labelled.to_xarray(self.lanes, units)
 
     def to_pandas(self):
-        """Return coordinates and speeds as a `pandas.DataFrame`, one row for each sample and time (s).
-        ImportError without pandas.
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row per sample and time
+        (s). ImportError without pandas.
         """
         return labelled.to_pandas(self.lanes)
 
@@ -132,8 +137,8 @@ class Rollout(Printed, eqx.Module):
                 named = f" ({', '.join(faults)})" * bool(faults) + ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
-            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run "
-                "with the full state")
+            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and "
+                "were run with the full state")
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
@@ -186,7 +191,7 @@ def rollout(
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
             raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": '
                 'jnp.linspace(0.0, 1.0, 8)}')
-    advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
+    advice = "pass an array with one entry per lane; to vary a field that is a module, use `equinox.filter_vmap` of `simulate`"
     parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, span["ts"], options.memory or MEMORY)
@@ -204,7 +209,7 @@ def rollout(
         return modelled(model, options.formulation, options.backend).field(span["inputs"].constant, bool(options.work))
 
     if is_traced((scene, fixed, varied, parameters, span, options)):
-        lanes = run(options, varied, parameters)  # being differentiated or batched: one piece, no host loop
+        lanes = run(options, varied, parameters)  # differentiated or batched: one piece, no host loop
         warn_of_jumps(form(options), lanes, is_traced((scene, parameters)))
         return Rollout(lanes)
 
@@ -214,9 +219,10 @@ def rollout(
     pieces = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
-        index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
+        # copies of the last sample fill the last chunk
+        index = np.minimum(np.arange(first, first + chunk), count - 1)
         piece = run_some(options, index)
-        # one piece stays where it is; several are put together on the host
+        # a single piece stays on its device; several are joined on the host
         pieces.append(jax.block_until_ready(piece) if chunk == count else jax.tree.map(np.asarray, piece))
         bar.update(min(chunk, count - first))
     bar.close()
@@ -229,9 +235,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
-    """Check times, and inputs for jumps between the times, if all lanes have one known span.
+    """Check times, and inputs for jumps between the times, if all samples have one known span.
 
-    Other spans are traced: a lane with an invalid time then gets a result code.
+    Other spans are traced: a sample with an invalid time then gets a result code.
     """
     ts, t0, t1 = (span[name] for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):
@@ -256,9 +262,7 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 
 def _with_arrays(options: AllOptions) -> AllOptions:
-    """Return options with their numbers as arrays, so that another tolerance or first step needs no
-    compilation.
-    """
+    """Return options with their numbers as arrays, so that other values need no compilation."""
     real, (solver, order) = real_type(), solver_of(options)
     numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
@@ -272,11 +276,13 @@ def _lanes(scene: Scene, starts, parameters: dict):
     lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
     if isinstance(starts, State):
         many = starts.q.shape[:1] if starts.q.ndim == 2 else ()
-        fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))  # a state made by hand has one for all lanes
+        # a state made directly has one guess for all samples
+        fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
         arrays = {name: checked_real(value, f"start `{name}`").astype(real_type()) for name, value in starts.items()}
-        groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}  # quaternions and their rates
+        # quaternions and their rates
+        groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}
         fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
         varied = {name: value for name, value in arrays.items() if name not in fixed}
         lengths |= {f"start `{name}`": value.shape[0] for name, value in varied.items()}
@@ -286,13 +292,14 @@ def _lanes(scene: Scene, starts, parameters: dict):
 def _common_length(lengths: dict) -> int:
     for what, length in lengths.items():
         if length is None:
-            raise ValueError(f"{what} has no axis of lanes; give an array with one entry per lane, or set it "
-                "on the scene itself")
+            raise ValueError(
+                f"{what} has no axis of lanes; pass an array with one entry per lane, or set it on the scene")
     counts = set(lengths.values())
     if len(counts) > 1:
-        raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) + "; give arrays of one length")
+        raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) +
+            "; pass arrays of one length")
     if not counts or counts == {0}:
-        raise ValueError("no lanes: give at least one start value or parameter as an array with one entry "
+        raise ValueError("no lanes: pass at least one start value or parameter as an array with one entry "
             "per lane, or use `simulate` for one motion")
     return counts.pop()
 
@@ -302,5 +309,6 @@ def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
     chunk = usual if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(state_names(scene)) + 2)
-    # the stages of 512 lanes fit the cache of a core, and a GPU takes some ten thousand at once; of the saved states of a chunk four copies are there at once
+    # the stages of 512 samples fit the cache of a core, and a GPU runs some ten thousand at once; saved
+    # states of a chunk exist in four copies
     return max(1, min(count, chunk, memory // (4 * per_lane)))

@@ -1,17 +1,19 @@
-"""The discrete Lagrange-d'Alembert principle (DLA), as a map from (q_0, u_0) to (q_1, u_1).
+"""Discrete Lagrange-d'Alembert principle (DLA), as a map from (q_0, u_0) to (q_1, u_1).
 
     dL/dqdot(q_0, u_0) + A(q_0)' lambda_0 = p^+ = -D_1 L_d(q_0, q_1) - f^-        phi_d(q_0, q_1) = 0         -> q_1, lambda_0
     dL/dqdot(q_1, u_1) = p^- + A(q_1)' lambda_1,  p^- = D_2 L_d(q_0, q_1) + f^+   A(q_1) u_1 + phi_0 = 0      -> u_1, lambda_1
 
-At a node the momenta of the two intervals that meet there differ by a constraint impulse alone, p^+ - p^- = A' lambda: the DLA equations
-D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both so have the same projection onto the velocity rows, which is the state that is carried.
+At a node the momenta of the adjacent intervals differ only by a constraint impulse, p^+ - p^- = A' lambda:
+the DLA equations D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both therefore have the same projection onto the
+velocity constraints, which is the state between steps.
 
     v = (q_1 - q_0)/h
     midpoint:     L_d = h L(t_m, q_m, v),                               f^-+ = h/2 Q(t_m, q_m, v)           q_m = (q_0 + q_1)/2
     trapezoidal:  L_d = h/2 (L(t_0, q_0, v) + L(t_1, q_1, v)),          f^- = h/2 Q(t_0, q_0, v), f^+ = h/2 Q(t_1, q_1, v)
-    rows:         phi at the midpoint, or the mean of phi at both ends; of geometric rows g(t_1, q_1)/h
+    constraints:  phi at the midpoint, or the mean of phi at both ends; for geometric constraints g(t_1, q_1)/h
 
-L = T - V - dS/dt, with S the scene's `gauge`; Q the loads that have no potential. Both rules are symmetric: L_d(q_0, q_1, h) = -L_d(q_1, q_0, -h).
+L = T - V - dS/dt, with S the scene's `gauge`; Q the loads without a potential. Both rules are symmetric:
+L_d(q_0, q_1, h) = -L_d(q_1, q_0, -h).
 """
 
 from collections.abc import Callable
@@ -49,20 +51,20 @@ def lagrangian(scene: Scene, t, q, u, inputs) -> Scalar:
 
 
 def momentum(scene: Scene, t, q, u, inputs) -> Speeds:
-    """`dL/dqdot`, kg m/s or kg m^2/s."""
+    """Return `dL/dqdot`, kg m/s or kg m^2/s."""
     return jax.grad(lambda u: lagrangian(scene, t, q, u, inputs))(u)
 
 
 class Interval(eqx.Module):
-    """The span of one step, and the quadrature rule."""
+    """Time interval of one step, and the quadrature rule."""
 
     t0: Scalar
-    h: Scalar  # its length, s
+    h: Scalar  # length, s
     rule: str = static()
 
     @property
     def t1(self) -> Scalar:
-        """Its end."""
+        """Return the end of the interval."""
         return self.t0 + self.h
 
     def mean(self, f: Callable, q0, q1):
@@ -74,7 +76,7 @@ class Interval(eqx.Module):
 
 
 def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) -> Scalar:
-    """`L_d(q_0, q_1)` in J s."""
+    """Return `L_d(q_0, q_1)` in J s."""
     return over.h * over.mean(lambda t, q, v: lagrangian(scene, t, q, v, inputs(t)), q0, q1)
 
 
@@ -94,15 +96,15 @@ def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
 
 
 def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int) -> Float[Array, "rows"]:
-    """Return all rows over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so that they are
-    satisfied at every node.
+    """Return all constraint residuals over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so
+    that they vanish at every node.
     """
     rows = over.mean(lambda t, q, v: velocity_residual(scene, t, q, v, inputs(t)), q0, q1)
     return rows if geometric == 0 else rows.at[:geometric].set(position_residual(scene, over.t1, q1) / over.h)
 
 
 def _has_forces(scene: Scene, t, q) -> bool:
-    """Return whether any load has no potential: known while tracing."""
+    """Return whether any load has no potential, which is known while tracing."""
     return any(load.potential is None for load in loads_of(scene, motion_at(scene, t, q, jnp.zeros_like(q))))
 
 
@@ -116,23 +118,27 @@ def _force(scene: Scene, t, q, u, inputs) -> Speeds:
 
 
 class DiscreteLagrangeDAlembert(FixedStepMethod):
-    """The nonholonomic integrator of the discrete Lagrange-d'Alembert principle, `simulate(..., solver=DiscreteLagrangeDAlembert(step=h))`.
+    """Nonholonomic integrator of the discrete Lagrange-d'Alembert principle, `simulate(...,
+    solver=DiscreteLagrangeDAlembert(step=h))`.
 
-    `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete rows `phi_d(q_k, q_k+1) = 0`, from the scene's own Lagrangian
-    L = T - V - dS/dt (S: its `gauge`) by autodiff. `rule`: "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or "trapezoidal",
-    `L_d = h/2 (L(q_0, v) + L(q_1, v))`, v = (q_1 - q_0)/h; rows are taken by the same rule, geometric rows at every node; h in s. Loads without a
-    potential enter as discrete forces. The state between steps is (q, u) with u on the rows: the momentum at the node, projected.
+    `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete constraints `phi_d(q_k, q_k+1)
+    = 0`, from the scene's Lagrangian L = T - V - dS/dt (S: its `gauge`) by automatic differentiation. `rule`:
+    "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or "trapezoidal", `L_d = h/2 (L(q_0, v) + L(q_1,
+    v))`, v = (q_1 - q_0)/h, also for the velocity constraints; geometric constraints hold at every node; h in
+    s. Loads without a potential enter as discrete forces. The state between steps is (q, u) with u on the
+    constraints: the momentum at the node, projected.
 
-    It has order 2, is symmetric in time, and is variational where there are no velocity rows; it is then
-    symplectic and keeps the momenta of symmetries. It needs speeds that are the coordinate rates, and rows
-    linear or affine in them.
+    It has order 2, is symmetric in time, and is variational without velocity constraints; it is then
+    symplectic and preserves the momenta of symmetries. It needs speeds that are the coordinate rates, and
+    constraints linear or affine in them.
 
     Use it for long motions of reversible scenes whose coordinates suit L: energy errors stay bounded there.
     In general they do not: a gauge term that changes no equation of motion, or a scene that is not
     reversible, makes the energy drift. The implicit midpoint rule does not depend on the gauge.
 
-    Source: J. Cortes and S. Martinez, Nonholonomic integrators, Nonlinearity 14 (2001) 1365; R. McLachlan and M. Perlmutter, J. Nonlinear Sci. 16 (2006)
-    283; J. E. Marsden and M. West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001) 357, sections 2.1 and 3.2 (forces).
+    Source: J. Cortes and S. Martinez, Nonholonomic integrators, Nonlinearity 14 (2001) 1365; R. McLachlan and
+    M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283; J. E. Marsden and M. West, Discrete mechanics and
+    variational integrators, Acta Numerica 10 (2001) 357, sections 2.1 and 3.2 (forces).
     """
 
     rule: str = static(default="midpoint")
@@ -143,9 +149,9 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
                 f"{nearest(str(self.rule), RULES)}")
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the full `field` of the state, without projection since the method satisfies the rows
-        itself. Raises ValueError if it does not apply to the `scene`, or if another state was requested
-        (`asked`).
+        """Return the full `field` of the state, without projection because the method satisfies the
+        constraints itself. Raises ValueError if it does not apply to the `scene`, or if another
+        state was requested (`asked`).
         """
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)
@@ -153,8 +159,8 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
             raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use "
                 "solver=jj.ImplicitMidpoint(step=...)")
         if asked == "minimal":
-            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of its "
-                "`Formulation` at 'auto'")
+            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of "
+                "its `Formulation` at 'auto'")
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
@@ -171,7 +177,7 @@ def _solved(args, over: Interval, y: Integrated) -> Solution:
     A0 = jax.jacfwd(lambda u: _kept(scene, velocity_residual(scene, over.t0, q0, u, inputs(over.t0))))(u0)
     p0 = momentum(scene, over.t0, q0, u0, inputs(over.t0))
     guess = jnp.concatenate([h * u0, jnp.zeros(A0.shape[0], q0.dtype)])
-    # impulses follow from coordinates: they are right when those are
+    # impulses follow from coordinates, so only coordinates are judged
     scale = jnp.where(jnp.arange(len(guess)) < n, sizes(len(guess), q0, h * u0), jnp.inf)
     found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, scale)
     q1 = q0 + found.x[:n]
@@ -181,9 +187,9 @@ def _solved(args, over: Interval, y: Integrated) -> Solution:
     return Solution(jax.tree.map(lambda x: jnp.where(solved, x, 0.0), change), None, solved)
 
 
-@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+@eqx.filter_jit  # traced once, and differentiated from that trace
 def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
-    """Return `p^+ - p_0 - A_0' lambda` and the discrete rows, for x = (q_1 - q_0, lambda)."""
+    """Return `p^+ - p_0 - A_0' lambda` and the discrete constraints, for x = (q_1 - q_0, lambda)."""
     _, scene, inputs, *_ = args
     n = q0.shape[0]
     q1, impulse = q0 + x[:n], x[n:]
@@ -193,8 +199,8 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 
 def _projected(args, over: Interval, q0, q1) -> Speeds:
-    """Return speeds on the rows that have the given momentum at the end of the interval, up to a constraint
-    impulse.
+    """Return speeds on the constraints with the given momentum at the end of the
+    interval, up to a constraint impulse.
     """
     _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)
@@ -210,18 +216,18 @@ def _projected(args, over: Interval, q0, q1) -> Speeds:
 
 
 def _kept(scene: Scene, rows: Float[Array, "rows"]) -> Float[Array, "kept_rows"]:
-    """Return the constraints without those that are redundant everywhere."""
+    """Return the constraints that are not redundant everywhere."""
     return rows[np.array(structure_of(scene).kept_rows, int)]
 
 
 def _fault(scene: Scene, structure: Structure) -> str:
-    """Return the reason why the principle does not apply; empty if it does."""
+    """Return why the principle does not apply; empty if it does."""
     if not speeds_are_rates(scene):
-        return "its speeds are quasi-velocities or angular velocities, not the coordinates' own rates"
+        return "its speeds are quasi-velocities or angular velocities, not the rates of its coordinates"
     if not structure.affine:
         return "its constraints are nonlinear in the speeds"
     if structure.varying_inertia:
-        return "its masses or inertias change along the motion, which a Lagrangian does not describe"
+        return "its masses or inertias change along the motion, so there is no Lagrangian"
     if structure.dependent_rows:
         return "its constraints are redundant, but none can be omitted everywhere"
     return ""

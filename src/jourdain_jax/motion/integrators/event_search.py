@@ -1,25 +1,29 @@
-"""The first stop event of a step and its time: trials of shorter steps from the last state before it.
+"""The first stop event of a step and its time, located by trials of shorter steps
+from the last state before it.
 
-The formulas are those of arrays of JAX and of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events are lists.
+The same source serves JAX arrays and machine code through the writer `w` of a step
+(`motion/native/step.py`). Values of events are lists.
 
-An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it continues
+An event happens where its value falls through zero. A motion that starts with a value of zero (to round-off)
+and a rate that raises it continues if the value is positive after a first step:
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
 
-if the value is positive after a first step. Where it is not, the step is tried again at half its length, down to that noise; otherwise the search would find
-the zero at the start. Then the event has happened at the start, as it has where the value is lower or does not rise.
+Otherwise the step is halved, down to that noise, lest the search find the zero at the start. If the value is
+negative or does not rise at the start, the event has happened there.
 
-All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. NaN is not positive: such a value lies beyond its boundary. Of
-the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial is by the cubic through values and
-rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another
-event, all that is after it no longer counts, so that the event found has no other before it, as far as values were seen. A value of zero may stay zero beyond
-the event: it is an end of the bracket like a negative one, which is then halved.
+All event values are positive at t_b, or rise from zero there, and at least one is not positive at t_a. NaN is
+not positive, so it lies beyond the event. Of the values that are not positive at t_a, the search follows the
+one whose secant from t_b falls to zero first. The first trial uses the cubic through values and rates at both
+ends, later ones Chandrupatla's method (inverse quadratic interpolation if safe, otherwise bisection). If a
+trial finds an earlier event, the search continues with that. A value may stay zero beyond the event: such an
+end of the bracket counts as negative, and the bracket is halved.
 
-The times tried are constants to differentiation. Near the event, shifts of Newton's method follow,
+Trial times have no derivatives. Near the event, Newton shifts follow,
 
     t <- t - c/cdot,   y <- y + (shift of t) f
 
-Once the event is found, `put_tangents` sets the tangents of its time and of the state there. Where c is no number beyond it, no Newton shift is taken.
+but not if c is NaN beyond it. `put_tangents` then sets the tangents of the event's time and state.
 
 Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
@@ -34,18 +38,19 @@ from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, e
 from jourdain_jax.motion.native.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
 from jourdain_jax.motion.trajectories import results
 
-RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
+RUNNING, LOCATING = -1, -2  # codes of a running motion, and of one that locates an event
 MOST_STEPS = 72
 DIFFERENTIABLE = 2
-FLAT = 1e-8  # of its mean rate over a step: a value that falls through zero so slowly has a root of several fold, or as good as that
+# a value that falls through zero at less than this part of its mean rate counts as a multiple root
+FLAT = 1e-8
 LEAVES = 0.6  # exponent of round-off
-LATE = 0.98  # of a step: a dip that is later is left to the next one
+LATE = 0.98  # fraction of a step: a later dip is left to the next step
 
-Values = Any  # one for each event
+Values = Any  # one per event
 
 
 def any_of(found: Values):
-    """Return whether any holds."""
+    """Return whether any condition holds."""
     return reduce(operator.or_, found)
 
 
@@ -55,7 +60,7 @@ def no_event(values: Values):
 
 
 def chosen(w, index, values: Values):
-    """Return the value with this index, the first one without an index."""
+    """Return the value with this index, by default the first."""
     found = values[0]
     for i in range(1, len(values)):
         found = w.where(w.equal(index, i), values[i], found)
@@ -72,8 +77,8 @@ def reach_of_noise(w, span):
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> tuple[list, list]:
-    """Return the events that have happened at a start, and the values that rise from zero there without being
-    positive after one step."""
+    """Return the events that have happened at a start, and values that rise from zero there but are
+    not positive after one step."""
     sunk, sinks = [], []
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate = slope * direction
@@ -96,9 +101,8 @@ def first_event(w, before: Values, after: Values):
 
 
 def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and s = 1, the ends of a step
-    h.
-    """
+    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and
+    s = 1, the ends of a step h."""
     m_0, m_1, rise = h * slope_a, h * slope_b, b - a
     return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
 
@@ -114,11 +118,9 @@ def falls_through(w, h, a, slope_a, b, slope_b):
 
 
 def trial(w, t, c, step, last, guess) -> tuple:
-    """Return the next time to try in a step of length `step`, and whether the last time tried is near enough.
-    `times` and values are those of a bracket.
-
-    The first trial divides the bracket by the fraction `guess`. With `last` the search ends, at a time where
-    the value is a number."""
+    """Return the next trial time in a step of length `step`, and whether the last one is near enough. `t` and
+    `c` are times and values of a bracket. The first trial divides it by the fraction `guess`. With `last` the
+    search ends at a finite value."""
     eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
@@ -128,12 +130,12 @@ def trial(w, t, c, step, last, guess) -> tuple:
     share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
-    # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps; nor does the mean
-    # slope over the whole step, before anything was tried
+    # Near in time by the slope, and small relative to the other end: one alone is not enough for flat or
+    # jumping values, nor is the mean slope of the whole step before any trial.
     slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
     slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
     small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
-    zero = w.equal(c_1, 0.0)  # at the event, or anywhere beyond it where the value stays zero
+    zero = w.equal(c_1, 0.0)  # at the event, or beyond it if the value stays zero
     near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
     closed = (w.magnitude(width) <= 2.0 * tiny) | last
     clipped = w.smaller(w.larger(share, least), 1.0 - least)
@@ -141,21 +143,19 @@ def trial(w, t, c, step, last, guess) -> tuple:
 
 
 class Search(NamedTuple):
-    """Bounds of the event's time.
-
-    A bracket consists of three times with the values of all events there: the last trial, a time on the other
-    side of the event, and an earlier bound."""
+    """Bounds of the event's time: three times with the values of all events. They are the last trial, a time
+    on the other side of the event, and an earlier bound."""
 
     t: Values
     c: Any
-    step: Any  # length of the step in which the event lies
-    left: Any  # steps; 0: found
-    shift: Any  # the next step, with its sign
+    step: Any  # length of the step with the event
+    left: Any  # remaining steps; 0: found
+    shift: Any  # the next step, signed
     slope: Values  # magnitude of the mean rate of the values over that step
 
     @property
     def trying(self):
-        """Whether trials start at the last state before the event and go on by Newton's method."""
+        """Return whether trials start at the last state before the event, rather than Newton shifts."""
         return self.left > DIFFERENTIABLE + 1.0
 
 
@@ -168,12 +168,11 @@ def search_of(form: Form, p: Lanes) -> Search:
 
 
 def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
-    """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time, values of
-    all events, rates).
-
-    `begins`: whether the event is in this step. Returns the index of the event that the search follows."""
+    """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time,
+    values of all events, rates). `begins`: whether the event is in this step. Returns the index of the
+    event that the search follows."""
     old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
-    # narrowed: the time tried, one on the other side of the event, and one that was either before
+    # narrowed bracket: the trial time, one on the other side of the event, and one of the former two
     same = ~(no_event(c_1) ^ no_event(old.c[0]))
     narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
     narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
@@ -191,13 +190,15 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     left = w.where(trying & near, DIFFERENTIABLE + 1.0, left)
     slack = math.sqrt(w.eps) * step
     value, rate = chosen(w, first, c_1), chosen(w, first, rate_0)
-    to = t_1 - value / rate  # within the bracket: of a value that was zero shortly before, that is another event
+    # stay within the bracket; a value that was zero shortly before belongs to another event
+    to = t_1 - value / rate
     usable = (old.left > 0.0) & (to > w.smaller(t[0], t[1]) - slack) & (to < w.larger(t[0], t[1]) + slack) & (w.magnitude(rate) < math.inf)
     slope = []
     for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
         mean = w.magnitude((b - a) / (t_1 - t_0))
         slope.append(w.where(begins, w.where(mean < math.inf, mean, 0.0), kept))
-    newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)  # beyond the event its value may be no number
+    # its value beyond the event may be NaN
+    newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)
     shift = w.where(trying, w.where(near, 0.0, tried - t_0), newton)
     rows = {"t": t, "c": [x for part in c for x in part], "step": [step], "left": [left], "shift": [shift], "slope": slope}
     for name, values in rows.items():
@@ -211,10 +212,9 @@ def is_flat(w, c_dot, slope):
 
 
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
-    """Return the fraction of a step `h` at which a value that falls below zero between the ends is lowest,
-    for the first such value; 1 if there is none.
-
-    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))"""
+    """Return the fraction of a step `h` at which the first value that dips below zero between the
+    ends is lowest; 1 if there is none: p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s =
+    -m_0/(A + sqrt(A^2 - 3 B m_0))."""
     share = None
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
         m_0, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -227,8 +227,8 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half the fraction of a step `h` during which the values that rise from zero stay positive
-    according to their cubics. The result is at most a half."""
+    """Return half the fraction of a step `h`, at most a half, for which values
+    rising from zero stay positive."""
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
         m, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -240,11 +240,9 @@ def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sink
 def monitored(
     w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
 ) -> dict[str, Number]:
-    """Return the result of a step `h` that may contain an event, or in which an event is being located. The
-    state `y1` after the step changes accordingly.
-
-    `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`: whether it is a step
-    of the motion."""
+    """Return the result of a step `h` that may contain an event, or in which an event is being located;
+    update `y1`. `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`:
+    whether it is a step of the motion."""
     count, y, t = form.events, p.pointer, p["t"]
 
     def events(t: Number, y: Number, slope: Number) -> list[list[Number]]:
@@ -262,9 +260,8 @@ def monitored(
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of events that were not left: rising above zero and falling again in a step counts
-        as new.
-        """
+        """Reverse the sign of events that were not left: rising above zero and falling
+        again in a step counts as new."""
         if not form.goes_on:
             return found
         off = p.every("disarmed")
@@ -275,7 +272,7 @@ def monitored(
     at_end = events(new["t"], y1, k[1])
     c_1, rate_1 = armed(at_end)
     locating = w.equal(p["code"], LOCATING)
-    # a motion that starts beyond an event has no motion at all; a state that is lost is no event
+    # a motion that starts beyond an event ends at once; a NaN state is not an event
     sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
     fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.goes_on else 0.0) & sound
     share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
@@ -287,7 +284,8 @@ def monitored(
     w.store(0.5, half)
     w.if_any(again, lambda: w.store(ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), half))
     dips, share = accept & ((share < 1.0) | again), w.where(again, w.load(half), share)
-    restarts = locating & again  # a trial that passes a second zero of a value that rises from zero: a shorter step
+    # the trial passed a second zero of a value that rises from zero: use a shorter step
+    restarts = locating & again
     happened = accept & ~dips & ~no_event(c_1)
     was_trying, changes, first = search_of(form, p).trying, happened | (locating & ~restarts), w.room()
     w.store(p["event"], first)
@@ -297,7 +295,7 @@ def monitored(
 
     w.if_any(changes, follow)
     search = search_of(form, p)
-    # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
+    # trials start at the last state before the event; a step over a dip is repeated up to its bottom
     found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
     over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
     stays = back | dips | restarts | over
@@ -324,17 +322,18 @@ def monitored(
     ends = found
     if form.goes_on:
         goes = goes_on(w, form, changed["event"]) & (found | over)
-        # an event a rounding beyond the end of its step happens there: what is saved there is the state after it
+        # an event just beyond the end of its step by rounding happens at the end; the
+        # saved state is the one after it
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
-        at_once = over & ~goes & (p["begun"] > 0.0)  # right after a transition, by which its time is set
+        at_once = over & ~goes & (p["begun"] > 0.0)  # right after a transition, which determines its time
         ends = at_once | (found & ~goes)
         p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
         left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
         p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
         rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
-        side = is_side(w, form, changed["event"])  # one may vanish where another one has
+        side = is_side(w, form, changed["event"])  # one may vanish together with another
         flat = ~side & (over | is_flat(w, rate, slope))
         quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
         passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
@@ -346,7 +345,8 @@ def monitored(
         why = w.where(why > 0.0, why, float(results.TOO_MANY_TRANSITIONS))
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
-        changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)  # they count as tries, so that these end
+        # counted as trial steps, so that they end
+        changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:
@@ -360,13 +360,11 @@ def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
 
 
 def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
-    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates.
+    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each
+    time tangent shifts the state along the directions e of which it is composed (values and rates before
+    the event; NaN without slope),
 
-    Each tangent of time in turn moves the state, in the directions e of which it is composed,
-
-        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
-
-    where values, tangents and rates are those before the event; dt is NaN where c has no slope there."""
+        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0"""
     count, times = form.events, form.rows["dt"]
 
     def put() -> None:
@@ -376,7 +374,7 @@ def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, 
         usable = found & w.differs(slope, 0.0) & (w.magnitude(slope) < math.inf)
         flat = found & slope_is_flat(w, p, slope)
         for part, row in enumerate(times, 1):
-            if part > 1:  # what is known of the rates is of the state as it was
+            if part > 1:  # rates at the shifted state
                 k_now = w.room(form.integrated)
                 w.run("rates", p.pointer, t, y1, k_now, pivots)
             w.run("event_tangents", p.pointer, t, y1, values)

@@ -1,16 +1,16 @@
-"""The explicit Runge-Kutta methods of our own loop: tableaus and step sizes.
+"""Explicit Runge-Kutta methods of this package's loop: tableaus and step sizes.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum (b_i - b^_i) k_i
 
-Tsit5:  Ch. Tsitouras, Computers and Mathematics with Applications 62 (2011) 770, of order 5 with an estimate of order 4
-Dopri5: J. R. Dormand and P. J. Prince, J. Comput. Appl. Math. 6 (1980) 19, of order 5; its estimate is that of L. F. Shampine, Math. Comp. 46 (1986) 135
-Dopri8: P. J. Prince and J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67, of order 8 with an estimate of order 7
+    Tsit5:  Ch. Tsitouras, Computers and Mathematics with Applications 62 (2011) 770, order 5, estimate of order 4
+    Dopri5: J. R. Dormand and P. J. Prince, J. Comput. Appl. Math. 6 (1980) 19, order 5, estimate by
+            L. F. Shampine, Math. Comp. 46 (1986) 135
+    Dopri8: P. J. Prince and J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67, order 8, estimate of order 7
 
-They bear the names of diffrax's solvers, and have their coefficients to the last bit: so a motion is the same by whichever loop, and the default ones need
-no diffrax. The weights of the solution stand as the last row of A too: the last stage of a step is the first of the next one.
-
-The formulas for the length of steps, those of implicit methods among them, are those of arrays of JAX and of values of machine code: `w` is
-the writer of a step (`motion/native/step.py`).
+Names and coefficients equal those of diffrax's solvers to the last bit, so a motion is the same in either
+loop, and the defaults do not need diffrax. The weights of the solution are also the last row of A: the last
+stage of a step is the first of the next one. The formulas for step sizes, also of implicit methods, serve JAX
+arrays and machine code through `w`, the writer of a step (`motion/native/step.py`).
 """
 
 import math
@@ -38,7 +38,7 @@ SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A Runge-Kutta tableau. Its stages run as a loop, so that the vector field is compiled only once."""
+    """Runge-Kutta tableau. Its stages run as a loop, so that the vector field is compiled only once."""
 
     name: str
     order: int
@@ -46,23 +46,23 @@ class Method:
     b: np.ndarray
     b_error: np.ndarray
     c: np.ndarray
-    even: ClassVar[bool] = False  # whether it takes steps of one length
+    even: ClassVar[bool] = False  # whether it takes equal steps
 
     @property
     def needed(self) -> int:
-        """The number of stages of a step, without an unused last one."""
+        """Return the number of stages of a step, without an unused last one."""
         at_y_1 = np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0
         return len(self.c) - int(at_y_1 and self.b_error[-1] == 0)
 
     @property
     def at_the_end(self) -> int:
-        """Return the last stage at the end of a step. If no stage is at the end, return the last of all."""
+        """Return the index of the last stage at the end of a step, or of the last stage if none is there."""
         return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
-    """Return a method from its nodes, the rows of A and the weights of its embedded method. Nodes and rows
-    are given without those of the first stage.
+    """Return a method from its nodes, the rows of A and the weights of its embedded method,
+    all without the first stage.
     """
     stages = len(c) + 1
     A = np.zeros((stages, stages))
@@ -136,23 +136,23 @@ _ALL = {method.name: method for method in (TSIT5, DOPRI5, DOPRI8)}
 
 
 def method_of(solver) -> Method | None:
-    """Return the method of a solver of diffrax; None if our own loop has no such method."""
+    """Return the method of a diffrax solver; None if this package's loop does not support it."""
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
 
 
 class Aim(NamedTuple):
-    """The step that is tried."""
+    """Trial step."""
 
     t_1: Any  # its end
-    h: Any  # its length, as rounded: the state and the time advance together
-    size: Any  # its magnitude, but of a search for an event
-    locating: Any  # whether it is part of one
+    h: Any  # its rounded length, so that state and time advance together
+    size: Any  # its magnitude, except in an event search
+    locating: Any  # whether it belongs to an event search
 
 
 def aimed(w, p, target, reach, shift) -> Aim:
-    """Return the length of a step to the `target`, to half of the way, or to `reach`, whichever applies.
-    `shift`: from a search for an event, if there is one.
+    """Return the step to the `target`, to half of the way, or to `reach`, whichever applies. `shift`:
+    from an event search, if active.
     """
     locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
     lands = ~locating & (reach >= 0.999 * rest)
@@ -163,7 +163,7 @@ def aimed(w, p, target, reach, shift) -> Aim:
 
 
 def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
-    """Return whether a step of this `error` is accepted, and the next step."""
+    """Return whether a step with this `error` is accepted, and the next step."""
     accept = aim.locating | (error <= 1.0)
     factor = SAFETY * power(w.where(error > 0.0, error, 1e-30), -1 / order)
     factor = w.larger(w.where(error < math.inf, factor, 0.0), LEAST_FACTOR)
@@ -175,7 +175,8 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
     """Return time, next step, code and counts after a step."""
     accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
     rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
-    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)  # the second: no time would pass
+    # the second: time would not advance
+    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)
     arrived = accept & w.equal(aim.t_1, p["last_goal"])
     code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, results.MAX_STEPS, RUNNING)
     code = w.where(too_short, results.STEP_TOO_SMALL, code)
@@ -186,8 +187,7 @@ def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
     """Return the result code of a motion that ends after `span`, when every requested time has been reached.
     `h`: the length of the next step.
     """
-    # the last steps against the average one
-    # 0.01 of the average step: a singularity is near
+    # steps that shrank below 0.01 of their average indicate a singularity
     shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
     return jnp.where(shrank, results.SHRANK, jnp.where(code == RUNNING, results.SUCCESS, code))
 
@@ -196,20 +196,20 @@ LEAST_ORDER, MOST_ORDER = 4, 30
 
 
 class Taylor(eqx.Module):
-    """Taylor series of the motion, `simulate(..., solver=jj.Taylor())`: for small scenes, tight tolerances,
-    and many saved times.
+    """Taylor series of the motion, `simulate(..., solver=jj.Taylor())`: for small scenes, tight
+    tolerances, and many saved times.
 
-    y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, by machine code of the CPU. By default
-    the order is p = ceil(1 - log(rtol)/2), and a step is as long as its last two terms stay within the
-    tolerance (Jorba and Zou). Saved states come from the series: steps do not end there. Against Dopri8 at
-    equal error, a Chaplygin sleigh takes half of the time alone at 1e-12, a scene of some hundred operations
-    more time than it.
+    y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, in machine code of the CPU. The
+    default order is p = ceil(1 - log(rtol)/2); the length of a step keeps its last two terms within the
+    tolerance (Jorba and Zou). Saved states come from the series, so steps do not end there. Compared with
+    Dopri8 at equal error, a single Chaplygin sleigh takes half of the time at 1e-12; scenes with some
+    hundred operations take longer.
 
     **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`. **Raises** from `simulate`:
-    ValueError without machine code, for sampled inputs, and for equations that branch or are too long.
-    Derivatives: forward mode by series too, or by Dopri8 if the series of second derivatives are too long;
-    reverse mode runs the motion once more by Dopri8. Source: A. Jorba and M. Zou, Experimental Mathematics 14
-    (2005) 99.
+    ValueError without machine code, for sampled inputs, and for equations that branch or are too
+    long. Derivatives: forward mode also by series, or by Dopri8 if the series of second derivatives
+    are too long; reverse mode integrates the motion again by Dopri8. Source: A. Jorba and M. Zou,
+    Experimental Mathematics 14 (2005) 99.
     """
 
     order: int | None = static(default=None)
@@ -220,7 +220,7 @@ class Taylor(eqx.Module):
 
 
 def order_for(rtol: Number) -> int:
-    """Return p = ceil(1 - log(rtol)/2), at which the cost per length of time is least."""
-    # the tolerance that the order is for where it is traced
+    """Return p = ceil(1 - log(rtol)/2), which minimises the cost per unit of time."""
+    # assumed for a traced tolerance
     tolerance = 1e-12 if is_traced(rtol) else float(rtol)
     return min(max(math.ceil(1 - math.log(tolerance) / 2), LEAST_ORDER), MOST_ORDER)

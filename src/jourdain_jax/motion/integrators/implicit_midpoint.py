@@ -1,4 +1,4 @@
-"""The implicit midpoint rule, on any form of the integrated state."""
+"""Implicit midpoint rule, for any form of the integrated state."""
 
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -10,17 +10,18 @@ from jourdain_jax.motion.integrators.integrands import rates
 
 
 class ImplicitMidpoint(FixedStepMethod):
-    """The implicit midpoint rule, `y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)`, for `simulate(..., solver=ImplicitMidpoint(step=h))`; h in s.
+    """The implicit midpoint rule, `y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)`, for `simulate(...,
+    solver=ImplicitMidpoint(step=h))`; h in s.
 
-    Order 2, symmetric in time, stable for any step where the motion is. It keeps every integral that is
-    quadratic in the integrated state (with the minimal state: in the coordinates and privileged speeds) to
-    round-off, and is symplectic for unconstrained holonomic scenes in canonical coordinates. Velocity rows
-    hold exactly with the minimal state; with the full one they are projected after each step, which breaks
-    the symmetry.
+    It has order 2, is symmetric in time, and stable for any step if the motion is. It preserves all integrals
+    that are quadratic in the integrated state (with the minimal state: in the coordinates and independent
+    speeds) to round-off, and is symplectic for unconstrained holonomic scenes in canonical coordinates.
+    Velocity constraints hold exactly with the minimal state. With the full state they are projected after
+    each step, which breaks the symmetry.
 
     Use it for long motions of reversible scenes, where its energy error stays bounded, for stiff scenes, and
-    where a quadratic integral matters; otherwise the default solvers reach the same accuracy much faster. The
-    equations of a step are solved by Newton's method to round-off, and differentiated through the implicit
+    if a quadratic integral matters; otherwise the default solvers reach the same accuracy much faster. The
+    equations of a step are solved to round-off by Newton's method, and differentiated through the implicit
     function theorem. Between saved times it takes equal steps of at most `step` (s).
 
     Source: Hairer, Lubich and Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
@@ -34,7 +35,7 @@ class ImplicitMidpoint(FixedStepMethod):
         def f(t, x):
             return ravel_pytree(rates(t, unravel(x), args))[0]
 
-        # the unknown is the difference, which has more digits than the state
+        # solve for the difference, which keeps more digits than the state
         guess = h * f(t, y0)
         found = newton_root(lambda d: d - h * f(middle, y0 + d / 2), guess, sizes(len(y0), y0, guess))
         return Solution(unravel(jnp.where(found.converged, found.x, 0.0)), None, found.converged)

@@ -1,7 +1,8 @@
-"""The integrands of the loops: rates, projection and events as functions of (tau, y, args), for one motion
-and for batches.
+"""Integrands of the loops: rates, projection and events as functions of (tau, y, args),
+for one motion and for batches.
 
-`args`: the vector field, the scene, its inputs, what the rates need of the scene, and the time from which tau counts; of lanes, with their axis first.
+`args`: the vector field, the scene, its inputs, the scene's part of the rates, and the origin of tau; for
+batches with the batch axis first.
 """
 
 from collections.abc import Callable
@@ -16,11 +17,10 @@ from jourdain_jax.motion.vector_fields.field import Instant, Integrated, VectorF
 
 
 def state_norm(y: Integrated) -> PerLane:
-    """Return the root mean square over coordinates and speeds. Integrated work does not influence the step
-    size.
+    """Return the root mean square over coordinates and speeds. Integrated work does
+    not influence the step size.
 
-    NaN counts as infinite: the step then shrinks until the motion ends. A NaN itself would be tried until the
-    last allowed step.
+    NaN counts as infinite, so that the step shrinks until the motion ends instead of using up all steps.
     """
     squared = sum(jnp.sum(part**2, axis=0) for part in (y.q, y.v)) / (len(y.q) + len(y.v))
     squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
@@ -28,8 +28,8 @@ def state_norm(y: Integrated) -> PerLane:
 
 
 def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorField, Instant]:
-    """Return the vector field, and its arguments at a state. With `of_rates`, return the arguments of the
-    rates alone. Lanes have their axis last.
+    """Return the vector field, and its arguments at a state. With `of_rates`, return only the arguments of
+    the rates. The batch axis is last.
     """
     field, scene, inputs, fixed, origin = args
     t = origin + tau
@@ -39,8 +39,8 @@ def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorFie
 
 
 def _lane_by_lane(knows_lanes: Callable[[VectorField], bool]) -> Callable:
-    """Return a decorator for functions of (tau, y, args). Lanes go through such a function one by one, unless
-    the field handles lanes.
+    """Return a decorator for functions of (tau, y, args) that maps them over a batch
+    unless the field supports batches.
     """
 
     def decorated(function: Callable) -> Callable:
@@ -87,12 +87,12 @@ def resets(tau, y, args) -> Float[Array, "events rows *lanes"]:
 
 @_lane_by_lane(lambda field: field.lowered is not None)
 def energy(tau, y, args) -> PerLane:
-    """T + V, J; a number to differentiation."""
+    """Return T + V, J, without derivatives."""
     field, at = at_time(tau, y, args)
     return jnp.sum(field.energies(at), axis=0)
 
 
 def within(middle, args):
-    """`args` for the stages of a step with this middle."""
+    """Return `args` for the stages of a step with this middle."""
     field, scene, inputs, fixed, origin = args
     return field, scene, seen_from_within(inputs, origin + middle), fixed, origin

@@ -3,8 +3,8 @@
     z_i = h sum_j a_ij f(t_0 + c_j h, y_0 + z_j),   y_1 = y_0 + z_3
     e = (1 - h g J)^-1 (g h f(t_0, y_0) + g/3 (-13 - 7 sqrt 6, -13 + 7 sqrt 6, -1) . z),   1/g the real eigenvalue of A^-1,   J = df/dy
 
-The stages are collocation at the nodes of Radau, c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1); the estimate e is of order 3 and stays small where a
-component decays at once.
+The stages are collocation at the Radau nodes c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1). The estimate e has
+order 3 and stays small for components that decay at once.
 """
 
 from typing import ClassVar
@@ -28,24 +28,25 @@ _ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1
 
 
 class RadauIIA(ImplicitMethod):
-    """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff springs, dampers and drives.
+    """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff
+    springs, dampers and drives.
 
-    L-stable: fast decaying modes do not bound the steps. The equations of a step are solved by Newton's
-    method to round-off, and differentiated through the implicit function theorem; a step whose equations are
-    not solved is tried again at a fifth of its length. A step costs some fifty evaluations and a linear
-    system three times the size of the state. This pays where an explicit method would need many more steps
-    for stability than for accuracy. With `retry=True`, `simulate` changes to it where its default solver runs
+    L-stable: fast decaying modes do not limit the steps. The equations of a step are solved to round-off
+    by Newton's method, and differentiated through the implicit function theorem; if that fails, the step
+    is repeated at a fifth of its length. A step costs some fifty evaluations and a linear system three
+    times the size of the state. This pays if stability would force an explicit method to take many more
+    steps than accuracy requires. With `retry=True`, `simulate` uses this method if its default solver runs
     out of steps on a stiff motion.
 
-    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
+    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and
+    equations (IV.8.17) to (IV.8.19).
     """
 
     order: ClassVar[int] = 4  # of the embedded estimate
 
     def solve(self, args: tuple, t, y: PyTree, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s), with an infinite error where its equations were not solved.
-
-        `args`: as in `integrands.py`.
+        """Return the change of the state `y` at `t` by a step `h` (s), with an infinite error if its
+        equations were not solved. `args`: as in `integrands.py`.
         """
         x0, unravel = ravel_pytree(y)
         h = jnp.asarray(h, x0.dtype)
@@ -57,7 +58,8 @@ class RadauIIA(ImplicitMethod):
 
         def equations(z):
             z = z.reshape(3, n)
-            slopes = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))  # a loop: one copy of the rates to compile
+            # a loop compiles the rates once
+            slopes = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))
             return (z - h * A @ slopes).reshape(-1)
 
         slope, along = jax.linearize(lambda x: f(t, x), x0)

@@ -1,1 +1,1 @@
-"""Steps of a motion, and the loop over them as machine code, for lanes side by side."""
+"""Steps of a motion, and the loop over them, as machine code for several lanes at once."""

@@ -1,22 +1,21 @@
-"""Reverse mode of the loop over steps as machine code: cotangents of the start from those of the states and
-the end.
+"""Reverse mode of the loop over steps: cotangents of the start from the cotangents of the states and the end.
 
-Lanes side by side begin and end together here. On the forward pass every try of a step leaves a slot: the
-state before it, the slopes of its stages, by how
-far the state continued (zero where the step was refused, or the lane had ended), and how many times had been
-saved before it
-(`record.py`). On the backward pass, a step being a number,
+All lanes of a block begin and end together here. On the forward pass every trial step leaves a slot
+(`record.py`): the state before it, the slopes of its stages, the advance of the state (zero if the
+step was rejected or the lane had ended), and the number of times saved before it. On the backward
+pass, with a fixed step size,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
 
-and where a motion ended at a stop event, at its time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, first
+and if a motion ended at a stop event, at the time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, first
 
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
-On arrays the same source goes back (`motion/arrays/back.py`). JAX differentiates this once more, by cotangents of the motion with a tangent.
-Let S be the sum of all states, each times its cotangent g, and g' what S' changes by along a tangent. The result is dS/dx, where x is the start's state and the
-numbers known. It changes by d(dS)/dx, where dS is the sum of the states times g' and of their tangents times g: cotangents are g' of the states and g of
-their tangents.
+In JAX the same source goes back (`motion/arrays/back.py`). JAX differentiates this once more, by cotangents
+of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g' be the
+change of g along a tangent. The result is dS/dx, where x is the initial state and the known numbers. Its
+change is d(dS)/dx, where dS is the sum of states times g' and of their tangents times g: the cotangents are
+g' for the states and g for their tangents.
 """
 
 import math
@@ -57,8 +56,8 @@ from jourdain_jax.native.ir import Value
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
-    """Write the module; `asked`: marks of the numbers whose cotangents are needed; `memory`: bytes for the
-    records of all threads.
+    """Write the module; `asked`: indices of the numbers whose cotangents are needed; `memory`: bytes
+    for the records of all threads.
     """
     write_functions(w, form, method)
     write_pulled(w, form, asked)
@@ -93,7 +92,7 @@ def _write_begin(w: MachineWriter, form: Form) -> None:
 
 
 def _write_note(w: MachineWriter, form: Form) -> None:
-    """Write `note(job, state, who, saved)`: count the times that were reached, set the next one, and end
+    """Write `note(job, state, who, saved)`: count the times reached, set the next one, and end
     lanes that have reached all.
     """
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
@@ -140,8 +139,8 @@ def _write_added(w: MachineWriter, form: Form) -> None:
 
 
 def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """Write `step_back(state, here, g, by_known)`: go back over the step in the slot `here`, in lanes that
-    continued in it.
+    """Write `step_back(state, here, g, by_known)`: go back over the step in the slot `here`,
+    in lanes that advanced in it.
     """
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         step_back(w, form, method, asked, state, here, g, by_known)
@@ -157,7 +156,7 @@ def _used(method: Method) -> list[int]:
 
 
 def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Number, here: Number, g: Number, by_known: Number) -> None:
-    """Go back over the step in the slot `here`, in lanes that continued in it."""
+    """Go back over the step in the slot `here`, in lanes that advanced in it."""
     slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
     h, t = w.load(here, slot.taken), w.load(here, slot.t)
     took, k = w.differs(h, 0.0), w.at(here, slot.y)
@@ -222,8 +221,8 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
 
 
 def _write_project_back(w: MachineWriter, form: Form) -> None:
-    """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into those of the
-    state `free` before the projection.
+    """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into cotangents of
+    the state `free` before the projection.
     """
     moves, count = form.moves, form.integrated
     with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
@@ -238,8 +237,8 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 
 
 def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `event_back(job, state, who, g, by_known)`, the function of the same name here, with cotangents
-    of the end's time from the job.
+    """Write `event_back(job, state, who, g, by_known)`, which calls the Python function `event_back` with
+    cotangents of the end's time from the job.
     """
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         located = is_located(w, Lanes(w, form, state))
@@ -253,8 +252,8 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
 
 
 def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `reset_back(job, state, who, left, g, by_known)`, the function of the same name here, with
-    cotangents of the transition's time from the job.
+    """Write `reset_back(job, state, who, left, g, by_known)`, which calls the Python function `reset_back`
+    with cotangents of the transition's time from the job.
     """
     with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
@@ -277,23 +276,23 @@ def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
 
 
 def _cotangents_of_end(w: MachineWriter, form: Form, job: Value, lane: Value) -> OfLane:
-    """Return the cotangents of the end of a lane and of the times of its transitions."""
+    """Return the cotangents of the end of a sample and of the times of its transitions."""
     return of_lane(w, w.load(job, TO_ENDS, "ptr"), w.load(job, COUNT, "i64"), form.ends, lane)
 
 
 def is_located(w: StepWriter, lanes: Lanes) -> Number:
-    """Return which lanes ended at an event that was searched for."""
+    """Return which lanes ended at an event located by a search."""
     return w.equal(lanes["code"], results.EVENT) & (lanes["accepted"] > 0.0)
 
 
 def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Number, g_t: Number, g: Number, by_known: Number) -> None:
-    """Turn cotangents of a state at a given time into those at the time and state of an event."""
+    """Turn cotangents of a state at a fixed time into cotangents at the time and state of an event."""
     lanes, count = Lanes(w, form, state), form.integrated
     f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
     values, rates, weights = (w.room(form.events) for _ in range(3))
     t = lanes["t"]
     w.run("rates", state, t, state, f, pivots)
-    if form.moving:  # the tangent, and its rates, at a number for a time
+    if form.moving:  # the tangent and its rates at a fixed time
         dy, dt = w.at(state, form.y), lanes["dt"]
         each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(w.differs(dt, 0.0), dt * w.load(f, i), 0.0))
         lanes["dt"] = w.number(0.0)
@@ -321,8 +320,8 @@ def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Nu
 
 
 def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
-    """Return the derivative with respect to time of an event's contribution to a tangent. It changes the
-    cotangents `g` of the state and adds to the others.
+    """Return the time derivative of an event's contribution to a tangent. It changes the cotangents `g` of
+    the state and adds to the others.
     """
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated
@@ -339,8 +338,8 @@ def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Call
     """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
     (with its time last), and the goals.
 
-    It returns cotangents of the state at the start, and of the requested numbers among those that the rates
-    receive (`asked`). A state is followed by its tangent.
+    It returns cotangents of the initial state, and of the requested numbers among the known ones (`asked`). A
+    state is followed by its tangent.
     """
     count = form.integrated + len(asked)
     run_rows = called(
@@ -368,10 +367,11 @@ def flow_back(form: Form, method: Method, asked: Indices, memory: int) -> Callab
         (start, g, ends), (along, dg, dends) = primals, tangents
         dg, dends = filled(dg), filled(dends)
         raised, more = with_tangents(form, start, along)
-        # of the state and its tangent, at the goals, at the end, and of the time of that
+        # of the state and its tangent, at the goals, at the end, and of its time
         parts = [x for a, b in pairwise((0, n, n + 1, len(ends))) for x in (dends[a:b], ends[a:b])]
         both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
-        raised = replace(raised, time_moves=form.has_events and bool(form.sampled))  # an event needs to know how fast samples change
+        # events need the slopes of samples
+        raised = replace(raised, time_moves=form.has_events and bool(form.sampled))
         d = _pulled(kernel_back(raised, method, asked, memory), more, *both)
         return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
 

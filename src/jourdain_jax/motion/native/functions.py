@@ -1,13 +1,14 @@
-"""Rates, projection and stop events of a lowered scene as functions in machine code: of the rows of lanes,
-time since the start, and a state in memory.
+"""Rates, projection and stop events of a lowered scene as machine code: functions of the rows of the lanes,
+the time since the start, and a state in memory.
 
-Where a tangent is pushed along, it follows its state in memory, and each function also gives the tangents of what it gives; others give cotangents:
+A state may be followed by its tangents; each function then also returns the tangents of its results. Further
+functions return cotangents:
 
-    d f(t, y, p) = df/dy dy + df/dp dp          p: numbers that the rates are given, of which those in `Form.moving` have tangents
+    d f(t, y, p) = df/dy dy + df/dp dp          p: known numbers of the rates, of which `Form.moving` have tangents
     G_y = (df/dy)' g,   G_p += (df/dp)' g       for the requested p
 
-and, of derivatives of higher order, the tangents of these along the next direction. A tangent that is pushed along belongs to the state: cotangents of a
-motion with its tangent are what second derivatives consist of.
+For higher derivatives, tangents of all these follow along the next direction. Cotangents of a motion with its
+tangents give the second derivatives.
 """
 
 from collections.abc import Sequence
@@ -25,20 +26,20 @@ from jourdain_jax.program.graph import Graph, NodeList
 
 
 class Outputs(NamedTuple):
-    """Nodes with their tangents, on a graph of their own where they have some."""
+    """Nodes with their tangents, on a separate graph if there are tangents."""
 
     graph: Graph
     values: NodeList
-    tangents: list[NodeList]  # one after the other
-    variables: NodeList  # for those of the scene's program
-    states: list[NodeList]  # inputs for the tangents of the state
-    known: NodeList  # for those of the numbers known that have some, all of the first tangent first
-    times: NodeList  # for those of time
-    slopes: NodeList  # and for how fast inputs given by samples change with it
+    tangents: list[NodeList]  # one list per tangent
+    variables: NodeList  # variables of the scene's program
+    states: list[NodeList]  # inputs: tangents of the state
+    known: NodeList  # inputs: tangents of known numbers, all of the first direction first
+    times: NodeList  # inputs: tangents of time
+    slopes: NodeList  # inputs: time derivatives of sampled inputs
 
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
-    """Return the first `pushed` of the nodes with their tangents."""
+    """Return the nodes with tangents of the first `pushed` of them."""
     program, count = form.program, len(form.moving)
     if not count:
         return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
@@ -49,7 +50,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     sampled = {len(y) + len(fixed) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
-    # all that varies, and its tangents, in the order of these
+    # all varying quantities, then their tangents, in this order
     given = [dict(enumerate([*y, *fixed, *inputs, t]))]
     for k in range(count):
         of_time = {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in sampled.items()} if times else {}
@@ -63,7 +64,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
 
 
 def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
-    """Return the values of outputs, and their tangents; `known`: as from `known_values`."""
+    """Return the values of outputs and their tangents; `known`: from `known_values`."""
     given = given_values(w, form, own, known, state, tau, y)
     found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
     tangents = iter(found[len(own.values) :])
@@ -71,9 +72,7 @@ def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], 
 
 
 def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Return values of those nodes of outputs that are given from outside. `known`: as returned by
-    `known_values`.
-    """
+    """Return the values of the input nodes of outputs; `known`: from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
@@ -84,7 +83,7 @@ def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Va
 
 
 def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
-    """Return values of all nodes that are given from outside."""
+    """Return the values of all input nodes of the program."""
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
     known, fixed, t = stated(w, lanes, "known"), len(program.fixed), lanes["origin"] + tau
@@ -95,11 +94,11 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
 
 
 def write_rates(w: MachineWriter, form: Form) -> None:
-    """Write `rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and the monitored
-    quantities, pivots first.
+    """Write `rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and the
+    monitored quantities, pivots first.
     """
     program = form.program
-    # 120 operations: so few are written again at each stage
+    # inline small programs at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
@@ -115,7 +114,7 @@ def write_rates(w: MachineWriter, form: Form) -> None:
 
 
 def write_projection(w: MachineWriter, form: Form) -> None:
-    """`project(state, tau, y)`: puts the state `y` back onto the rows."""
+    """Write `project(state, tau, y)`: project the state `y` onto the constraints."""
     program = form.program
     with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
         known = known_values(w, form, state, tau, y)
@@ -134,8 +133,8 @@ def write_projection(w: MachineWriter, form: Form) -> None:
 
 
 def _write_along(w: MachineWriter, form: Form) -> None:
-    """Write `along(state, tau, y)`: for a state `y` on the constraints, keep only the part of its error along
-    the constraints, since a projection removes the rest.
+    """Write `along(state, tau, y)`: keep only the part of a state's error along the constraints, because a
+    projection removes the rest.
     """
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
@@ -148,10 +147,10 @@ def _write_along(w: MachineWriter, form: Form) -> None:
 
 @lru_cache(maxsize=64)
 def event_program(form: Form) -> Outputs:
-    """Return stop events with their rates, for states whose rates are known. Raises `Unsupported` where an
-    operation has no derivative on the graph.
+    """Return stop events and their rates, as functions of a state and its rates. Raises `Unsupported` for
+    operations without derivative on the graph.
 
-    dc/dt = sum dc/dx_i dx_i/dt
+        dc/dt = sum dc/dx_i dx_i/dt
     """
     graph, events, variables = on_its_own(form.program.graph, form.program.events, form.program.variables)
     _, t, y, _ = form.split(variables)
@@ -162,7 +161,7 @@ def event_program(form: Form) -> Outputs:
 
 def write_events(w: MachineWriter, form: Form) -> None:
     """Write `events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and
-    their rates where `y` changes at the rate `slope`.
+    their rates if `y` changes at the rate `slope`.
     """
     program, own, count = form.program, event_program(form), form.events
     with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
@@ -179,7 +178,7 @@ def write_events(w: MachineWriter, form: Form) -> None:
                 w.store(x, dc, i)
 
 
-# Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.
+# Limits on the operations of first and second derivatives. Reverse mode keeps some on the stack.
 LARGEST_DERIVATIVE = 10_000, 40_000
 
 
@@ -188,25 +187,25 @@ class Pulled(NamedTuple):
 
     own: Outputs
     found: NodeList
-    weights: dict[int, int]  # row of what is pulled -> input for its cotangent
+    weights: dict[int, int]  # row of a result -> input for its cotangent
 
     @property
     def graph(self) -> Graph:
-        """Where the nodes are."""
+        """Return the graph."""
         return self.own.graph
 
 
 def check_derivatives(form: Form, order: int) -> None:
-    """Raise a DifferentiationModeError where machine code for a form has no derivatives of an order."""
+    """Raise DifferentiationModeError if machine code has no derivatives of this order for a form."""
     if reason := reason_against_derivatives(form, order):
         raise DifferentiationModeError(f'{reason}; use `jj.simulate(..., backend="xla")`')
 
 
 @lru_cache(maxsize=64)
 def reason_against_derivatives(form: Form, order: int) -> str:
-    """Return the reason why machine code has no derivatives of this order for a form; empty if it has."""
+    """Return why machine code has no derivatives of this order for a form; empty if it has."""
     if order > len(LARGEST_DERIVATIVE):
-        return "`simulate` was differentiated three times, and machine code has derivatives of the first two orders"
+        return "`simulate` was differentiated three times, but machine code has only first and second derivatives"
     for nodes in steps_of(form).values():
         along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
         back = pulled_program(replace(form, moving=((),) * (order - 1)), nodes, (), len(nodes))
@@ -214,15 +213,15 @@ def reason_against_derivatives(form: Form, order: int) -> str:
             if reason := unsupported(graph, of_it):
                 return f"machine code cannot differentiate the motion: {reason}"
             if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
-                return f"a derivative of a part of the motion takes {operations} operations, more than the {most} that machine code is made for"
+                return f"a derivative of a part of the motion takes {operations} operations, more than the {most} of machine code"
     return ""
 
 
 def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
     """Write `pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`;
-    `asked`: the requested known numbers.
+    `asked`: indices of the requested known numbers.
 
-    For a state with a tangent, also write `pull_moved`; events are then those of the state alone.
+    For a state with a tangent, also write `pull_moved`; events are then functions of the state alone.
     """
     for name, nodes in steps_of(form).items():
         _write_one_pulled(w, form, f"pull_{name}", pulled_program(form, nodes, asked, 0 if name == "events" else len(nodes)), work_stays=name in ("q", "u"))
@@ -231,8 +230,7 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
 
 
 def steps_of(form: Form) -> dict[str, NodeList]:
-    """Return the parts of a step: rates, the whole state after either part of a projection, and stop events.
-    """
+    """Return the parts of a step: rates, the whole state after each part of a projection, and stop events."""
     program, (_, _, y, _) = form.program, form.split(form.program.variables)
     q, u = y[: form.coordinates], y[form.coordinates :]
     found = {"rates": form.rates}
@@ -243,7 +241,7 @@ def steps_of(form: Form) -> dict[str, NodeList]:
 
 
 def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushed: int) -> Pulled:
-    """Through nodes, the first `pushed` of them with their tangents."""
+    """Return the cotangents through nodes, of which the first `pushed` have tangents."""
     own = outputs_of(form, nodes, pushed)
     if not form.moving:
         graph, values, variables = on_its_own(own.graph, own.values, own.variables)
@@ -254,19 +252,18 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
 
 
 def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> NodeList:
-    """List the nodes of the state, of its tangent, and of the requested numbers."""
+    """Return the nodes of the state, of its tangents, and of the requested numbers."""
     fixed, _, y, inputs = form.split(own.variables)
     return [*y, *(n for part in own.states for n in part), *([*fixed, *inputs][i] for i in asked)]
 
 
 def _moved(form: Form, asked: Sequence[int]) -> Pulled:
-    """Differentiate through the contribution of a stop event to the tangent of a state at a given time, and
-    through the tangent of its time,
+    """Differentiate the contribution of a stop event to the tangent of a state at a fixed time, and the
+    tangent of the event's time,
 
         dt = -dc/cdot,   dy <- dy + f dt,   dc = dc/dy dy + dc/dp dp,   cdot = dc/dt + dc/dy f
 
-    The row after the state is that of dt. The last row is the derivative of the whole contribution along
-    time.
+    The row after the state is for dt. The last row is the time derivative of the whole contribution.
     """
     nodes = form.rates
     own = outputs_of(form, [*nodes, *form.program.events], len(nodes) + form.events)

@@ -1,20 +1,21 @@
-"""The memory layout of lanes: a lane is a column, each number is a row, and a row is one vector for all lanes
-side by side.
+"""Memory layout of lanes: a lane is a column, each number is a row, and a row is one vector for all lanes.
 
-A lane is handed over with all rows of `Form.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
-pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
-derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
-second order those along e_1, e_2, and both. `taken` is by how far the last step has gone; of
-a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be
-after one that was rejected.
+A sample enters with the rows of `Form.given`, which include its initial progress, and leaves with the rows of
+its final progress. Tangents of the state follow the state, tangents of the rates' known numbers follow these
+numbers; `dt` are tangents of time, which only an event's time has. Derivatives of order n in directions e_1
+to e_n have 2^n - 1 tangents, indexed by the binary numbers of their subsets of directions: for second order
+those along e_1, e_2, and both. `taken` is the advance by the last step. For Taylor series, `before` is the
+start time of the step, and `bound` limits the next one after a rejection.
 
-Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and
-where the next knot is at which a step must end (`knot`; `samples.py`).
+For sampled inputs, rows of pointers and integers locate a lane's samples (`table`), their number per input
+(`samples`), and the next knot, at which a step must end (`knot`; `samples.py`).
 
-Where events let the motion go on (`transitions.py`), `mode` are the modes, `passed` counts the transitions, and `log_event`, `log_mode`, `log_lost` and `log_t`
-hold of each the event, the modes after it, by how much the energy fell, and the time with its tangents. `begun` is how many steps had been tried at the
-last one, `disarmed` tells which events have not been left since they happened, and `left` holds what the last try left by a transition: the event's number
-and 1 (negative where its value has no slope), or 0 for none; its time; the state and the modes before it.
+If the motion continues after events (`transitions.py`), `mode` are the modes, `passed` counts the
+transitions, and `log_event`, `log_mode`, `log_lost` and `log_t` record for each the event, the new modes,
+the loss of energy, and the time with its tangents. `begun` is the number of steps tried up to the last
+transition, `disarmed` marks events whose value has not yet left zero. `left` describes the transition in
+the last trial step: the event's index plus 1 (negative if its value has no slope), or 0 for none; its time;
+the state and modes before it.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,27 +35,27 @@ CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max
 
 @dataclass(frozen=True)
 class Form:
-    """The integrated form: a lowered scene with its options: work, projection, events, monitored pivots."""
+    """Integrated form: a lowered scene with its options for work, projection, events and monitored pivots."""
 
     program: Lowered
     with_work: bool
     projects: bool
     affine: bool
     has_events: bool
-    pivots: int  # how many are monitored
-    moving: tuple[Indices, ...] = ()  # of every tangent, which of the numbers known have it
-    sampled: Indices = ()  # which of the inputs are given by samples
+    pivots: int  # number of monitored pivots
+    moving: tuple[Indices, ...] = ()  # for every tangent, the indices of known numbers that have it
+    sampled: Indices = ()  # indices of sampled inputs
     time_moves: bool = False  # whether time has tangents
-    compensated: bool = False  # whether the state is summed with what rounding leaves off, as in single precision
-    switched: Indices = ()  # which of the inputs are modes
+    compensated: bool = False  # whether the state uses compensated summation, as in single precision
+    switched: Indices = ()  # indices of the inputs that are modes
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
-    most: int = 0  # transitions of a motion
-    stopping: bool = True  # whether events that end a motion do
-    sides: tuple[bool, ...] = ()  # of relations, the last modes and events: whether each is of whole numbers
+    most: int = 0  # maximum number of transitions of a motion
+    stopping: bool = True  # whether events that end a motion are active
+    sides: tuple[bool, ...] = ()  # of relations, the last modes and events: whether each has integer sides
 
     @property
     def rates(self) -> list[int]:
-        """The rates of the state."""
+        """Return the nodes of the state's rates."""
         program = self.program
         return [*program.qdot, *program.ydot, *([program.power] if self.with_work else [])]
 
@@ -65,43 +66,47 @@ class Form:
 
     @property
     def stated(self) -> int:
-        """Numbers of events that the scene states."""
+        """Return the number of events that the scene states."""
         return self.events - len(self.sides)
 
     @property
     def monitored(self) -> list[int]:
-        """Return the monitored quantities at all stages of a step: pivots first, then directions of rows,
-        then distances from a loss of rank."""
+        """Return the quantities monitored at all stages of a step: pivots, directions of constraints, then
+        distances from a loss of rank.
+        """
         return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
 
     @property
     def speeds(self) -> int:
-        """Numbers of speeds."""
+        """Return the number of speeds."""
         return len(self.program.ydot)
 
     @property
     def turning(self) -> int:
-        """Numbers of all entries of directions of rows."""
+        """Return the total number of entries in directions of constraints."""
         return len(self.program.directions)
 
     @property
     def known(self) -> dict[str, int]:
-        """Rows of the numbers known beside time and the state, and of their tangents."""
+        """Return the numbers of rows of the known numbers other than time and state, and of their tangents.
+        """
         return {"known": len(self.program.fixed) + len(self.program.inputs), "dknown": sum(map(len, self.moving))}
 
     @property
     def squares(self) -> Indices:
-        """Return the squared parts of rows normal to their predecessors, and squared sizes, alternating."""
+        """Return the squared part of each constraint normal to the earlier ones, and
+        its squared size, alternating.
+        """
         return self.program.squares if self.projects else ()
 
     @property
     def moves(self) -> list[int]:
-        """A projection step by step, 1: of the coordinates, 0: of the speeds."""
+        """Return the sequence of projection steps, 1 for coordinates and 0 for speeds."""
         return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
 
     @property
     def nodes(self) -> list[int]:
-        """All that is evaluated."""
+        """Return all evaluated nodes."""
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
@@ -115,35 +120,37 @@ class Form:
 
     @property
     def coordinates(self) -> int:
-        """Numbers of coordinates."""
+        """Return the number of coordinates."""
         return len(self.program.qdot)
 
     @property
     def goes_on(self) -> bool:
-        """Whether a motion goes on after some events."""
+        """Return whether a motion continues after some events."""
         return self.has_events and not all(self.stops)
 
     @property
     def transitions(self) -> int:
-        """Return the largest number of transitions that a motion notes; zero if all of the scene's events end
-        it."""
+        """Return the maximum number of recorded transitions; zero if all of the
+        scene's events end the motion.
+        """
         return self.most if self.goes_on and not all(self.stops[: self.stated]) else 0
 
     @property
     def rows_of_transition(self) -> dict[str, range]:
-        """Return the results of a transition: the state after it, modes, the loss of energy, and its time
-        with its tangents."""
+        """Return the results of a transition: the state after it, modes, the loss of energy,
+        and its time with its tangents.
+        """
         counts = {"y": self.integrated, "mode": len(self.switched), "lost": 1, "t": 1 + len(self.moving)}
         return _in_a_row(counts)
 
     @property
     def q_and_v(self) -> int:
-        """Numbers of coordinates and speeds."""
+        """Return the number of coordinates and speeds."""
         return self.coordinates + self.speeds
 
     @property
     def events(self) -> int:
-        """Numbers of stop events."""
+        """Return the number of stop events."""
         return len(self.program.events) if self.has_events else 0
 
     @property
@@ -153,25 +160,25 @@ class Form:
 
     @property
     def integrated(self) -> int:
-        """Numbers of the state and of its tangents."""
+        """Return the number of values of the state and its tangents."""
         return self.y * (1 + len(self.moving))
 
     @property
     def ends(self) -> int:
-        """Return the number of values stored for the final state, its time, the times of transitions, and
-        their tangents.
+        """Return the number of cotangents of the end: final state, its time, times of
+        transitions, and their tangents.
         """
         return (self.y + 1 + self.transitions) * (1 + len(self.moving))
 
     @property
     def parts(self) -> list[range]:
-        """Return rows of the coordinates, of the speeds and of the work, if there are any."""
+        """Return the rows of the coordinates, of the speeds and of the work, if any."""
         ends = [0, self.coordinates, self.q_and_v, self.y]
         return [range(a, b) for a, b in pairwise(ends) if b > a]
 
     @property
     def rows(self) -> dict[str, range]:
-        """Name -> rows."""
+        """Return name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
         most, modes = self.transitions, len(self.switched)
         log = {"passed": 1, "log_event": most, "log_mode": most * self.modes, "log_lost": most, "log_t": most * (1 + len(self.moving))}
@@ -192,17 +199,17 @@ class Form:
 
     @property
     def returned(self) -> int:
-        """How many rows are handed back."""
+        """Return the number of rows returned by a motion."""
         return self.rows[CONTROL[0]].start
 
     @property
     def given(self) -> int:
-        """How many rows are handed over."""
+        """Return the number of rows passed to a motion."""
         return self.rows["goal"].start
 
     @property
     def all(self) -> int:
-        """How many rows there are."""
+        """Return the number of all rows."""
         return max(rows.stop for rows in self.rows.values())
 
 
@@ -214,35 +221,33 @@ def _in_a_row(counts: dict[str, int]) -> dict[str, range]:
     return found
 
 
-Number = Any  # of a step: a value of machine code, an array, or a pointer to memory of either
-StepWriter = Any  # `MachineWriter`, or `ArrayWriter`, by which the source runs on arrays of JAX
+Number = Any  # a machine-code value, an array, or a pointer to memory of either
+StepWriter = Any  # `MachineWriter`, or `ArrayWriter` for JAX arrays
 
 
 class MachineWriter(Writer):
-    """Writes the source of a step as machine code.
+    """Translator of the source of a step to machine code.
 
-    The source needs, beside arithmetic and memory, the following operations. Each is a method, so that a
-    writer may use another form than instructions in a row:
+    Besides arithmetic and memory, the source uses the following operations. They are methods, so that a
+    writer may implement them differently:
 
-        if_any(c, body)            what the body does counts where c holds in any lane; lanes are told apart by `where`
+        if_any(c, body)            run the body if c holds in any lane; the body distinguishes lanes by `where`
         over_stages(n, body, x)    x <- body(i, x)
-        each(rows, body)           the body for every row, none of which needs what another one makes
+        each(rows, body)           run the body for every row, independently
 
-    `common`: rows of a start that are equal in all lanes of a GPU, and are stored once.
+    `common`: rows of a start that all lanes of a GPU share, which are stored once.
     """
 
     common: Sequence[bool] = ()
 
     def constant(self, pointer: Value, index: int) -> Value:
-        """Return a number that is equal in all threads of a GPU, from memory that does not change during the
-        kernel.
-        """
+        """Return a number shared by all threads of a GPU, from memory that is constant during the kernel."""
         place = self.converted("addrspacecast", self.at(pointer, index), "ptr addrspace(1)").name
         text = f"load {self.real}, ptr addrspace(1) {place}, align 8, !invariant.load !{{}}"
         return self.instruction(self.real, text)
 
     def power(self, x: Value, exponent: float) -> Value:
-        """x^exponent"""
+        """Return x^exponent."""
         return power(self, x, exponent)
 
     def if_any(self, condition: Value, body: Callable[[], object]) -> None:
@@ -251,13 +256,13 @@ class MachineWriter(Writer):
             body()
 
     def over_stages(self, count: int, body: Callable[[int, Any], Any], found: Any) -> Any:
-        """Return the result of the body on the stages, stage by stage."""
+        """Return the result of applying the body to all stages in order."""
         for i in range(count):
             found = body(i, found)
         return found
 
     def in_step(self, t: Value, h: Value) -> None:
-        """Begin with the stages of a step: samples are interpolated by the time only."""
+        """Begin the stages of a step; nothing to do here, because samples depend only on time."""
 
     def is_first(self, i: int) -> bool:
         """Return whether this is known to be the first stage."""
@@ -272,7 +277,7 @@ class MachineWriter(Writer):
         return numbers
 
     def put_at(self, place: Value, rows: int, index: Value, value: Value, where: Value) -> None:
-        """Put a value into the row with each lane's own index, in lanes for which `where` is true. Indices
+        """Store a value in the row with each lane's own index, in lanes where `where` is true. Indices
         beyond the last row are skipped.
         """
         values, indices = self.room(), self.room()
@@ -285,12 +290,12 @@ class MachineWriter(Writer):
                 self.store(self.load(values, lane, "double"), self.at(place, into, "double"))
 
     def may_count(self, weights: Any, j: int) -> bool:
-        """Return whether a weight may be other than zero."""
+        """Return whether a weight may be nonzero."""
         return bool(weights[j] != 0)
 
     def each(self, rows: range, body: Callable[[Any], object]) -> None:
-        """Call the body for the number of every row."""
-        # 12 numbers of a state; more are gone through by loops, whose code is short
+        """Call the body with the index of every row."""
+        # above 12 rows use a loop, whose code is short
         if len(rows) <= 12:
             for i in rows:
                 body(i)
@@ -305,16 +310,16 @@ class MachineWriter(Writer):
         return self.load(total)
 
     def sum_of_squares(self, rows: range, value: Callable[[Any], Value]) -> Value:
-        """Return the sum of the squares of the values of all rows."""
+        """Return the sum of squares of the values of all rows."""
         return self._total(rows, lambda total, i: self.fma(x := value(i), x, total))
 
     def largest(self, rows: range, value: Callable[[Any], Value]) -> Value:
-        """Return the largest of the values of all rows, all of them non-negative."""
+        """Return the largest of the values of all rows, which are non-negative."""
         return self._total(rows, lambda total, i: self.larger(total, value(i)))
 
 
 class Lanes:
-    """The rows of the lanes side by side, in memory at `pointer`."""
+    """Rows of all lanes, in memory at `pointer`."""
 
     def __init__(self, w: StepWriter, form: Form, pointer: Number) -> None:
         self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
@@ -332,12 +337,12 @@ class Lanes:
         return [self.w.load(self.pointer, row) for row in self.rows[name]]
 
     def put(self, name: str, values: Sequence[Number]) -> None:
-        """Sets all rows of this name."""
+        """Set all rows of this name."""
         for row, value in zip(self.rows[name], values, strict=True):
             self.w.store(value, self.pointer, row)
 
     def place(self, name: str, lane: Number) -> Number:
-        """Return where the number of one lane is."""
+        """Return a pointer to the number of one lane."""
         return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
     def of(self, name: str, lane: Number, type: str = "double") -> Number:
@@ -345,17 +350,17 @@ class Lanes:
         return self.w.load(self.place(name, lane), type=type)
 
     def set(self, name: str, lane: Number, value) -> None:
-        """Sets the number of one lane."""
+        """Set the number of one lane."""
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
 def each_row(w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]) -> None:
-    """Set rows of a state in memory, so many of them, or these."""
+    """Set these rows of a state in memory, or the first `rows`."""
     w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
 def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
-    """Copy so many rows from another place, in lanes `where` this holds."""
+    """Copy the first `rows` rows from another place, in lanes where `where` holds."""
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
 
 
@@ -375,12 +380,12 @@ def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
 
 
 def room_of_lanes(w: MachineWriter, form: Form) -> Value:
-    """Return memory for all rows. On a GPU, the location of the shared rows comes after them."""
+    """Return memory for all rows. On a GPU, a pointer to the shared rows follows them."""
     return w.room(form.all + w.device)
 
 
 def arguments_of_samples(form: Form) -> int:
-    """Return how many arguments of a handler are samples."""
+    """Return the number of arguments of a handler that are samples."""
     return 2 if form.sampled else 0
 
 

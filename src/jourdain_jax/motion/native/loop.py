@@ -1,14 +1,15 @@
-"""The loop over steps as machine code, and as a function of JAX: from starts and times to save, to states and
-ends.
+"""The loop over steps in machine code, as a function of JAX: from starts and times
+to save, to states and ends.
 
-Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
-narrow registers, in which an instruction takes less time. Results of a lane do not depend on the width. A
-call is given two arrays with one row per
-lane: the rows of `Form.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
-were reached one after the other. Where inputs are given by samples, their tables and knots come first (`layout.py`).
+Lanes run in several threads, in the widest registers. When a sample has ended, the next one takes its lane. A
+single motion runs in narrow registers, whose instructions are faster. Results do not depend on the width. A
+call takes two arrays with one row per sample: the rows of `Form.given`, and the times to save. It returns the
+states at these times, and the rows of the final progress with the number of times reached in order. Tables
+and knots of sampled inputs come first (`samples.py`).
 
-The derivative of a motion is a motion, of states with their tangents. A time of an event has a tangent, which the loop itself finds; all other times are
-numbers (`native_motion.py`). Tolerances and the first step change nothing, and what samples say is a number at each time.
+The derivative of a motion is a motion of states with their tangents. The loop itself finds the tangent of an
+event's time; all other times are numbers (`native_motion.py`). Tolerances and the first step have no
+derivative, nor have samples.
 """
 
 import math
@@ -55,18 +56,16 @@ from jourdain_jax.native.ir import Value
 
 Loop = Callable[[Start], Found]
 
-# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a
-# kernel's
-# own memory (`ffi.py`), on a GPU where that is what all lanes share, and how many rows of times there are
-# (one, or one
-# of each lane), those of samples, then pointers to the arrays
+# Words of a job, shared by all threads: number of samples, number of times, index of the next sample, size of
+# a kernel's scratch memory in doubles (`ffi.py`), on a GPU a pointer to the shared rows and the number of
+# rows of times (one, or one per sample), words of samples, then pointers to the arrays
 COUNT, TIMES, NEXT, OWN, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(7)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
 def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """The module."""
+    """Write the module."""
     write_functions(w, form, method)
     _write_begin(w, form)
     _write_serve(w, form)
@@ -82,7 +81,7 @@ def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> No
 
 
 def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write `step`, and its callees."""
+    """Write `step` and the functions that it calls."""
     if form.sampled:
         write_sampled_inputs(w, form, form.time_moves)
     write_rates(w, form)
@@ -96,8 +95,8 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
 
 
 def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
-    """Compute all lanes, by this thread and by others that it starts and joins; the last argument is an array
-    of lanes and times.
+    """Compute all samples in this thread and others that it starts and joins; the last argument is
+    an array of samples and times.
     """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
     of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
@@ -119,14 +118,14 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
 
 
 def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """`loop(job)`: lanes side by side until none is left."""
+    """Write `loop(job)`: run lanes until no sample is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_lanes(w, form, method, job)
         w.give(w.null)
 
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
-    # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
+    # for each lane the index of its sample and the number of its saved times; then the number of busy lanes
     state, who, k = (
         room_of_lanes(w, form),
         w.room(2 * w.lanes + 1, "i64"),
@@ -151,8 +150,8 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
 
 
 def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
-    """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with the data
-    of the first sample.
+    """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with
+    the data of the first sample.
     """
     if form.sampled:
         begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
@@ -175,7 +174,7 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
     """Return the rows of a lane's start as contiguous ranges, each with its source.
 
-    On a GPU, numbers that all lanes share and that steps do not change are not copied.
+    On a GPU, shared numbers that steps do not change are not copied.
     """
     count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
     found, shared = [], w.common if w.device else [False] * form.given
@@ -193,7 +192,7 @@ def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple
 
 
 def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:
-    """Return the time of this number to which a lane goes."""
+    """Return the saved time with this index for a sample."""
     rows = w.load(job, ROWS_OF_TIMES if w.device else COUNT, "i64")
     if w.device:
         lane = w.where(lane < rows, lane, 0)
@@ -201,7 +200,7 @@ def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Val
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
-    """`begin(job, state, who, lane)`: the next lane of the batch takes this place."""
+    """Write `begin(job, state, who, lane)`: start the next sample of the batch in this lane."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = next_lane(w, job, NEXT)
         there = number < w.load(job, COUNT, "i64")
@@ -214,8 +213,8 @@ def _write_begin(w: MachineWriter, form: Form) -> None:
 
 
 def _write_serve(w: MachineWriter, form: Form) -> None:
-    """Write `serve(job, state, who, lane)`: save due states; if the sample has ended, return it and begin the
-    next one.
+    """Write `serve(job, state, who, lane)`: save due states; if the sample has ended,
+    return it and begin the next one.
     """
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form, state)
@@ -268,14 +267,15 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
                     of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
                 )
                 w.store(saved + 1, who, lane + w.lanes)
-                lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
+                # never due again if an event was found just beyond the last time by rounding
+                lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)
                 with w.when((saved + 1) < times):
                     lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))
 
 
 def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
-    """Save the state of a lane at a due time. At the end, save it for all remaining times and begin the next
-    sample.
+    """Save the state of a lane at a due time. At the end, save it for all remaining
+    times and begin the next sample.
     """
     times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
@@ -295,12 +295,12 @@ def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, la
         w.run("begin", job, lanes.pointer, who, lane)
 
 
-MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
+MOST_KERNELS = 64  # number of cached kernels; their machine code lives as long as the process
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
-    """Return the kernel of the integrated form, by a tableau or by Taylor series up to an order."""
+    """Return the kernel of the integrated form, by a tableau or by Taylor series of an order."""
     steps = method if order is None else TaylorSteps(order)
 
     def shapes(*arguments):
@@ -324,16 +324,15 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
     return motion
 
 
-OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
+OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; use `jj.simulate(..., backend="xla")`'
 
 
 def flow(form: Form, method: Method, order: int | None) -> Loop:
-    """Return the motion by a kernel. `order`: the order of a Taylor series, which then takes the place of the
-    tableau.
-    """
+    """Return the motion by a kernel. `order`: order of a Taylor series, which replaces the tableau."""
 
     def motion(form: Form) -> Loop:
-        # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
+        # above 36_000 products of coefficients, Taylor steps with second derivatives
+        # are replaced by the tableau
         too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
         return kernel(form, method, None if too_many else order)
 
@@ -346,8 +345,8 @@ def flow(form: Form, method: Method, order: int | None) -> Loop:
 
 
 def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
-    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`:
-    whether such a form is supported.
+    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`
+    raises an error if that form is not supported.
     """
     own = jax.custom_jvp(motion(form))
 
@@ -364,7 +363,7 @@ def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[
 
 
 def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
-    """Return the form and the start that have these tangents too."""
+    """Return the form and the start with these tangents added."""
     every = (tuple(range(len(start.known[0]))), *form.moving)
     moves = [[not is_zero(dx) for dx in part] for part in along.known]
     moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))

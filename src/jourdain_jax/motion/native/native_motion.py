@@ -1,16 +1,18 @@
-"""One motion by machine code: when it applies, arguments of the kernel, and quantities derived from its
-results.
+"""One motion by machine code: when it applies, arguments of the kernel, and
+quantities derived from its results.
 
-Inputs that are functions of time become part of the scalar program: time and their numbers take the place of their values.
+Inputs that are functions of time become part of the scalar program: time and their
+numbers replace their values.
 
-    u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: the numbers in f_i and those that it closes over
+    u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
 
-Times may vary. Machine code goes from one number to others, and states are moved to the times that these stand for, along their own rates. z: all that the
-rates of a state are given, beside that state; G: how fast each of these numbers changes. Where z is moved by a time d that is zero,
+Times may have derivatives. Machine code integrates between fixed times, and states are then shifted along
+their rates to the differentiable times. Let z be the state and all arguments of its rates, and G the rate of
+z. Shifting z by a time d of value zero,
 
-    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to the second order
+    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to second order
 
-A start is moved by less than its time, t_0 = number - d, what is found by more.
+The start is shifted to its fixed time, t_0 - d, the results are shifted forward.
 """
 
 import math
@@ -47,15 +49,15 @@ Unknowns = Float[Array, "z"]
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
-    """Return each number of a function of time. If a tree of flags or tangents is given, return its entries
-    in place of the numbers (None: nothing).
+    """Return each number of a function of time. For a tree of flags or tangents, return its entries instead
+    of the numbers (None: nothing).
     """
     return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers` and all of `channel.held`, each number replaced by the next replacement; None
-    if there are none.
+    """Return `channel.numbers` and all of `channel.held`, each number replaced by the next
+    replacement; None if there are none.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
@@ -72,7 +74,7 @@ def _each(part, shape: Shape) -> list:
 
 
 def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return a function of z and of a displacement of time that moves z along its `rates`. The value of the
+    """Return a function of z and a time displacement that shifts z along its `rates`. The value of the
     displacement is zero: it only carries derivatives.
     """
 
@@ -105,8 +107,8 @@ def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar],
 
 
 def _rates(form: Form) -> Callable[[Unknowns], Unknowns]:
-    """Return rates of z, which holds the state, time, the known numbers, and the slopes of samples. Rates of
-    the known numbers are zero.
+    """Return the rates of z, which holds the state, time, the known numbers, and the slopes of samples. Rates
+    of the known numbers are zero.
     """
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
@@ -120,7 +122,7 @@ def _rates(form: Form) -> Callable[[Unknowns], Unknowns]:
 
 @jax.custom_jvp
 def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
-    """Return their product; zero, whatever the slope, where it is multiplied by zero."""
+    """Return the product, which is zero for a zero factor `by`, whatever the slope."""
     return jnp.where(by == 0.0, 0.0, slope * by)
 
 
@@ -129,15 +131,15 @@ def _scaled_jvp(primals, tangents):
     return scaled(*primals), scaled(tangents[0], primals[1]) + scaled(primals[0], tangents[1])
 
 
-# Operations of all that is evaluated. Measured: they are compiled in a time that grows with them, 15,000 of a chain of 128 trailers in 2.8 s (XLA: 40 s),
-# 18,000 of a chain of 23 joint angles in 1.2 s.
+# Limit on evaluated operations. Measured compile times: 15,000 operations of a chain of 128 trailers in 2.8 s
+# (XLA: 40 s), 18,000 of a chain of 23 joint angles in 1.2 s.
 LARGEST_PROGRAM = 60_000
-MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
+MOST_PRODUCTS = 12_000  # limit on products of coefficients in a Taylor step, which is written out
 
 
 def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None) -> str:
-    """Return in words why machine code cannot integrate a scene (by Taylor series, if an `order` is given);
-    empty if it can.
+    """Return why machine code cannot integrate a scene (by Taylor series, if an
+    `order` is given); empty if it can.
     """
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
@@ -146,17 +148,17 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
     if not all(isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels):
-        return "an input is a function of time that holds arrays of its own"
+        return "an input is a function of time that holds its own arrays"
     if isinstance(reason := driven(field.program, inputs), str):
         return reason
     if has_events and not field.lowers_events:
-        return "a stop event is no part of the scalar program"
+        return "a stop event is not part of the scalar program"
     return _reason_against_program(form_of(field, inputs, has_events, 1, True), order)
 
 
 @lru_cache(maxsize=64)
 def _reason_against_program(form: Form, order: int | None) -> str:
-    """Return in words why machine code cannot evaluate the program of a form; empty if it can."""
+    """Return why machine code cannot evaluate the program of a form; empty if it can."""
     program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:
@@ -185,8 +187,8 @@ def _reason_against_series(form: Form, order: int) -> str:
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
-    """Return the form for machine code; `most`: the number of transitions of a motion; `stopping`: whether
-    other events end it.
+    """Return the form for machine code; `most`: maximum number of transitions of a motion; `stopping`:
+    whether other events end it.
     """
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Sampled))
@@ -198,15 +200,15 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
 
 
 def modes_among(inputs: Inputs) -> Indices:
-    """Return which of the inputs that are no functions of time are modes."""
+    """Return the indices of modes among the inputs that are not functions of time."""
     return tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Mode))
 
 
 def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
-    """Return cotangents of the start, and of each requested number of the rates (`asked`), from those of the
-    results.
+    """Return cotangents of the start, and of each requested known number (`asked`), from
+    the cotangents of the results.
 
-    `memory`: bytes that records of steps may take.
+    `memory`: limit in bytes for records of steps.
     """
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
@@ -217,14 +219,15 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
 
 
 def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
-    """Return cotangents of the states at all goals, from those of the results."""
+    """Return cotangents of the states at all goals from the cotangents of the results."""
     states = jax.vmap(lambda y: y.rows)(g.ys)
-    return jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
+    # zero for the last one, which is the end state
+    return jnp.concatenate([states, jnp.zeros_like(states[:1])])
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function that moves a state at time t along its rates by a time d. The value of d is zero: it
-    only carries derivatives.
+    """Return a function that shifts a state at time t along its rates by a time d. The value of d is zero:
+    it only carries derivatives.
     """
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(_rates(form))
 
@@ -242,7 +245,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 def start_of(setup: Setup, begun: Begun) -> Start:
     """Return the arguments of a kernel for a motion."""
     knots, goals = setup.knots, setup.goals(setup.ts)
-    # what samples say is looked up
+    # zeros for sampled inputs, which are interpolated
     known, plain = (
         tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
         for part in (known_of(begun.args), begun.plain.known if begun.plain else ())
@@ -266,14 +269,14 @@ def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
 
 
 def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scalar, ...]:
-    """Tolerances and limits of steps, as a `Start` has them."""
+    """Return tolerances and limits of steps in the order of `Start.control`."""
     control = *setup.tolerances, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots)
     return tuple(jnp.asarray(x, real_type()) for x in control)
 
 
 def known_of(args: tuple) -> list:
-    """Return the known numbers of the rates: numbers that depend on parameters only, numbers of functions of
-    time, and constant inputs. Samples have None.
+    """Return the known numbers of the rates: numbers that depend only on parameters, numbers of functions of
+    time, and constant inputs. Sampled inputs have None.
     """
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
@@ -295,15 +298,14 @@ def with_known(inputs: Inputs, known: Sequence) -> Inputs:
 
 
 def others_of(inputs: Inputs) -> list[Callable]:
-    """The channels that are no functions of time."""
+    """Return the inputs that are not functions of time."""
     return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
 
 def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
-    """Return tables of the sampled inputs, and the knots, in the kernel's layout; nothing if there are none.
-    """
+    """Return tables of the sampled inputs, and the knots, in the kernel's layout; empty if there are none."""
     _, _, inputs, _, origin = args
-    origin = jax.lax.stop_gradient(origin)  # what samples say at a time since the start is that of a number
+    origin = jax.lax.stop_gradient(origin)  # samples are interpolated at fixed times since the start
     channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
     if not channels:
         return ()

@@ -1,9 +1,8 @@
-"""Operands of a call of machine code, joined to the arrays that it takes on a CPU and on a GPU.
+"""Operands of a machine-code call, joined to the arrays that it takes on a CPU and on a GPU.
 
-The rows of a start are vectors and numbers, some of them with lanes. On a CPU they are joined lane by lane.
-On a GPU
-the rows that all lanes share are an array of their own, without lanes; so are the times to save, where lanes
-share them.
+The rows of a start are vectors and numbers, some of them with a batch axis. On a CPU they are
+joined lane by lane. On a GPU shared rows form a separate array without batch axis, and so do
+saved times if lanes share them.
 """
 
 from collections.abc import Sequence
@@ -14,16 +13,16 @@ from jaxtyping import Array
 
 
 class Operands(NamedTuple):
-    """The operands of one call, some of them with lanes."""
+    """Operands of one call, some of them with batch axes."""
 
-    batch: tuple[int, ...]  # numbers of lanes, one for each `vmap`
-    ranks: tuple[int, ...]  # of the operands, without lanes
-    samples: int  # how many come first
-    others: int  # how many come last, each an array; those in between are rows of a start
+    batch: tuple[int, ...]  # batch sizes, one for each `vmap`
+    ranks: tuple[int, ...]  # ranks of the operands without batch axes
+    samples: int  # number of leading operands that are samples
+    others: int  # number of trailing operands that are separate arrays; those in between are rows of a start
     constant: tuple[tuple[int, float], ...]  # rows of a start that are not operands
 
     def _laned(self, x: Array, rank: int) -> Array:
-        """Return the operand with all lanes."""
+        """Return the operand with all batch axes."""
         return jnp.broadcast_to(x, (*self.batch, *x.shape[x.ndim - rank :]))
 
     def _rows(self, values: Sequence) -> list[tuple[Any, int, bool]]:
@@ -46,26 +45,24 @@ class Operands(NamedTuple):
         return tuple(is_shared for x, rank, is_shared in rows for _ in range(x.shape[-1] if rank else 1))
 
     def _joined(self, rows: list, dtype, laned: bool) -> Array:
-        """Return rows as one array, with lanes or without."""
+        """Return rows as one array, with or without batch axes."""
         found = []
         for x, rank, _ in rows:
             x = self._laned(jnp.asarray(x, dtype), rank) if laned else jnp.asarray(x, dtype)
             found.append(jnp.moveaxis(x, -1, 0) if rank else x[None])
-        # XLA compiles a concatenation with lanes last in less time (`markers.entries_of`)
+        # XLA compiles a concatenation faster with the batch axis last (`markers.entries_of`)
         return jnp.moveaxis(jnp.concatenate(found), 0, -1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
-        """Return the arrays of a CPU: the axis of lanes comes first, except in samples, which lanes may
-        share.
+        """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share.
         """
         rows, last = self._rows(values), len(values) - self.others
         starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
         return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
 
     def given_once(self, *values: Array) -> list[Array]:
-        """Return the arrays of a GPU: the shared rows of a start follow the others, without lanes.
-
-        The last operand, the times, has no lanes either if all lanes share it.
+        """Return the arrays for a GPU: the shared rows of a start follow the others, without batch axis. If
+        all lanes share the times (the last operand), these have none either.
         """
         rows, last = self._rows(values), len(values) - self.others
         starts = [

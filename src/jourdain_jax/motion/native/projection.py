@@ -1,18 +1,18 @@
 """Projection of coordinates or speeds as machine code: `equations/projection.py` on the scalar program of the
-constraints, lanes side by side.
+constraints, for several lanes.
 
-    x <- x - W (d A W)+ d r(x),   A = dr/dx over what is free,   d: one over the lengths of the rows
+    x <- x - W (d A W)+ d r(x),   A = dr/dx for the free variables,   d: reciprocal row lengths
 
-r: geometric rows over coordinates, or velocity rows over speeds; W = 1, or W = c L'^-1 with c M c = L L' where speeds are to be nearest in the metric of
-the mass matrix. A lane that nothing changes any more stays as it is.
+r: geometric constraints (x: coordinates) or velocity constraints (x: speeds); W = 1, or W = c L'^-1 with c M
+c = L L' for speeds nearest in the metric of the mass matrix. Converged lanes stay unchanged.
 
 Dense linear algebra is written as loops, one matrix per lane: entries are vectors in memory, row by row.
 
     A+ = B' S^-2 J,   J A = B with orthogonal rows of lengths S     one-sided Jacobi rotations J
     M = L L'                                                        Cholesky
 
-Sources: M. R. Hestenes, J. SIAM 6 (1958) 51-90, for rows in place of columns; J. Demmel and K. Veselic, SIAM J. Matrix Anal. Appl. 13 (1992) 1204-1245, on
-its accuracy. Results of a lane depend only on its own numbers.
+Sources: M. R. Hestenes, J. SIAM 6 (1958) 51-90, with rows instead of columns; J. Demmel and K. Veselic, SIAM
+J. Matrix Anal. Appl. 13 (1992) 1204-1245, on its accuracy. Results of a lane depend only on its own numbers.
 """
 
 import math
@@ -30,7 +30,7 @@ from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_
 
 
 def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
-    """Return the sum of products of so many numbers from two places on."""
+    """Return the dot product of two vectors of `count` numbers in memory."""
     total = w.room()
     w.store(0.0, total)
     with w.counted(count) as k:
@@ -39,7 +39,7 @@ def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
 
 
 def cleared(w: MachineWriter, place: Value, count: int) -> None:
-    """Store zeros at so many places from one on."""
+    """Store `count` zeros from `place` on."""
     with w.counted(count) as k:
         w.store(0.0, place, k)
 
@@ -51,7 +51,7 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
     width = rows + columns
     with w.procedure("rotated", "B") as (B,):
         turned = w.room(type="i1")
-        # 40 of rotations; 6 to 10 are taken
+        # at most 40 sweeps of rotations; 6 to 10 suffice
         with w.counted(40):
             w.store(w.literal(0, "i1"), turned)
             with w.counted(rows) as i, w.counted(rows, first=i + 1) as j:
@@ -73,8 +73,8 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> None:
-    """Write `inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter than
-    `cutoff` times the longest.
+    """Write `inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter
+    than `cutoff` times the longest.
     """
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
@@ -86,12 +86,12 @@ def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> 
             w.store(w.larger(w.load(longest), length), longest)
         with w.counted(rows) as i:
             length = w.load(weights, i)
-            short = length <= w.load(longest) * cutoff  # never where one is not a number, which shows
+            short = length <= w.load(longest) * cutoff  # false for NaN, so that NaN is kept
             w.store(w.where(short, 0.0, w.number(1.0) / w.where(short, 1.0, length * length)), weights, i)
 
 
 def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
-    """`solved(B, weights, b, x)`: x = A+ b."""
+    """Write `solved(B, weights, b, x)`: x = A+ b."""
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
         cleared(w, x, columns)
@@ -103,12 +103,12 @@ def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_cholesky(w: MachineWriter, n: int) -> None:
-    """Write `cholesky(M)`, which puts L in place of the lower triangle of M. L is the identity if M is not
+    """Write `cholesky(M)`, which replaces the lower triangle of M by L. L is the identity if M is not
     positive definite to round-off, and NaN if M is not finite.
     """
     with w.procedure("cholesky", "M") as (M,):
         finite, smallest = w.room(), w.room()
-        w.store(0.0, finite)  # stays zero where all entries are finite
+        w.store(0.0, finite)  # stays zero if all entries are finite
         w.store(1.0, smallest)
         with w.counted(n) as i, w.counted(n) as j:
             w.store(w.fma(w.load(M, i * n + j), 0.0, w.load(finite)), finite)
@@ -130,7 +130,7 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
 
 
 def write_triangular(w: MachineWriter, n: int) -> None:
-    """`forward(L, x)` and `backward(L, x)`: L^-1 x and L'^-1 x in place of x."""
+    """Write `forward(L, x)` and `backward(L, x)`: replace x by L^-1 x and L'^-1 x."""
     with w.procedure("forward", "L x") as (L, x), w.counted(n) as i:
         row = w.at(L, i * n)
         w.store((w.load(x, i) - _product_of_rows(w, row, x, i)) / w.load(row, i), x, i)
@@ -150,50 +150,52 @@ Kind = Literal["positions", "speeds", "determined speeds"]
 
 @dataclass(frozen=True)
 class Rows:
-    """The moving quantities and their constraints."""
+    """The projected variables and their constraints."""
 
     program: RowProgram
     kind: Kind
-    affine: bool = False  # in what moves: one matrix serves, and a second step is for round-off
+    # constraints are affine in these variables: one matrix suffices, and a second step removes round-off
+    affine: bool = False
 
     @property
     def moving(self) -> Indices:
-        """Nodes of the moving quantities."""
+        """Return the nodes of the projected variables."""
         return self.program.q if self.kind == "positions" else self.program.u
 
     @property
     def residuals(self) -> Indices:
-        """Nodes of the residuals."""
+        """Return the nodes of the residuals."""
         return self.program.g if self.kind == "positions" else self.program.phi
 
     @property
     def slopes(self) -> dict[tuple[int, int], int]:
-        """Nodes of their derivatives."""
+        """Return the nodes of the derivatives of the residuals."""
         return self.program.G if self.kind == "positions" else self.program.A
 
     @property
     def metric(self) -> dict[tuple[int, int], int] | None:
-        """Nodes of the mass matrix; None where no metric is needed."""
+        """Return the nodes of the mass matrix; None if no metric is needed."""
         return self.program.M if self.kind == "speeds" else None
 
     @property
     def given(self) -> list[int]:
-        """Return the nodes of a sample's arguments. Marks of free entries and the typical lengths of the
-        constraints come after them.
+        """Return the nodes of a sample's arguments. Flags of free entries and typical lengths of
+        the constraints follow them.
         """
         program = self.program
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
 
     def reason_against(self) -> str:
-        """Return in words why this cannot be machine code; empty if it can."""
+        """Return why this cannot be machine code; empty if it can."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
-        # Entries of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and
-        # 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20, 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
+        # Entries of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone,
+        # 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20, 0.32 and 0.18; of 32
+        # 14.6 and 1.4, 3.6 and 1.2.
         if max((rows + columns) * rows, columns**2) > 3_000:
-            return "the rows are too many"
+            return "there are too many constraints"
         nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
         if self.program.graph.operations(nodes) > LARGEST_PROGRAM:
             return "the scalar program is too large"
@@ -201,10 +203,10 @@ class Rows:
 
 
 def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
-    """Write the module. It takes `of.given`, marks of free entries, and lengths, and returns the projected
-    quantities and the residual.
+    """Write the module. It takes `of.given`, flags of free entries, and lengths, and returns the
+    projected variables and the residual.
 
-    `cutoff`: singular values of rows below this share of the largest one count as zero.
+    `cutoff`: singular values below this fraction of the largest count as zero.
     """
     rows, columns = len(of.residuals), len(of.moving)
     _write_values(w, of, "residuals", dict(enumerate(of.residuals)))
@@ -224,7 +226,7 @@ def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
 
 
 def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) -> None:
-    """`name(state, found)`: values of nodes, each at its place in `found`."""
+    """Write `name(state, found)`: values of nodes, each at its place in `found`."""
     with w.procedure(name, "state found") as (state, found):
         known = {n: w.load(state, k) for k, n in enumerate(of.given)}
         places = list(nodes)
@@ -234,7 +236,7 @@ def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) 
 
 def _write_metric(w: MachineWriter, of: Rows) -> None:
     """Write `metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled
-    speeds. Held speeds have the identity in it.
+    speeds, with identity rows for held speeds.
     """
     n, first_free = len(of.moving), len(of.given)
     with w.procedure("metric", "state L c") as (state, L, c):
@@ -251,16 +253,16 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
 
 
 def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
-    """Return the scale of a speed, as `equations/scaling.speed_scale`, from an entry on the diagonal of the
-    mass matrix.
+    """Return the scale of a speed from its diagonal entry of the mass matrix, as
+    `equations/scaling.speed_scale`.
     """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 
 
 def _write_factored(w: MachineWriter, of: Rows) -> None:
-    """Write `factored(state, L, c, B, d, weights)`: the matrix of the rows, rotated as by `rotated`, and the
-    scales of the rows.
+    """Write `factored(state, L, c, B, d, weights)`: the matrix of the constraints after
+    `rotated`, and its row scales.
     """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
@@ -291,8 +293,7 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_moved(w: MachineWriter, of: Rows) -> None:
-    """Write `moved(state, L, c, B, d, weights, x)`: the quantities after one step, by the `factored` matrix
-    of the constraints.
+    """Write `moved(state, L, c, B, d, weights, x)`: the variables after one step with the `factored` matrix.
     """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
@@ -307,12 +308,12 @@ def _write_moved(w: MachineWriter, of: Rows) -> None:
         with w.counted(columns) as k:
             change = w.load(x, k)
             change = change if of.metric is None else change * w.load(c, k)
-            moves = w.load(state, k + first_free) > 0.0  # what is held does not move by round-off either
+            moves = w.load(state, k + first_free) > 0.0  # held variables do not even move by round-off
             w.store(w.load(state, k + first) - w.where(moves, change, 0.0), x, k)
 
 
 def _write_row(w: MachineWriter, of: Rows) -> None:
-    """Write `row(state, found)`: a block of samples, from arguments to results."""
+    """Write `row(state, found)`: map the arguments of a block of samples to results."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
     with w.procedure("row", "state found") as (state, found):
@@ -339,7 +340,7 @@ def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors
 
 
 def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:
-    """Write steps until they change nothing, as in `calculus/roots.py`."""
+    """Write the iteration until steps change nothing, as in `calculus/roots.py`."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(0.0, quiet)

@@ -1,8 +1,9 @@
-"""The record of the steps of a motion for reverse mode (`back.py`): one slot for each trial step, for all
-lanes of a block.
+"""Record of the steps of a motion for reverse mode (`back.py`): one slot per trial
+step, for all lanes of a block.
 
-The number of slots is bounded by the memory of the model, which all threads share; on a CPU the record grows up to it with the steps.
-If a motion takes more steps, its lanes run forward again for each window of slots, the last window first.
+The memory of the model, shared by all threads, limits the number of slots; on a CPU the record
+grows up to this limit. If a motion takes more steps, its lanes run forward again for each window of
+slots, the last window first.
 """
 
 import math
@@ -21,7 +22,7 @@ TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: the state first, then its derivatives; rows of a transition last; `all`: their number.
+    """Rows of a slot: the state, its derivatives, and finally the rows of a transition; `all`: their number.
     """
 
     y: int
@@ -39,8 +40,8 @@ class Slot(NamedTuple):
 
 
 class _Rooms(NamedTuple):
-    """Memory of a block: for each of its lanes the index in the batch, the number of saved times, its
-    cotangents, and the number of slots.
+    """Memory of a block: for each lane the index in the batch, the number of saved times and its
+    cotangents; the number of slots used.
     """
 
     state: Value
@@ -58,17 +59,17 @@ class _Rooms(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """Where slots are; each function takes the number of a try."""
+    """Locations of slots; each function takes the index of a trial step."""
 
-    slots: Value  # how many there are
-    free: Callable[[Value], Value]  # where the slot is written
-    keep: Callable[[Value], None]  # what is done then
-    kept: Callable[[Value], Value]  # where it is read
-    lost: Callable[[], Value]  # whether memory has run out
+    slots: Value  # number of slots
+    free: Callable[[Value], Value]  # where to write the slot
+    keep: Callable[[Value], None]  # to be called afterwards
+    kept: Callable[[Value], Value]  # where to read the slot
+    lost: Callable[[], Value]  # whether memory is exhausted
 
 
 def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
-    """Lanes side by side, forth and back, until none is left; inside a function."""
+    """Write, inside a function, the forward and backward passes of all lanes until no sample is left."""
     slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
     lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
     places = _on_gpu(w, slot, job) if w.device else _on_cpu(w, slot, memory)
@@ -105,7 +106,7 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
 
 
 def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
-    """Write the parts of the module needed by a record of so many bytes."""
+    """Write the parts of the module that a record of this size in bytes needs."""
     if w.device:
         w.scratch = Slot.of(form, method).all, memory
     else:
@@ -113,8 +114,8 @@ def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
 
 
 def _write_more_room(w: MachineWriter) -> None:
-    """Write `more_room(old, bytes)`: allocate twice as many bytes and copy the old content. The result is
-    null if there is no memory.
+    """Write `more_room(old, bytes)`: allocate twice as many bytes and copy the old content. The result
+    is null if there is no memory.
     """
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
         new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
@@ -126,12 +127,12 @@ def _write_more_room(w: MachineWriter) -> None:
 
 
 def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
-    """Return the number of slots that fit into a third of each thread's memory. While the record grows to
-    twice its size, the old one still exists.
+    """Return slots that fit into a third of each thread's memory. While the record
+    doubles, the old one still exists.
     """
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)
-    # memory for 64 at first, then for twice as many, and so on
+    # memory for 64 slots at first, then doubled
     slots, first = w.literal(most, "i64"), w.literal(min(64, most) * size, "i64")
     record, bytes_there = w.room(type="ptr"), w.room(type="i64")
     w.store(first, bytes_there)
@@ -150,9 +151,7 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
-    """Return the number of slots that fit into a thread's memory. The numbers of neighbouring threads are
-    interleaved.
-    """
+    """Return slots that fit into a thread's memory. The numbers of neighbouring threads are interleaved."""
     here, (thread, threads) = w.room(slot.all), w.thread()
     record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
     slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
@@ -171,14 +170,14 @@ def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
 
 
 def _take(w: MachineWriter, job: Value, who: Value) -> None:
-    """Return the next samples of the batch; -1 if there is none."""
+    """Take the next samples of the batch into `who`; -1 if there is none."""
     with w.each_lane() as lane:
         number = next_lane(w, job, NEXT)
         w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
 
 
 def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> None:
-    """All lanes at their starts."""
+    """Set all lanes to their starts."""
     with w.counted(form.all) as row:
         w.store(1.0, rooms.state, row)
     with w.each_lane() as lane:
@@ -189,7 +188,7 @@ def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> N
 
 
 def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
-    """A step that is tried, and its slot `here`."""
+    """Write a trial step and its slot `here`."""
     lanes = Lanes(w, form, rooms.state)
     copied(w, form.integrated, rooms.state, here)
     w.store(lanes["t"], here, slot.t)
@@ -203,7 +202,7 @@ def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Ro
 
 
 def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """Cotangents of the states at the end of a block."""
+    """Initialise the cotangents with the cotangents of the end states of a block."""
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
     each_row(w, form.integrated, g, lambda i: 0.0)
@@ -214,7 +213,7 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
             taken_in(
                 w, form.integrated, of_lane(w, ends, w.load(job, COUNT, "i64"), form.ends, number), g, lane
             )
-    # what was not reached repeats the last state
+    # unreached times repeat the last state
     all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
     w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
     if form.has_events:
@@ -222,7 +221,7 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
 
 
 def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
-    """Back over the try in a slot."""
+    """Go back over the trial step in a slot."""
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
     w.store(before, rooms.saved)
@@ -235,7 +234,7 @@ def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms:
 
 
 def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """The results of a block."""
+    """Write the results of a block."""
     g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
@@ -248,7 +247,7 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
 
 
 def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:
-    """Store NaN for this block and for all remaining lanes, since no memory is left."""
+    """Return NaN for this block and all remaining samples, because memory is exhausted."""
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 
     def lost(number: Value) -> None:

@@ -3,15 +3,17 @@
     f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
     df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
 
-Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite
-times. Knots (`motion/inputs.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
+Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every sampled
+input, padded with infinite times. Knots, the times at which steps must end (`motion/inputs.py`), have the
+shape (rows, knots). Lanes may share them: with T tables, lane i of N uses number i T / N.
 """
 
 from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
 from jourdain_jax.native.ffi import Given, last_size, product
 from jourdain_jax.native.ir import Value
 
-WORDS_OF_SAMPLES = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
+# words of a job: pointers to tables and knots, their numbers, samples per table, knots per row
+WORDS_OF_SAMPLES = 6
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
 
 
@@ -44,7 +46,7 @@ def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lane
 
 
 def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
-    """The next knot is behind."""
+    """Advance a lane to its next knot."""
     lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
 
 

@@ -1,4 +1,4 @@
-"""Input and output of a loop over steps, as machine code and on arrays."""
+"""Input and output of a loop over steps, in machine code and in JAX."""
 
 import math
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.motion.integrators.event_search import RUNNING
 from jourdain_jax.motion.native.layout import PROGRESS, Form
 
-Numbers = tuple[PerLane, ...]  # one each
+Numbers = tuple[PerLane, ...]  # one number per row
 
 
 def constant_rows(form: Form) -> dict[int, float]:
-    """Return the rows that are equal at the start of every motion, with their indices."""
+    """Return the rows that are equal at the start of every motion: index -> value."""
     rows = form.rows
     said = {"code": float(RUNNING), "event": -1.0, "pivot": math.inf}
     begun = dict.fromkeys(range(form.integrated, form.returned), 0.0) | {
@@ -25,22 +25,22 @@ def constant_rows(form: Form) -> dict[int, float]:
 
 
 class Start(NamedTuple):
-    """The input of a loop: one motion. The state and the known numbers are followed by their tangents
-    (`Form`).
+    """Input of a loop: one motion. The state and the known numbers are followed by their tangents (`Form`).
     """
 
-    of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
+    of_samples: tuple[Array, ...]  # tables and knots (`samples.py`); for a loop in JAX, only the knots
     control: Numbers  # rtol, atol, shortest, longest and first step, most steps
     goals: Float[Array, "times *lanes"]  # since the start
     origin: PerLane  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
-    known: tuple[tuple[Array, ...], ...]  # numbers; for a loop on arrays the stored arguments of rates, lanes first
+    # numbers; for a loop in JAX, the stored arguments of rates, batch axis first
+    known: tuple[tuple[Array, ...], ...]
     modes: Numbers = ()
-    plain: tuple[Array, ...] = ()  # `known` without lanes where all share it, for kernels of a GPU
+    plain: tuple[Array, ...] = ()  # `known` without batch axis where shared, for GPU kernels
 
     def numbers(self) -> Numbers:
-        """Return the rows at the start that are not `constant_rows`, after the state. Rows that all lanes
-        share have no axis of lanes.
+        """Return the rows at the start after the state, except `constant_rows`. Rows shared by
+        all lanes have no batch axis.
         """
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
@@ -53,19 +53,19 @@ class Start(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The output of a loop: a motion; each part is followed by its tangents."""
+    """Output of a loop: a motion; each part is followed by its tangents."""
 
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
     t: Numbers  # of the end, since the start
     log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
-    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, the number of goals that were reached one after the other, and of transitions
-    # their number, events, energies lost and modes
+    # rows of the progress after its time, the number of goals reached in order, and the number,
+    rest: Float[Array, "rest *lanes"]
+    # events, energy losses and modes of transitions
 
     @staticmethod
     def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
-        """Combine a motion from its states, its rows at the end, and the number of goals that were reached.
-        """
+        """Build a motion from its states, its rows at the end, and the number of goals reached."""
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
 
@@ -87,11 +87,11 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return the results of `vmap`, with lanes removed from parts that do not need them, and marks of the
-        parts that keep them. `given`: the parts of the start that have lanes.
+        """Return the results of `vmap` without the batch axis of parts that do not need it, and flags of the
+        parts that keep it. `given`: flags of the start's parts with a batch axis.
 
-        A tangent has lanes if anything on which it depends has. All directions share the values of one
-        motion.
+        A tangent has a batch axis if anything on which it depends has one. All directions
+        share the values of one motion.
         """
         parts = range(len(self.y))
         base = any(jax.tree.leaves(given._replace(y=(), known=())))

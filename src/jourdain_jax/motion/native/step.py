@@ -1,25 +1,26 @@
-"""One step of lanes side by side: an explicit Runge-Kutta method with an embedded error estimate, and steps of the search for a stop event.
+"""One step of several lanes: an explicit Runge-Kutta method with embedded error estimate, and steps of
+the search for a stop event.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
-This is the one source of a step. It asks a writer for arithmetic, memory, branches and loops: `MachineWriter` (`layout.py`) writes what it asks as machine
-code, by `ArrayWriter` (`motion/arrays/writer.py`) it runs on arrays of JAX. Events, those of relations among
-them (`lowering/sides.py`),
-and the search for one are by the formulas of `motion/integrators/event_search.py`.
+This is the only source of a step. A writer object provides arithmetic, memory, branches and loops:
+`MachineWriter` (`layout.py`) generates machine code, `ArrayWriter` (`motion/arrays/writer.py`) computes with
+JAX arrays. Events, including those of relations (`lowering/sides.py`), are located by the formulas of
+`motion/integrators/event_search.py`.
 
-A step ends at every time requested and at every knot of the inputs; the step size found before such a
-shortened step is remembered. The state advances by
-the difference of the times at the ends of a step, as they are after rounding.
+A step ends at every requested time and at every knot of the inputs; the step size before such a shortened
+step is remembered. The state advances by the difference of the rounded times at the ends of a step.
 
-Where rows are about to lose rank, sigma being the sine between a row and those before it, round-off eps of a row is a velocity eps/sigma^2 across it, which
-fills the error of short steps. In a step that starts at sigma < 0.1 the stages are put back onto the rows. Its error is the larger of two parts: the error
-along the rows, less n^2, and the distance that the projection moves the state, less n. Here n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of
-the stages; a displacement n across the rows moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
+Near a loss of rank, let sigma be the sine between a constraint and the earlier ones. Round-off eps of a
+constraint then causes a velocity eps/sigma^2 across it, which dominates the error of short steps. If a step
+starts at sigma < 0.1, its stages are projected onto the constraints. Its error is the larger of two parts:
+the error along the constraints, less n^2, and the displacement by the projection, less n. Here n = 16
+eps/sigma^2, at most eps^0.4, for the smallest sigma of the stages; a displacement n across the constraints
+moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
 
-In single precision the state is summed with compensation (Kahan): the rounding error of an increment is added
-to the next one. Otherwise a state whose
-increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
+In single precision the state uses compensated summation (Kahan). Otherwise a state whose increments are below
+its last digit would stand still, undetected by the error estimate.
 """
 
 import math
@@ -38,27 +39,27 @@ from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, c
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
 
-NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
+NOISE = 0.6  # powers of round-off: eps^0.6 counts as noise anywhere, and at most eps^(1 - 0.6)
 
 
-IDLE = -9.0  # code of a place that has no lane, or one that has saved all its times
+IDLE = -9.0  # code of a lane slot without sample, or whose sample has saved all its times
 
 
 class Trial(NamedTuple):
-    """A step that is tried by all lanes."""
+    """Trial step of all lanes."""
 
     aim: Aim
     y1: Number  # pointer: the state after it
     accept: Number
     next_h: Number  # positive
-    pivot: Number | None  # the smallest magnitude of a pivot that is monitored
+    pivot: Number | None  # smallest magnitude of a monitored pivot
     fails: Number | None = None  # whether it ends the motion, with this code
     code: Number | None = None
-    even: bool = False  # whether another length may not be tried
+    even: bool = False  # whether its length is fixed
 
 
 def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write `step(state, k)`: one step, tried by all lanes that are under way; `k`: room for the rates of its
+    """Write `step(state, k)`: one trial step of all running lanes; `k`: memory for the rates of its
     stages, or for Taylor coefficients.
     """
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
@@ -71,19 +72,19 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
 
 
 def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable) -> None:
-    """Try one step of all lanes under way, judged by `tried`."""
+    """Try one step of all running lanes by the method `tried`."""
     first_sides(w, form, p)
     take(w, form, method, p, k, tried(w, form, method, p, k))
 
 
 def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number) -> Trial:
-    """Return a step of a Runge-Kutta method, which ends at the next saved time at the latest."""
+    """Return a Runge-Kutta step, which ends at the next saved time at the latest."""
     aim = aimed(w, p, p["goal"], p["h"], p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     y1, error = w.room(form.integrated), w.room(form.y)
     w.in_step(p["t"], step)
     smallest, changed_sign, rank = stages(w, form, method, p, k, p["t"], step, y1)
-    # every stage counts: a comparison hides a NaN of an earlier stage whose weight is zero
+    # use every stage: comparisons hide a NaN of an earlier stage with weight zero
     weights = method.b_error[: method.needed]
     each_row(w, form.y, error, lambda i: step * weighted(w, weights, k, form, i, every=True))
     if form.compensated:
@@ -111,7 +112,7 @@ def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Call
 
 
 def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k: Number) -> Trial:
-    """Return a step by Taylor series, which may pass saved times. Put the coefficients into `k`, followed by
+    """Return a step by Taylor series, which may pass saved times. Store the coefficients in `k`, followed by
     the rates at the end of the step.
     """
     count = form.integrated
@@ -155,8 +156,8 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
-    """Update the lanes after a tried step. `k`: derivatives at the stages, beginning with the one at the
-    start.
+    """Update the lanes after a trial step. `k`: derivatives at the stages,
+    starting with the one at the start.
     """
     y, count = p.pointer, form.integrated
     if form.goes_on:
@@ -164,7 +165,7 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
     aim, y1, accept, next_h, smallest = trial[:5]
     t1, locating = aim.t_1, aim.locating
     new = taken(w, p, aim, accept, next_h)
-    new["taken"] = w.where(accept, aim.h, 0.0)  # by how far the state has gone on
+    new["taken"] = w.where(accept, aim.h, 0.0)  # by how much the state has advanced
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
         ends = k, w.at(k, method.at_the_end * form.integrated)
@@ -177,7 +178,7 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, new["code"])}
     moving = locating | w.equal(p["code"], RUNNING)
     copied(w, count, y1, y, moving)
-    if form.compensated:  # what was left off by a step that counts
+    if form.compensated:  # round-off of a step that counts
         rest, left = (w.at(y, form.rows[name].start) for name in ("rest", "next_rest"))
         copied(w, form.y, left, rest, moving & accept & ~locating)
     for name, value in new.items():
@@ -185,17 +186,17 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
 
 
 class Rank(NamedTuple):
-    """How near to a loss of rank the rows are in a step."""
+    """Closeness of the constraints to a loss of rank in a step."""
 
     near: Number  # at its start
-    square: Number  # the smallest squared sine between a row and those before it, of all stages
+    square: Number  # smallest squared sine between a constraint and the earlier ones, over all stages
 
 
 def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number) -> tuple[Number, Number, Rank | None]:
-    """Return the smallest magnitude of a pivot, whether any pivot changed its sign, and the distance of rows
-    from losing rank.
+    """Return the smallest magnitude of a pivot, whether any pivot changed its sign, and the
+    distance from a loss of rank.
 
-    The rates of all stages are stored in `k`. The state of each stage is stored in `y1`, which at last holds
+    The rates of all stages are stored in `k`. The state of each stage is stored in `y1`, which finally holds
     the state at the end of the step.
     """
     every, n = form.integrated, method.needed
@@ -223,8 +224,8 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
 
 
 def unseen(w: StepWriter, form: Form) -> tuple:
-    """Return the initial values for monitoring pivots and directions: the directions at the start, extremes
-    of pivots, and whether a row turned round.
+    """Return the initial values for monitoring: directions at the start, extremes of pivots, and
+    whether a constraint reversed.
     """
     low, high = ([w.number(x)] * form.pivots for x in (math.inf, -math.inf))
     return [w.number(0.0)] * form.turning, low, high, w.literal(0, w.truth)
@@ -240,28 +241,30 @@ def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> 
 
 
 def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
-    """Return the smallest magnitude of a pivot, and whether any changed its sign, or a row turned round."""
+    """Return the smallest magnitude of a pivot, and whether any pivot changed its
+    sign or a constraint reversed.
+    """
     _, low, high, turned = known
     smallest = reduce(w.smaller, [w.smaller(w.magnitude(a), w.magnitude(b)) for a, b in zip(low, high, strict=True)], w.number(math.inf))
     return smallest, reduce(operator.or_, [(a < 0.0) & (b > 0.0) for a, b in zip(low, high, strict=True)], turned)
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
-    """Return the square of the part of each row that is normal to the rows before it, and the square of its
-    size.
+    """Return, for each constraint, the square of its part normal to the earlier
+    ones, and the square of its size.
     """
     found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
     return list(zip(found[::2], found[1::2], strict=True))
 
 
 def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
-    """Return whether some row nearly depends on its predecessors."""
+    """Return whether some constraint nearly depends on earlier ones."""
     # a sine below 0.1
     return any_of([left < 0.1**2 * size for left, size in squares])
 
 
 def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Number, y: Number) -> None:
-    """Project the state `y` of a stage back onto the rows, in lanes that are `near` a loss of rank."""
+    """Project the state `y` of a stage onto the constraints, in lanes that are `near` a loss of rank."""
 
     def put() -> None:
         on_rows = w.room(form.integrated)
@@ -273,13 +276,13 @@ def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Num
 
 
 def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number]) -> Number:
-    """Return whether a row has turned round: the part of its slope along its first slope has fallen below the
-    permitted share. Only entries of directions count.
+    """Return whether a constraint has reversed: its component along its first direction has
+    fallen below the permitted share.
     """
     along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
     width = max(form.speeds, 1)
     rows = [range(k, k + width) for k in range(0, form.turning, width)]
-    # half of it: a step in which less is left is tried again
+    # half; a step that retains less is tried again
     lasting = [along(row, now) > 0.5 * along(row, first) for row in rows]
     return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
 
@@ -287,8 +290,7 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
 def weighted(
     w: StepWriter, weights: Number, k: Number, form: Form, row: int | Number, every: bool = False
 ) -> Number:
-    """Return `sum_j w_j k_j` of one number of the state; `every`: whether terms of weight zero are included.
-    """
+    """Return `sum_j w_j k_j` for one number of the state; `every`: include terms of weight zero."""
     first, *others = [j for j in range(len(weights)) if every or w.may_count(weights, j)]
     total = w.load(k, row + first * form.integrated) * weights[first]
     for j in others:
@@ -297,13 +299,13 @@ def weighted(
 
 
 def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: Number, rank: Rank | None = None) -> None:
-    """Project `y1` back onto the rows. The error becomes at least as large as this displacement, apart from
-    noise.
+    """Project `y1` onto the constraints. The error becomes at least as large as this
+    displacement, apart from noise.
     """
     free = w.room(form.y)
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
-    # 16 round-offs over the square of the sine count as noise
+    # 16 eps over the square of the sine counts as noise
     amplified = None if rank is None else w.where(rank.near, w.smaller(16.0 * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
 
@@ -329,8 +331,8 @@ def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: 
 
 
 def norm(w: StepWriter, form: Form, p: Lanes, error: Number, y1: Number) -> Number:
-    """Return the root mean square of the errors of coordinates and speeds, relative to the tolerance;
-    infinite if one is NaN.
+    """Return the root mean square of the errors of coordinates and speeds, relative to the
+    tolerance; infinite if one is NaN.
     """
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
 

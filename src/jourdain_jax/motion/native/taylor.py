@@ -1,10 +1,10 @@
-"""Steps by Taylor series: coefficients of a state along its motion, their radius, and the state at any time
-within it.
+"""Steps by Taylor series: coefficients of a state along its motion, their radius, and the
+state at any time within it.
 
     y(t + s) = sum_{k=0}^p y_k s^k,        h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
 
-so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y) are
-written out order by order:
+so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y)
+are written out order by order:
 
     y_{k+1} = f_k/(k + 1)                                  x_k = x^(k)/k! of any number x along the solution
     (a b)_k = sum_{j=0}^k a_j b_{k-j}
@@ -13,7 +13,8 @@ written out order by order:
     c = a^e:       c_k = sum_{j=1}^k (e j/k - (k - j)/k) a_j c_{k-j}/a_0             (a constant exponent e)
     c = F(a, ..):  c_k = sum_{j=1}^k (j/k) a_j (dF/da)_{k-j} + ..                     with the derivative on the graph, for all other functions
 
-Sums add the newest coefficients last: all others are known long before. Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99, sections 2 and 3.
+Sums add the newest coefficients last, because all others are known long before. Source: A. Jorba and M. Zou,
+Experimental Mathematics 14 (2005) 99, sections 2 and 3.
 """
 
 import math
@@ -33,12 +34,12 @@ from jourdain_jax.native.scalar_program import as_real, unsupported, written
 from jourdain_jax.program.derivative import on_its_own
 from jourdain_jax.program.graph import Graph
 
-_OWN = ("add", "sub", "neg", "mul", "div", "sqrt", "pow")  # that need no derivative on the graph
+_OWN = ("add", "sub", "neg", "mul", "div", "sqrt", "pow")  # operations that need no derivative on the graph
 Coefficients = list[Value]
 
 
 def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
-    """Return in words why a series of the outputs cannot be written; empty if it can."""
+    """Return why a series of the outputs cannot be written; empty if it can."""
     for node in graph.reachable(outputs):
         op = graph.op[node]
         if op in ("const", "input"):
@@ -51,17 +52,17 @@ def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
 
 
 class Series:
-    """Coefficients of all numbers of a graph along the solution with these rates, as nodes of the same graph.
+    """Coefficients of all numbers of a graph along a solution, as nodes of the same graph.
 
-    **Arguments:** `known`, the nodes of constant values; `states` and `rates`, those of the state and of its
-    rates; `order`, of the last coefficient of the state; `clock`, the node of the time.
+    **Arguments:** `known`, the nodes of constant values; `states` and `rates`, the nodes of the state and its
+    rates; `order`, the last coefficient of the state; `clock`, the node of time.
     """
 
     def __init__(self, graph: Graph, known: Iterable[int], states: Sequence[int], rates: Sequence[int], order: int, clock: int) -> None:
         self.graph = graph
         self.of = {n: [n] for n in (*known, *states)} | {clock: [clock, graph.one]}
         self.state = [self.of[n] for n in states]
-        self._partial: dict[tuple[int, int], int] = {}  # of a function and the number of an argument: the derivative's node
+        self._partial: dict[tuple[int, int], int] = {}  # (function, argument index) -> node of the derivative
         needed = self._with_derivatives(graph.needed(rates, self.of), set(self.of))
         self.of |= {node: [] for node in needed}
         for k in range(order):
@@ -71,11 +72,11 @@ class Series:
                 series.append(graph.div(self._at(rate, k), graph.const(k + 1)))
 
     def _at(self, node: int, k: int) -> int:
-        """Return the coefficient of a node. For given values, coefficients beyond the known ones are zero."""
+        """Return coefficient k of a node; beyond the known coefficients of an input it is zero."""
         return self.of[node][k] if k < len(self.of[node]) else self.graph.zero
 
     def _with_derivatives(self, nodes: Sequence[int], given: set[int]) -> list[int]:
-        """Return the nodes in order, with those of the derivatives that their recurrences need."""
+        """Return the nodes in order, including the derivatives that their recurrences need."""
         graph, found, left = self.graph, set(nodes), list(nodes)
         while left:
             node = left.pop()
@@ -118,7 +119,7 @@ class Series:
         return graph.div(graph.total(found), graph.const(k))
 
     def _product(self, a: int, b: int, k: int, js: range) -> int:
-        """sum_j a_j b_{k-j}"""
+        """Return sum_j a_j b_{k-j}."""
         graph, ordered = self.graph, _newest_last(js, k)
         half = graph.total(self._term(a, a, j, k) for j in ordered if a == b and 2 * j > k)
         rest = graph.total(self._term(a, b, j, k) for j in ordered if a != b or 2 * j == k)
@@ -129,22 +130,21 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """Return the given indices j in an order in which the products a_j b_{k-j} come last whose factors become
-    known last.
-    """
+    """Return the indices j ordered so that products a_j b_{k-j} whose factors become known last come last."""
     return sorted(js, key=lambda j: max(j, k - j))
 
 
-Terms = list[tuple[tuple[int, ...], int]]  # a sum of products: factors that vary, in order, and what they are multiplied by, which does not
+# a sum of products: varying factors, in order, and their constant coefficient
+Terms = list[tuple[tuple[int, ...], int]]
 
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
-    """Return nodes for the same numbers, equal to round-off, with fewer products of varying values, since
+    """Return nodes for the same numbers, equal to round-off, with fewer products of varying values, because
     every coefficient of a product is a sum. `moving`: varying inputs.
 
     Sums and products are expanded into terms. Then the sharing that saves most products is applied
-    repeatedly: x y where several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a
-    disc with s, c = sin, cos of its lean take 12 products, and after that 7, with p = v w/c and q = c u:
+    repeatedly: x y if several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a disc
+    with s, c = sin, cos of its lean take 12 products, and then 7, with p = v w/c and q = c u:
 
         v (2 s w/c - 5/3 c u),  s (g + c u^2) + 6/5 c u w,  -2 v w/c      ->      2 s p - 5/3 v q,  g s + q (s u + 6/5 w),  -2 p
     """
@@ -153,7 +153,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     uses = Counter(a for n in nodes for a in graph.args[n])
     whole = {*outputs, *(a for n in nodes if graph.op[n] not in (*signs, "mul") for a in graph.args[n])}
     forms: dict[int, Terms] = {n: [((n,), one)] for n in moving}
-    sums: dict[int, Terms] = {}  # of what is a factor, or requested; new ones have negative numbers
+    sums: dict[int, Terms] = {}  # sums that are factors or requested; new ones have negative keys
 
     def named(n: int) -> Terms:
         sums[n] = forms[n]
@@ -212,7 +212,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
             new[n] = graph.again(n, map(node, graph.args[n])) if n in forms and graph.args[n] else n
         return new[n]
 
-    for n in nodes:  # older ones first: no deep recursion
+    for n in nodes:  # arguments first, to avoid deep recursion
         node(n)
     return list(map(node, outputs))
 
@@ -229,25 +229,26 @@ class TaylorSteps:
 
     @property
     def needed(self) -> int:
-        """Return the rows of a state that a step keeps: the coefficients, and the rates at its end."""
+        """Return the number of state vectors that a step keeps: the coefficients, and the rates at its end.
+        """
         return self.order + 2
 
     @property
     def at_the_end(self) -> int:
-        """The place of the slope at the end, counted from that at the start."""
+        """Return the index of the slope at the end, relative to the slope at the start."""
         return self.order
 
 
 class Monitored(NamedTuple):
-    """The quantities that must not change sign."""
+    """Quantities that must not change sign."""
 
     holds: Value  # whether all guards are positive
     values: list[Value]  # as `Form.monitored`
 
 
 def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
-    """Return the Taylor series of every integrated number, including tangents, at the time t, and the
-    monitored quantities there.
+    """Return the Taylor series of every integrated number, including tangents, at the time t, and
+    the monitored quantities there.
     """
     y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
@@ -258,7 +259,7 @@ def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[l
     )
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
     nodes = [n for part in (own.values[: len(rates)], *own.tangents, own.values[len(rates) :]) for n in part]
-    # on a graph that nothing has been derived on: the numbers of its nodes decide on the order
+    # on a fresh graph, because node indices determine the order of evaluation
     graph, nodes, inputs = on_its_own(own.graph, nodes, [*given, *states, *(n for part in own.states for n in part)])
     clock, fixed, varying = inputs[[*given].index(clock)], inputs[: len(given)], iter(inputs[len(given) :])
     moved = [next(varying) if i % form.y < form.q_and_v else graph.input(f"work {i}", True) for i in range(form.integrated)]
@@ -269,7 +270,7 @@ def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[l
 
 
 def products(form: Form, order: int) -> int:
-    """About how many multiplications a step takes, tangents and all."""
+    """Return the approximate number of multiplications per step, including tangents."""
     own = outputs_of(form, form.rates, form.y)
     nodes = own.graph.reachable([*own.values, *(n for part in own.tangents for n in part)])
     return order * (order + 1) // 2 * sum(own.graph.op[n] not in ("const", "input", "add", "sub", "neg") for n in nodes)
@@ -280,7 +281,7 @@ def _monitored(form: Form) -> list[int]:
 
 
 def monitored_at(w: MachineWriter, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
-    """Return the monitored quantities, at a state in memory."""
+    """Return the monitored quantities at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
     return _judged(w, form, written(w, form.program.graph, _monitored(form), known))
 
@@ -294,7 +295,7 @@ def _judged(w: MachineWriter, form: Form, values: Sequence[Value]) -> Monitored:
 
 
 def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
-    """Return the permitted length of a step; zero where a coefficient is not a number."""
+    """Return the permitted length of a step; zero if a coefficient is NaN."""
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
     order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h
@@ -309,7 +310,7 @@ def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients])
 
 
 def at_time(w: MachineWriter, series: Coefficients, s: Value) -> Value:
-    """sum_k x_k s^k"""
+    """Return sum_k x_k s^k."""
     total = series[-1]
     for x in reversed(series[:-1]):
         total = w.fma(total, s, x)
@@ -317,5 +318,5 @@ def at_time(w: MachineWriter, series: Coefficients, s: Value) -> Value:
 
 
 def slope(series: Coefficients) -> Coefficients:
-    """Coefficients of the derivative."""
+    """Return the coefficients of the derivative."""
     return [x * float(k) for k, x in enumerate(series) if k]

@@ -1,4 +1,5 @@
-"""Inputs that are functions of time, on the scalar graph: in a program in place of inputs, and their jumps."""
+"""Inputs that are functions of time, on the scalar graph: their substitution into a program, and their jumps.
+"""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -17,11 +18,12 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
-MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
+# limit per function of time; each number is a row of a lane, so use `jj.Sampled` for long tables
+MOST_NUMBERS = 200
 
 
 def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
-    """The program that takes numbers and samples alone, or why there is none."""
+    """Return the program with functions of time substituted, or why that is not possible."""
     if not inputs.programs:
         return program
     return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
@@ -29,8 +31,8 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
 
 @lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
-    """Return the program with these functions in place of inputs, or the reason why this is not possible.
-    Their numbers come last among the `fixed` ones.
+    """Return the program with these functions substituted for inputs, or why that is not possible. Their
+    numbers come last among the `fixed` ones.
     """
     numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
     if numbers > MOST_NUMBERS:
@@ -58,7 +60,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     on_it["sided"] += go_on
     on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
     stays = [i for i, function in enumerate(functions) if function is None]
-    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
+    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are not variables
     q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
     return replace(
         program,
@@ -67,19 +69,19 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         fixed=(*(new[n] for n in program.fixed), *known),
         power=new[program.power],
         **on_it,
-        z=(),  # what is seen of a motion is evaluated with the values of inputs
+        z=(),  # quantities of saved states are computed from the values of inputs
     )
 
 
 def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
     """Return random times and numbers for functions."""
     generator = np.random.default_rng(11)
-    # states at which it is seen whether functions jump
+    # states used to detect jumps of functions
     return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
 
 
 def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[list[int], int]:
-    """Return the nodes of the numbers of a function, and the node of its value at time t."""
+    """Return the nodes of a function's numbers, and the node of its value at time t."""
     given = [
         [graph.input(f"{name} {k} {i}", True) for i in range(math.prod(shape))]
         for k, shape in enumerate(function.shapes)
@@ -90,8 +92,8 @@ def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[l
 
 
 def may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
-    """Return whether a function of time jumps. With `varies`, count only jumps at times that depend on one of
-    these numbers.
+    """Return whether a function of time jumps. With `varies`, count only jumps at times that
+    depend on one of these numbers.
     """
     graph = Graph(keeps_rules=True)
     try:

@@ -2,16 +2,19 @@
 
     z+ = R(t_e, z-, p),   c(t_e, z-, p) = 0        f, f+: rates before and after
 
-The time of the event moves with the state and the numbers p. At a number for a time, tangents and cotangents go through it by
+The time of the event varies with the state and the numbers p. At a fixed time,
+tangents and cotangents pass it by
 
     dt_e = -(c_z dz + c_p dp)/cdot,   cdot = c_t + c_z f
     dz+ = R_z (dz + f dt_e) + R_t dt_e + R_p dp - f+ dt_e
     s = (g.(f+ - R_z f - R_t) - g_t)/cdot,   G = R_z' g + s c_z,   G_p += R_p' g + s c_p
 
-where g_t is the cotangent of t_e. A state with a tangent is a state of a motion by itself, whose reset is the line of dz+ beside R; so derivatives of the
-second order are by the same formulas. This is the saltation matrix of hybrid systems.
+where g_t is the cotangent of t_e. A state with a tangent is again the state of a motion, whose reset
+consists of R and the equation for dz+. Second derivatives therefore follow from the same formulas, the
+saltation matrix of hybrid systems.
 
-Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and Applied Mathematics 11 (1958) 433-447.
+Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and Applied
+Mathematics 11 (1958) 433-447.
 """
 
 import math
@@ -26,28 +29,28 @@ from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList
 
-RESTS = 1e-3  # of the absolute tolerance of states: far less than errors of steps, and more than round-off
+RESTS = 1e-3  # fraction of the absolute tolerance of states: far below errors of steps, above round-off
 
 
 class Reset(NamedTuple):
-    """The state with its tangents after an event, on a separate graph."""
+    """State with its tangents after an event, on a separate graph."""
 
     own: Outputs  # without values
-    event: int  # input: which one it is
-    work: NodeList  # inputs: the work and its tangents; none where it is not integrated
-    state: NodeList  # after it, with its tangents
+    event: int  # input: index of the event
+    work: NodeList  # inputs: the work and its tangents; empty if not integrated
+    state: NodeList  # state after it, with its tangents
     modes: NodeList
-    lost: int  # energy
-    times: NodeList  # of the event, with its tangents
+    lost: int  # loss of energy
+    times: NodeList  # time of the event, with its tangents
 
     @property
     def graph(self) -> Graph:
-        """Where the nodes are."""
+        """Return the graph."""
         return self.own.graph
 
     @property
     def found(self) -> NodeList:
-        """All rows, as `Form.rows_of_transition` has them."""
+        """Return all results in the order of `Form.rows_of_transition`."""
         return [*self.state, *self.modes, self.lost, *self.times]
 
 
@@ -72,14 +75,15 @@ def reset_program(form: Form) -> Reset:
     energy = graph.add(T, V)
     lost = graph.sub(energy, *graph.substituted([energy], kept)) if form.transitions else graph.zero
     state, modes_after, times = after[: form.q_and_v], after[form.q_and_v : -1], [t]
-    # each with its tangents, as many as are lifted so far
+    # each followed by its tangents, as many as computed so far
     work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     known = [dict(enumerate([*fixed, *inputs]))]
     known += [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
     z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
-    state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]  # to which what loads store is added at saved times
+    # the energy stored in loads is added at saved times
+    state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]
     while (parts := len(state) // form.y) <= count:
         before = [n for part in z[:parts] for n in part]
         along = {n: dn for k in range(parts) for n, dn in zip(z[k], z[k + parts], strict=True)}
@@ -100,8 +104,8 @@ def reset_program(form: Form) -> Reset:
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:
-    """Write `reset(state, tau, y, event, after)`: the state after an event at the state `y`; rows as in
-    `Form.rows_of_transition`.
+    """Write `reset(state, tau, y, event, after)`: the state after an event at the state `y`; rows as
+    in `Form.rows_of_transition`.
     """
     reset = reset_program(form)
     with w.procedure("reset", "state tau:real y event:real after") as (state, tau, y, event, after):
@@ -111,7 +115,7 @@ def write_reset(w: MachineWriter, form: Form) -> None:
 
 def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
     """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`; `g`: cotangents of the state, then of the
-    times. The time follows the requested numbers.
+    times. The cotangent of time follows the requested numbers.
     """
     reset, each = reset_program(form), form.y
     graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
@@ -147,12 +151,12 @@ def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
 
 
 def is_side(w: StepWriter, form: Form, event: Number) -> Number:
-    """Return whether an event is that of a relation."""
+    """Return whether an event belongs to a relation."""
     return event > form.stated - 0.5 if form.sides else w.literal(0, w.truth)
 
 
 def is_noted(w: StepWriter, form: Form, left: Number) -> Number:
-    """Return whether a tried transition (`left`) is noted; those of relations are not."""
+    """Return whether a transition in a trial step (`left`) is recorded; transitions of relations are not."""
     return w.differs(left, 0.0) & ~is_side(w, form, w.magnitude(left) - 1.0)
 
 
@@ -167,15 +171,15 @@ def is_left(w: StepWriter, c: Number, rate: Number, noise: Number) -> Number:
 
 
 class Happened(NamedTuple):
-    """An event after which lanes continue."""
+    """Event after which lanes continue."""
 
     event: Number
     t: Number
     flat: Number  # whether its value has no slope
-    quiet: Number  # whether it is that of a relation whose number is as good as at rest: it moves nothing
-    here: Number  # in which lanes
-    noise: Number  # the time in which a value rises by round-off
-    found: Number  # whether it was searched for
+    quiet: Number  # whether it is a relation whose number practically rests: it changes nothing
+    here: Number  # lanes to which it applies
+    noise: Number  # time in which a value rises by round-off
+    found: Number  # whether it was located by a search
 
 
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
@@ -218,7 +222,8 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))  # a bounce: the value itself does not jump
+        # a bounce: the value itself does not jump
+        slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))
         w.store(w.where(slow, float(results.TOO_MANY_TRANSITIONS), w.load(stuck)), stuck)
         left_now = switches & is_left(w, c, rate, noise)
         disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
@@ -235,11 +240,10 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
 
 
 def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:
-    """Turn cotangents after a transition into those before it, and restore the modes, in lanes where the
+    """Turn cotangents after a transition into cotangents before it, and restore the modes, in lanes where the
     transition ended a phase (`left`).
 
-    `left`: the rows with this name; `g_t`: cotangents of the transition's time and of the tangents of that
-    time.
+    `left`: the rows of this name; `g_t`: cotangents of the transition's time and of its tangents.
     """
     count, of = form.integrated, form.rows_of_transition
     mark, t, z, before = w.load(left), w.load(left, 1), w.at(left, 2), w.at(left, 2 + count)

@@ -1,20 +1,18 @@
-"""Modules of LLVM IR as functions of JAX, and with them values of graph nodes and quantities beside the steps
-of a motion.
+"""Modules of LLVM IR as functions of JAX; with them, values of graph nodes and quantities
+beside the steps of a motion.
 
-Arrays without lanes go in, and under `vmap` all lanes go to one call. Many lanes run side by side in the widest registers; one by itself runs in narrow ones,
-in which an instruction takes less time. Results of a lane do not depend on the width.
+Arguments have no batch axis; under `vmap` the whole batch goes to one call. Many lanes run in
+the widest registers; a single one runs in narrow registers, whose instructions are faster.
+Results do not depend on the width.
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
-Each is machine code of its own, made when it is requested: derivatives are taken on the graph. For programs
-that are too large these are JAX's derivatives of
-the program as XLA runs it.
+Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
+programs that are too large, JAX differentiates the program run by XLA.
 
-Beside the steps stand numbers that depend on parameters alone, and all speeds, pivots and energies at saved states: functions of JAX on one state or scene,
-for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's
-(`lowering/lowered.py`). Machine code
-costs XLA no time to trace and compile: a first motion of a disc goes through 700 operations of JAX in place
-of 1,070.
+Quantities beside the steps are numbers that depend only on parameters, and all speeds, pivots and energies at
+saved states. XLA computes speeds of few operations (`lowering/lowered.py`). Machine code saves XLA's tracing
+and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,10 +49,10 @@ def called(
     effort: int = 2,
     constant: Mapping[int, float] | None = None,
 ) -> Callable:
-    """Return a module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the
-    arguments.
+    """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: returns the
+    shapes of results for arguments.
 
-    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`. If some rows
+    The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. If some rows
     of a start are `constant`, one more argument holds all the others: vectors of the state, then numbers.
     """
 
@@ -86,7 +84,8 @@ def called(
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
-        # 2 places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
+        # 2 lanes for a single motion; measured: 64 us with 2, 66 with 1 or 4, 99 with
+        # 8 (10 s of a disc at 1e-8)
         return call(2, 1, (), tuple(map(jnp.ndim, jax.tree.leaves(arguments))), arguments)
 
     @run.def_vmap
@@ -107,7 +106,7 @@ def _results(*arguments, shapes: Callable, operands: Operands, **_) -> list:
 
 
 def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
-    """Return the call with one more axis of lanes, the first one; operands without lanes stay without."""
+    """Return the call with one more leading batch axis; operands without batch axes stay so."""
     count, every = lanes_of(values, axes), []
     for x, axis, rank in zip(values, axes, operands.ranks, strict=True):
         has_lanes = x.ndim - (axis is not None) > rank
@@ -122,8 +121,7 @@ def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
 def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
-    """Return the operand that a function makes from operands of a call, and the context for a call with this
-    operand.
+    """Return the operands that `make` computes from operands of a call, and the context for a call with them.
     """
     avals = [
         ctx.avals_in[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False)
@@ -158,7 +156,7 @@ def _on_nvidia(ctx: mlir.LoweringRuleContext, *values, kernel: Callable, operand
 
 
 def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
-    """The error of a program for any other device."""
+    """Raise the error for programs on any other device."""
     raise OtherDeviceError(f"for JAX's platforms {', '.join(ctx.module_context.platforms)}")
 
 
@@ -170,7 +168,8 @@ def _check_here(ctx: mlir.LoweringRuleContext) -> None:
         _nowhere(ctx)
 
 
-# The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
+# The call itself: machine code is compiled when a program that contains it is lowered,
+# not when it is only traced.
 _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
 _HOW = "handler", "kernel", "lanes", "threads", "shapes", "operands"
@@ -197,16 +196,15 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
 
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Return values of nodes as a function of the values of the variables. Zeros by structure cost nothing.
-    """
+    """Return values of nodes as a function of the values of the variables. Structural zeros cost nothing."""
     graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
 
     @cache
     def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
-        """Return the derivative as a function of x, v or g, and w in a row; None if it is too large or if
-        there is no machine code.
+        """Return the derivative as a function of the concatenation of x, v or g, and w; None if it is too
+        large or without machine code.
         """
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
@@ -219,13 +217,15 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
             found = cotangents(graph, [first[i] for i in there], weights, variables) if back else along(first, weights)
         except Unsupported:
             return None
-        # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
+        # limit on operations; machine code of this size takes 1.4 MB of stack and 0.3 s to compile
         if unsupported(graph, found) or graph.operations(found) > 40_000:
             return None
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
     def linear(back: bool) -> Callable[[Array, Array], Array]:
-        """Return a function of x and v, or (`back`) g; its derivative along x is machine code if possible."""
+        """Return a function of x and v, or with `back` of x and g; its derivative along x
+        is machine code if possible.
+        """
 
         def taken(v):
             return v[there] if back else v
@@ -261,10 +261,9 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Return values of nodes as a function of the values of the variables, by XLA and by machine code.
-
-    Machine code returns only the nonzero numbers, since the whole matrix of 32 trailers would not fit on its
-    stack.
+    """Return values of nodes as a function of the values of the variables, by XLA and by
+    machine code. Machine code returns only the nonzero numbers, because the whole matrix of 32
+    trailers would not fit on its stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
@@ -283,48 +282,49 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Machine code for quantities beside the steps of a program. They are functions of fixed values, time,
-    coordinates, privileged speeds and inputs.
+    """Machine code for quantities beside the steps of a program: functions of fixed values, time,
+    coordinates, independent speeds and inputs.
     """
 
     program: Lowered
-    needed: tuple[Indices, ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
-    fixed: Callable[[Array], Array]  # of those entries
-    speeds: Callable[..., Array] | None  # all of them; None where XLA is quicker
+    needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
+    fixed: Callable[[Array], Array]  # function of those entries
+    speeds: Callable[..., Array] | None  # all speeds; None if XLA is faster
     numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
     def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
-        """As `Lowered.fixed_values`."""
+        """Return the values of `Lowered.fixed_values`."""
         parameters = entries(scene, self.needed)
-        if not self.program.fixed or not parameters:  # nothing to hand over, or nothing requested
+        if not self.program.fixed or not parameters:  # nothing to pass, or nothing requested
             return self.program.fixed_values(scene)
         return entries_of(self.fixed(jnp.concatenate(parameters)))
 
     def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Speeds, Scalar]:
-        """As `Lowered.speeds_and_pivot`."""
+        """Return the values of `Lowered.speeds_and_pivot`."""
         of = self.speeds or self.program.all_speeds
         return of(fixed, t, q, y, inputs), smallest_pivot(self.numbers(fixed, t, q, y, inputs)[:-2])
 
     def energies_at(self, *state) -> Float[Array, "2"]:
-        """As `Lowered.energies_at`."""
+        """Return the values of `Lowered.energies_at`."""
         return self.numbers(*state)[-2:]
 
 
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
-    """Return all this; None where it cannot be machine code."""
+    """Return the machine code beside the steps of a program; None if it cannot be compiled."""
     graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
-    # 60_000 operations
+    # limit of 60_000 operations
     if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
         return None
     used = set(graph.reachable(program.fixed))
     needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
     given = [n for leaf in needed for n in leaf if n >= 0]
     numbers, speeds = _at_state(program, [*program.pivots, *program.energies], nodes_called), None
-    # Operations from which on speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers (228 operations) 0.69 and
-    # 0.54, of 16 (436) 2.6 and 1.8, derivatives of which compile in 13 and 6 s; 256 bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of
-    # 4 trailers (124) 44 and 39, their gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
+    # Operations from which speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers
+    # (228 operations) 0.69 and 0.54, of 16 (436) 2.6 and 1.8, whose derivatives compile in 13 and 6 s; 256
+    # bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of 4 trailers (124) 44 and 39, their
+    # gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
     if program.graph.operations(program.z) >= 100:
         every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
         speeds = _at_state(program, [every[i] for i in np.argsort([*program.independent, *program.dependent])], values_of_nodes)
@@ -352,8 +352,8 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
-    """Return the entries of a scene's parameters that have a node; `nodes`: those of each leaf, entry by
-    entry, -1 for none.
+    """Return the entries of a scene's parameters that have a node; `nodes`: the node of each
+    entry of each leaf, -1 for none.
     """
     found = []
     for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
@@ -365,8 +365,8 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 
 def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
-    """Return whether parameters, and the bodies and contacts that depend on them, are valid, as
-    `parameter_faults` and `faults_at` define it.
+    """Return whether parameters, and the bodies and contacts that depend on them, are valid as defined by
+    `parameter_faults` and `faults_at`.
     """
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs, others]
     parameters = [n for leaf in program.parameters for n in leaf if n >= 0]

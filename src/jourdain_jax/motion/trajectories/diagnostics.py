@@ -20,39 +20,40 @@ OverTimes = Float[Array, "*lanes times"]
 
 
 class Energies(eqx.Module):
-    """Energies along a motion, in J. `balance`, which is T + V minus the work done (if that is integrated),
-    is constant for a correct motion.
+    """Energies along a motion, in J. `balance`, which is T + V minus the work done (if integrated), is
+    constant for a correct motion.
     """
 
     kinetic: OverTimes
     potential: OverTimes
     work: OverTimes | None
-    lost: OverTimes | None = None  # by events until then; None where no event lets a motion continue
+    lost: OverTimes | None = None  # in events so far; None without events at which a motion continues
 
     @property
     @with_nan_as_a_mark
     def balance(self) -> OverTimes:
-        """Return T - W + V + D: W is the work of forces without potential and of constraints that do work, D
-        the energy lost in events.
+        """Return T - W + V + D: W is the work of forces without potential and of constraints that do work,
+        D the energy lost in events.
         """
         return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (0.0 if self.work is None else self.work)
 
     @property
     def kind(self) -> str:
-        """Description of `balance`."""
-        return "T + V" + " less the work done" * (self.work is not None) + " and what events took" * (self.lost is not None)
+        """Return a description of `balance`."""
+        return "T + V" + " less the work done" * (self.work is not None) + " plus losses in events" * (self.lost is not None)
 
 
 class Diagnostics(eqx.Module):
     """Extremes of diagnostic quantities along a motion."""
 
-    energy_drift: Scalar  # J, max - min of T + V, less the work done where it is tracked
+    energy_drift: Scalar  # J, max - min of T + V, less the work done if integrated
     energy_kind: str = static()
-    energy_size: Scalar  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
-    position_residual: Scalar  # largest residual of the geometric rows and quaternion norms
-    velocity_residual: Scalar  # largest residual of the velocity rows
-    smallest_singular_value: Scalar  # of the scaled rows, smallest along the motion
-    rank: tuple[Count, Count]  # lowest and highest rank of the rows
+    # J, reference for the drift: largest kinetic energy plus max - min of the potential energy
+    energy_size: Scalar
+    position_residual: Scalar  # largest residual of the geometric constraints and quaternion norms
+    velocity_residual: Scalar  # largest residual of the velocity constraints
+    smallest_singular_value: Scalar  # of the scaled constraints, smallest along the motion
+    rank: tuple[Count, Count]  # lowest and highest rank of the constraints
     invariant_drifts: dict[str, Scalar]
     contacts: dict[str, "ContactExtremes"]
 
@@ -60,16 +61,16 @@ class Diagnostics(eqx.Module):
 class ContactExtremes(eqx.Module):
     """Extreme forces of a rolling contact."""
 
-    lowest_normal: Scalar  # N; negative: it would have had to pull
+    lowest_normal: Scalar  # N; negative: it would have to pull
     highest_normal: Scalar  # N
     friction_needed: Scalar  # largest |tangential| / normal
-    pulls: Array  # whether it would have had to pull at any time, beyond round-off
-    determined: Array  # whether the rows determine these forces all along
-    normal_determined: Array  # whether they determine the normal force all along
+    pulls: Array  # whether it would have to pull at any time, beyond round-off
+    determined: Array  # whether the constraints always determine these forces
+    normal_determined: Array  # whether they always determine the normal force
 
     @property
     def honest(self) -> bool:
-        """Whether the contact only ever pushed, or bore nothing."""
+        """Return whether the contact never had to pull."""
         return not bool(self.pulls)
 
 
@@ -77,16 +78,16 @@ def diagnose(trajectory: Record) -> Diagnostics:
     """Return drifts, residuals, conditioning and contact extremes of one `trajectory` (for a batch:
     `jax.vmap` or `rollout.lane(i)`).
 
-    Times that were not reached do not count. Raises ValueError for anything but a trajectory.
+    Unreached times are ignored. Raises ValueError for anything but a trajectory.
     """
     if not hasattr(trajectory, "scene"):
         raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
-            "a rollout give one lane: `rollout.lane(0)`")
+            "a rollout pass one lane: `rollout.lane(0)`")
     checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
 
 
-DRIFTED = 1e-2  # of the energy that moves
+DRIFTED = 1e-2  # of the varying energy
 
 
 @eager_if_concrete
@@ -97,7 +98,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
     return Diagnostics(
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind + (", changed by work that was not integrated" if lacks_work else ""),
-        # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
+        # plus a share of the whole energy: if less than that varies, as at rest, no drift is reported
         energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
@@ -109,14 +110,14 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
 
 
 def lost_of(trajectory: Record) -> OverTimes | None:
-    """Return the energy lost in events until each saved time, J; None without events at which the motion
-    continues.
+    """Return the energy lost in events until each saved time, J; None without events
+    at which the motion continues.
     """
     return trajectory.phases.lost_until(trajectory.ts) if trajectory.phases.ts.shape[-1] else None
 
 
 def _lacks_work(trajectory: Record) -> bool:
-    """Return whether work was done that was not integrated, so that T + V is not constant."""
+    """Return whether work was done but not integrated, so that T + V is not constant."""
     return trajectory.work is None and needs_work(trajectory.scene, structure_of(trajectory.scene))
 
 
@@ -135,54 +136,54 @@ def _largest(values) -> Scalar:
 
 
 def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
-    """Return warnings from the diagnostics of a motion, in words."""
+    """Return warnings from the diagnostics of a motion."""
     low, high = (int(rank) for rank in found.rank)
     smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
     if low != high:
-        warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the "
-            "motion beyond may not be unique")
+        warned.append(f"constraints change their rank along the motion, {low} to {high}: constraint forces "
+            "and the further motion may not be unique")
     elif high < usual:
         warned.append(
-            f"rows have rank {high} on the whole motion, but {usual} at generic states: a singular "
-            "configuration, or another assembly of the scene; state a `domain` around the motion to decide"
+            f"constraints have rank {high} on the whole motion, but {usual} at generic states: a singular "
+                "configuration or another assembly; state a `domain` around the motion to decide"
         )
     elif smallest < np.sqrt(eps_of(trajectory.q)):
-        warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
+        warned.append(f"constraints come within {smallest:.1e} of a loss of rank, where digits are lost")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
-        # residual of a row, relative to the state
+        # residual of a constraint, relative to the state
         if float(residual) > 1e-4 * (1.0 + float(_largest(state))):
             warned.append(
-                f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller "
-                "tolerances, or look for rows that contradict each other"
+                f"{kind} constraints are violated by up to {float(residual):.1e}: use projection or smaller "
+                    "tolerances, or look for constraints that contradict each other"
             )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size and not _lacks_work(trajectory):
-        share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
+        share = f"{drift:.1e} J, {drift / size:.0%} of the varying energy"
         warned.append(
-            f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`, "
-            "or let `verify` look at potentials and rows"
+            f"{found.energy_kind}, which should be constant, drifts by {share}: tighten `rtol`, or check "
+                "potentials and constraints with `verify`"
         )
     pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
-    # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
+    # the error of an acceleration is round-off over the square of the pivot; motions
+    # with other states end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
-            f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no "
-            f"digit of the accelerations is sure in {trajectory.q.dtype}; leave `reduction` at its default, "
-            "or take float64"
+            f"the reduction's independent speeds hardly determine the others (pivot {pivot:.1e}), "
+                f"so no digit of the accelerations is reliable in {trajectory.q.dtype}; use the "
+                "default `reduction` or float64"
         )
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
     by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
-    # of a step: a clock that resolves less rounds times visibly
+    # a clock that resolves less than this part of a step rounds times noticeably
     if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
-            f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, "
-            "poses and inputs that depend on time are given rounded times; count time from zero, or take "
-            "float64"
+            f"times are resolved to {resolved:.0e} s, steps are {step:.0e} s: loads, poses and inputs "
+                "receive rounded times; count time from zero, or use float64"
         )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
-    return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
+    return (*warned, *(f"contact `{name}` would have to pull; a real one lifts off" for name in pulled))
 
 
 def summary(trajectory: Record, message: str) -> str:
@@ -191,7 +192,7 @@ def summary(trajectory: Record, message: str) -> str:
     ts = np.asarray(trajectory.ts)
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
     saved, several = f"{reached} of {len(ts)} times saved", reached > 1
-    pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
+    pivot = "" if trajectory.state_form == "full" else f"; pivot of the independent speeds at least {float(trajectory.smallest_pivot):.1e}"
     dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
     moved, left = (float(trajectory.moved_q), float(trajectory.moved_u)), _left_domain(trajectory)
@@ -204,12 +205,14 @@ def summary(trajectory: Record, message: str) -> str:
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
         ("dense", dense),
         ("relations", f"{int(trajectory.crossings)} crossings" if int(trajectory.crossings) > 0 else ""),
-        ("relations", f"not watched: {trajectory.unwatched}" if trajectory.unwatched else ""),
+        ("relations", f"not monitored: {trajectory.unwatched}" if trajectory.unwatched else ""),
         ("phases", _phases_text(trajectory) if trajectory.phases.ts.size else ""),
-        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
+        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "no "
+            "drift from one saved time"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
-        ("start", f"put onto the rows: coordinates changed by {moved[0]:.1e}, speeds by {moved[1]:.1e}; named values are kept"),
+        ("start", f"projected onto the constraints: coordinates changed by {moved[0]:.1e}, speeds by "
+            f"{moved[1]:.1e}; named values are kept"),
         ("inputs", ", ".join(inputs)),
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
@@ -226,7 +229,7 @@ def _phases_text(trajectory: Record) -> str:
 
 
 def _left_domain(trajectory: Record) -> str:
-    """Return which coordinate or speed left the scene's `domain` first, and when."""
+    """Return the coordinate or speed that left the scene's `domain` first, and when."""
     scene, first = trajectory.scene, []
     for names, values in ((scene.coordinate_names, trajectory.q), (scene.speed_names, trajectory.u)):
         for k, name in enumerate(names.entries):
@@ -241,7 +244,7 @@ def _left_domain(trajectory: Record) -> str:
 
 
 def _channel_text(channel) -> str:
-    """Return the text of an input; missing ones are zero."""
+    """Return the text for an input; missing ones are zero."""
     if isinstance(channel, Mode):
         return "a mode"
     if isinstance(channel, Constant):
@@ -257,6 +260,6 @@ def _contact_text(contact: ContactExtremes) -> str:
     if bool(contact.determined):
         return text
     if bool(contact.normal_determined):
-        return f"{text}; the tangential force is not determined by the rows (minimum norm)"
-    hint = "" if contact.honest else "; if this contact does not hold up all bodies, name those that it does in `carried=`"
-    return f"{text}; not determined by the rows (minimum norm){hint}"
+        return f"{text}; the constraints do not determine the tangential force (minimum norm)"
+    hint = "" if contact.honest else "; if this contact does not carry all bodies, name those it carries in `carried=`"
+    return f"{text}; the constraints do not determine it (minimum norm){hint}"

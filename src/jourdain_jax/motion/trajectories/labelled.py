@@ -1,7 +1,8 @@
 """Motions as labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame` with names, times, result codes,
 parameters, and known units.
 
-A scene states the units of its parameters. Of its coordinates and speeds only those of quaternions and their angular velocities are known; others are given.
+A scene states the units of its parameters. Units of coordinates and speeds are known only for quaternions and
+their angular velocities; the user supplies the others.
 """
 
 import math
@@ -17,19 +18,21 @@ from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import state_names
 
-OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion, type, what stands for nothing, attributes
+# name: field of a motion, type, missing value, attributes
+OF_LANES: dict[str, tuple[str, str, float, dict]] = {
     "result": ("result", "int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
     "event": ("event", "int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
     "steps": ("accepted", "int32", -1, {"long_name": "accepted steps"}),
     "rejected_steps": ("rejected", "int32", -1, {"long_name": "rejected steps"}),
-    "retries": ("fallback", "int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
+    "retries": ("fallback", "int8", -1, {"long_name": "how it was "
+        "repeated", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
     "end_time": ("t_end", "float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
 }
 
 
 @of_known_numbers
 def to_xarray(record: Record, units: Mapping[str, str] | None = None):
-    """Return the motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a
+    """Return the motion, or a batch of motions, as an `xarray.Dataset`; `units`: name of a
     coordinate or speed -> its unit.
     """
     xarray = needed("xarray", "a motion as labelled arrays")
@@ -41,14 +44,14 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
     about_time = {"long_name": "time", "units": "s"}
     found: dict[str, tuple] = {"time": ("time", ts[0] if lanes else ts, about_time) if shared else (along, ts, about_time)}
     if lanes:
-        found["lane"] = ("lane", np.arange(len(ts)), {"long_name": "number of the motion"})
+        found["lane"] = ("lane", np.arange(len(ts)), {"long_name": "index of the motion"})
 
     def add(name: str, axes: tuple, values, about: dict) -> None:
         if name in found or name == "lane":
             raise ValueError(
                 f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; "
-                "coordinates, speeds and parameters need names of their own, different from "
-                f"{', '.join(('time', 'lane', *OF_LANES))}: rename it in the scene, or use `to_pandas()`"
+                    "rename it in the scene (names other than "
+                    f"{', '.join(('time', 'lane', *OF_LANES))}), or use `to_pandas()`"
             )
         found[name] = (axes, values, about)
 
@@ -68,9 +71,7 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
 
 @of_known_numbers
 def to_pandas(record: Record):
-    """Return coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and
-    time.
-    """
+    """Return coordinates and speeds as a `pandas.DataFrame`: one row per time, or per sample and time."""
     pandas = needed("pandas", "a table of a motion")
     lanes, ts = _lanes(record), np.asarray(record.ts)
     if not lanes:
@@ -95,6 +96,6 @@ def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
     for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
         known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
     valid = state_names(scene)
-    check_names(given or {}, valid, "`units` names `{}`, which is not a coordinate or speed of "
-        f"`{type(scene).__name__}`")
+    check_names(given or {}, valid,
+        f"`units` names `{{}}`, which is not a coordinate or speed of `{type(scene).__name__}`")
     return known | dict(given or {})

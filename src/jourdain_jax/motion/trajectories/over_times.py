@@ -28,22 +28,22 @@ from jourdain_jax.scene.validated import invariants_of
 
 
 class Phases(eqx.Module, Printed):
-    """The phases of a motion, separated by events at which it continues."""
+    """Phases of a motion, separated by events at which it continues."""
 
     ts: Float[Array, "transitions"]  # s, of these events; NaN after the last one
     events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
     modes: Float[Array, "modes phases"]  # numbers of their values in each phase
-    lost: Float[Array, "transitions"]  # J, by which T + V fell at each event
+    lost: Float[Array, "transitions"]  # J, loss of T + V at each event
     event_names: Labels = static()
     named: Modes = static()
 
     @property
     def count(self) -> Count:
-        """How many such events there were."""
+        """Return the number of events that separate the phases."""
         return jnp.sum(jnp.isfinite(self.ts), axis=-1)
 
     def texts(self) -> list[str]:
-        """Return one line for each event: its time, its name, the modes that it switched and the energy that it took."""
+        """Return one line per event: its time, its name, the modes that it switched and the energy lost."""
         ts, events, modes, lost = (np.asarray(x) for x in (self.ts, self.events, self.modes, self.lost))
         lines = []
         for k in range(int(self.count)):
@@ -54,7 +54,9 @@ class Phases(eqx.Module, Printed):
         return lines
 
     def _text(self) -> str:
-        return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())]) if self.ts.ndim == 1 else f"Phases of lanes {self.ts.shape[:-1]}"
+        if self.ts.ndim > 1:
+            return f"Phases of a batch of shape {self.ts.shape[:-1]}"
+        return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())])
 
     def lost_until(self, ts: Float[Array, "*lanes times"]) -> Float[Array, "*lanes times"]:
         """Return the loss of T + V by events until each time `ts` (s), in J."""
@@ -63,19 +65,20 @@ class Phases(eqx.Module, Printed):
 
 
 def one_phase(event_names: Labels) -> Phases:
-    """Return the phases of a motion with one of them, without modes."""
+    """Return the phases of a motion with a single phase, without modes."""
     none = jnp.zeros(0)
     return Phases(none, none.astype(jnp.int32), jnp.zeros((0, 1)), none, event_names, Modes())
 
 
 class Record(eqx.Module):
-    """The numbers of a motion; NaN at times that were not reached."""
+    """Numbers of a motion; NaN at unreached times."""
 
     scene: Scene
     ts: Float[Array, "times"]  # s
     q: Float[Array, "times coordinates"]
     u: Float[Array, "times speeds"]
-    work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
+    # J, since the start; None if all forces have potentials and no constraint does work
+    work: Float[Array, "times"] | None
     t_end: Scalar  # s
     q_end: Float[Array, "coordinates"]
     u_end: Speeds
@@ -83,13 +86,16 @@ class Record(eqx.Module):
     event: Count  # index into `event_names`, -1: none
     accepted: Count  # steps
     rejected: Count
-    last_step: Scalar  # s, that the step-size control would take next; NaN where it keeps that to itself
-    crossings: Count  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: steps do not end there
-    fallback: Count  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
-    moved_q: Scalar  # how far the start was moved onto the constraints
+    last_step: Scalar  # s, proposed by step-size control for the next step; NaN if unknown
+    # number of sign changes of relations (`<`, `abs`, `floor`, ...) in loads, poses and
+    # constraints; -1: not monitored
+    crossings: Count
+    fallback: Count  # how the motion was repeated, see `results.FALLBACKS`; 0: as requested
+    moved_q: Scalar  # change of the start by its projection
     moved_u: Scalar
-    # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
-    # full state, dense: of those of the reduction, 1 where it has none
+    # smallest pivot of the independent speeds along the motion (lowered: of the elimination,
+    # relative to its usual size), negative if it changed sign; for the full state with dense
+    # matrices, of the reduction, or 1 without
     smallest_pivot: Scalar
     inputs: Inputs
     phases: Phases
@@ -97,26 +103,29 @@ class Record(eqx.Module):
     reduction: str = static()
     solver: str = static()
     projected: bool = static()
-    unwatched: str = static()  # why steps do not watch relations, in words; empty where they do, or there are none
+    unwatched: str = static()  # why steps do not monitor relations; empty if they do, or there are none
     event_names: Labels = static()
 
 
 @with_usual_promotion
 def map_over_times(f, record: Record, by_inputs: bool = False):
-    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a
-    named function or a module, since it is a cache key.
+    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at unreached times. f must be a named function
+    or a module, because it is a cache key.
 
-    `by_inputs`: whether f needs the rates of the inputs, since rows depend on varying ones. For a batch of
-    motions the axes of lanes come first.
+    `by_inputs`: whether f needs the rates of the inputs, because constraints depend on varying ones. For a
+    batch of motions the batch axes come first.
     """
     first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))  # noqa: E731  of a batch, the first
-    by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs  # accelerations depend on the rates of the inputs
+    # accelerations depend on the rates of the inputs
+    by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs
     known = not is_traced((f, record))
-    # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)
+    # for one concrete motion NumPy finishes before a program is compiled (contact forces of a bicycle at
+    # 101 times: 1 s instead of 7)
     if known and record.q.ndim == 2 and len(record.ts) <= 1000:
         return _on_numpy(f, record, by_inputs)
     mapped = _compiled(record.inputs.programs)
-    whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
+    # then NaN is not a marker
+    whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))
     return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs)
 
 
@@ -128,7 +137,8 @@ def _mapped(f, record: Record, by_inputs: bool):
     count, most = len(record.ts), _largest_block(record)
     if count <= most:
         return jax.vmap(one)(record.ts, record.q, record.u)
-    block = next(k for k in range(most, 0, -1) if count % k == 0)  # without a rest, which would be compiled by itself
+    # a divisor, because a remainder would be compiled separately
+    block = next(k for k in range(most, 0, -1) if count % k == 0)
     return jax.lax.map(lambda state: one(*state), (record.ts, record.q, record.u), batch_size=block)
 
 
@@ -136,7 +146,7 @@ _compiled = for_programs(_mapped)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
-    """Return `f` at one state. For a time that was not reached, f runs at the end of the motion instead, and
+    """Return `f` at one state. For an unreached time, f is evaluated at the end of the motion, and
     its result is replaced by NaN.
     """
     reached = jnp.all(jnp.isfinite(q))
@@ -147,7 +157,8 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
 
 def _largest_block(record: Record) -> int:
     """Return the number of times at which quantities are computed together."""
-    # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
+    # limit on entries of square matrices of the coordinates: for 200 trailers at 201 times, derivatives of
+    # all poses took more than 23 GB
     return max(1, 4_000_000 // record.q.shape[-1] ** 2)
 
 
@@ -162,8 +173,8 @@ _uncompiled = eval_numpy(_at_one_time)
 
 
 class BodyPoint(eqx.Module):
-    """Return the position (m, inertial frame) of the point of a body with coordinates `local` (m, body frame,
-    from the mass centre).
+    """Position (m, inertial frame) of the point of a body with coordinates `local` (m, body
+    frame, from the mass centre).
     """
 
     body: str = static()
@@ -174,12 +185,12 @@ class BodyPoint(eqx.Module):
 
 
 def energies(scene, t, q, u, inputs):
-    """Kinetic and potential energy, J."""
+    """Return the kinetic and potential energy, J."""
     return energies_at(scene, motion_at(scene, t, q, u, inputs))
 
 
 class InputOf(eqx.Module):
-    """An input by its name."""
+    """Input with a given name."""
 
     name: str = static()
 
@@ -188,8 +199,8 @@ class InputOf(eqx.Module):
 
 
 class AccelerationsBySvd(eqx.Module):
-    """Return accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint rows,
-    None: those of the scene.
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint
+    rows, None: those of the scene.
     """
 
     usual: UsualRows | None = None
@@ -199,22 +210,22 @@ class AccelerationsBySvd(eqx.Module):
 
 
 def reactions(scene, t, q, u, inputs):
-    """Constraint forces per row and per body."""
+    """Return the constraint forces per constraint and per body."""
     return row_reactions(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
 
 
 def contacts(scene, t, q, u, inputs):
-    """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
+    """Return normal and tangential force and the friction coefficient needed, for every rolling contact."""
     return contact_forces(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
 
 
 def residuals(scene, t, q, u, inputs):
-    """Return residuals of the geometric rows and quaternion norms, and of the velocity rows."""
+    """Return residuals of the geometric constraints and quaternion norms, and of the velocity constraints."""
     return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
 
 
 def invariants(scene, t, q, u, inputs):
-    """The quantities that the scene is known to conserve."""
+    """Return the quantities that the scene declares conserved."""
     return invariants_of(scene, motion_at(scene, t, q, u, inputs))
 
 
@@ -222,7 +233,7 @@ class Checked(NamedTuple):
     """Diagnostic quantities along a motion."""
 
     energies: tuple[Array, Array]  # kinetic and potential
-    residuals: tuple[Array, Array]  # of the geometric rows and of the velocity rows
+    residuals: tuple[Array, Array]  # of the geometric and of the velocity constraints
     rank: Array
     smallest_singular_value: Array
     invariants: dict[str, Array]

@@ -1,4 +1,4 @@
-"""Small figures of motions for notebooks: coordinates against time, from the saved numbers."""
+"""Small figures of motions for notebooks: coordinates over time."""
 
 import numpy as np
 
@@ -7,15 +7,13 @@ from jourdain_jax.motion.trajectories.over_times import Record
 
 
 def sketch(record: Record) -> str:
-    """Draw each coordinate, with its name and its range; times that were not reached are omitted."""
+    """Draw each coordinate with its name and range, without unreached times."""
     return _drawn(record, np.asarray(record.ts), np.asarray(record.q)[None])
 
 
 def sketch_of_lanes(record: Record) -> str:
-    """Draw many motions, with a leading batch axis: the median, and the bands that hold half and 95 % of the
-    samples under way.
-
-    Return "" for lanes with different saved times.
+    """Draw a batch of motions (leading axis): the median, and bands with half and 95 % of the running
+    samples. Return "" for samples with different saved times.
     """
     levels = 0.025, 0.25, 0.5, 0.75, 0.975  # the ends of two bands, the median between them
     lanes = _spread(len(record.q), 1000)
@@ -35,8 +33,8 @@ def _spread(count: int, most: int = 120) -> np.ndarray:
 
 
 def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
-    """Draw the coordinates; `levels` (levels, times, coordinates): the line in the middle, with bands around
-    it.
+    """Draw the coordinates; `levels` (levels, times, coordinates): the line in the
+    middle, with bands around it.
     """
     reached = np.flatnonzero(np.isfinite(levels).all(axis=(0, 2)))
     if reached.size < 2:

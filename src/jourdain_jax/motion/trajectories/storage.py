@@ -1,18 +1,20 @@
 """Saving and loading motions as NumPy's `.npz`.
 
-Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`,
-`fallback`, `inputs` (times, inputs;
-sampled at `ts`), `phases.NAME` for every array of `motion.phases` (absent where there is one phase, without modes), and `parameter:NAME` for every field that
-is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
-`speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays` (names of all arrays), `versions`,
-`digest` (SHA-256 of the rest of the header and of all arrays; files of earlier versions have none).
-`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
-says how lanes with a `fallback` were run.
+Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent if not
+integrated), `t_end`, `q_end`, `u_end`, `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`,
+`smallest_pivot`, `last_step`, `crossings`, `fallback`, `inputs` (times, inputs; sampled at `ts`),
+`phases.NAME` for every array of `motion.phases` (absent with a single phase and no modes), and
+`parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class
+name), `coordinates`, `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain
+numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays`
+(names of all arrays), `versions`, `digest` (SHA-256 of the rest of the header and of all arrays; files of
+earlier versions have none).
 
-A file is an error where its content has another digest, because it is damaged or was changed since, and where the scene's class has changed since: its
-parameters, their units, or its names.
+`kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis (so `result` is one
+code per sample), and `reruns` in its header describes how samples with a `fallback` were repeated.
+
+Loading raises an error if the digest does not match, because the file is damaged or was changed, or if the
+scene's class has changed its parameters, their units, or its names.
 """
 
 import hashlib
@@ -43,7 +45,8 @@ from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))  # without `work`, which may be absent
+# without `work`, which may be absent
+_ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))
 _PHASES = tuple(f"phases.{field.name}" for field in fields(Phases) if hasattr(field.type, "dim_str"))
 _HEADER = ("scene", "static", "units", "coordinates", "speeds", "input_names", "event_names", "reruns", *RERUN_FIELDS)
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
@@ -52,26 +55,29 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 
 @of_known_numbers
 def save(motion: Trajectory | Rollout, path: FilePath) -> None:
-    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
+    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of
+    `motion/trajectories/storage.py`).
 
-    An existing file is replaced only when the new one is complete: an interruption leaves the old one. Inputs
-    are stored as samples at the saved times. Raises ValueError where the path is a folder, or the scene has a
-    field that is not an array, number or text. Read the file with `load_trajectory` or `load_rollout`.
+    An existing file is replaced only when the new one is complete, so an interruption leaves the old one.
+    Inputs are stored as samples at the saved times. Raises ValueError if the path is a folder, or the scene
+    has a field that is not an array, number or text. Read the file with `load_trajectory` or `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):
         raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
     trajectory, kind, reruns = (motion.lanes, "rollout", motion.reruns) if isinstance(motion, Rollout) else (motion, "trajectory", ())
     if trajectory is motion and motion.q.ndim != 2:
         raise ValueError(
-            f"`save` takes one motion, but was given a batch of shape {motion.q.shape[:-2]}; for one axis of lanes, save `jj.Rollout(batch)`"
+            f"`save` takes one motion, but was given a batch of shape {motion.q.shape[:-2]}; for one batch "
+                "axis, save `jj.Rollout(batch)`"
         )
     scene = trajectory.scene
     parameters, static = _stored_fields(scene)
     for field in fields(scene):
         if field.init and field.name not in (*parameters, *static) and getattr(scene, field.name) is not field.default:
             raise ValueError(
-                f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
-                "expected arrays, numbers or texts, or the class's default"
+                f"field `{field.name}` of `{type(scene).__name__}` is "
+                    f"{described(getattr(scene, field.name))}, which `save` cannot store; expected arrays, "
+                    "numbers or texts, or the class's default"
             )
     check_place(path)
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
@@ -100,7 +106,7 @@ def save(motion: Trajectory | Rollout, path: FilePath) -> None:
 
 
 def _digest(header: dict, arrays: dict) -> str:
-    """Return the digest of all arrays and of the header but for the digest in it."""
+    """Return the digest of all arrays and of the header without its digest."""
     found = hashlib.sha256(json.dumps(header | {"digest": ""}, sort_keys=True).encode())
     for name, x in sorted(arrays.items()):
         found.update(f"{name} {x.dtype.str} {x.shape} ".encode() + x.tobytes())
@@ -113,10 +119,11 @@ def _sampled(inputs: Inputs, ts):
 
 @with_nan_as_a_mark
 def load_trajectory(path: FilePath, scene: Scene | type[Scene]) -> Trajectory:
-    """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
+    """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that
+    class; parameters come from the file.
 
-    Raises ValueError where the file cannot be read, has another format, contains a rollout, or belongs to
-    another scene.
+    Raises ValueError if the file cannot be read, has another format, contains a rollout,
+    or belongs to another scene.
     """
     header, arrays, kind = _read(path, scene, "trajectory")
     lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
@@ -125,10 +132,11 @@ def load_trajectory(path: FilePath, scene: Scene | type[Scene]) -> Trajectory:
 
 @with_nan_as_a_mark
 def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
-    """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
+    """Read a rollout written by `save` from `path`: all its samples, including failed
+    ones, each with its result code.
 
     `scene`: the scene's class, or any scene of that class; parameters come from the file. Raises ValueError
-    where the file cannot be read, has another format, contains one trajectory, or belongs to another scene.
+    if the file cannot be read, has another format, contains one trajectory, or belongs to another scene.
     """
     header, arrays, kind = _read(path, scene, "rollout")
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
@@ -136,16 +144,17 @@ def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
-    """Return trajectories from arrays with a leading axis of lanes, which may have failed. They are built
-    under `vmap`, where no value is refused."""
+    """Return trajectories from arrays with a batch axis. They are built under
+    `vmap`, where no value is rejected.
+    """
     samples = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
-    longest = max(len(times) for times, _ in samples)  # lanes with fewer are filled up with their last sample
+    longest = max(len(times) for times, _ in samples)  # samples with fewer input times repeat their last one
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples])
-    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` hands on what is given to it as it is
+    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` passes NumPy arrays on unchanged
     try:
         lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
-    except _NEEDS_NUMBERS:  # a class that looks at them when a scene is made
+    except _NEEDS_NUMBERS:  # the class reads the values when a scene is created
         each = [_trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()}) for i in range(len(arrays["result"]))]
         lanes = jax.tree.map(lambda *x: jnp.stack(x), *each)
     _check_scene(path, at_index(lanes.scene, 0))
@@ -161,17 +170,19 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     except TypeError as error:
         raise _refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
     parameters, static = _stored_fields(scene)
-    if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would replace what moved
+    # otherwise their defaults would replace the missing values
+    if missing := sorted({*parameters, *static} - {*values, *header["static"]}):
         raise ValueError(
-            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was "
-            "written before the class had it: pass the class as it was when the file was written"
+            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged or older than "
+                "the parameter: pass the class as it was when the file was written"
         )
     then, now = header["units"], {name: about["unit"] for name, _, about in parameters_of(scene)}
     for name in sorted({*then, *now}):
         if then.get(name) != now.get(name):
             was, takes = (f"in {units[name]}" if units.get(name) else "without a unit" for units in (then, now))
             raise ValueError(
-                f"`{path}` holds the parameter `{name}` {was}, but `{kind.__name__}` takes it {takes}; pass the class as it was when the file was written"
+                f"`{path}` holds the parameter `{name}` {was}, but `{kind.__name__}` takes it {takes}; pass "
+                    "the class as it was when the file was written"
             )
     for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
         if tuple(header[name]) != now.entries:
@@ -198,23 +209,24 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
 
 
 def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return samples of the inputs in increasing time, also for a motion in reversed time, without times that
-    were not reached."""
+    """Return samples of the inputs in increasing time, also for reversed time, without unreached times."""
     reached = np.flatnonzero(np.isfinite(ts))
     times, first = np.unique(ts[reached], return_index=True)
     return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))
 
 
 def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
-    """Return the class of the scene. Raises ValueError if it is not the one in the file, or if its parameters
-    or names have changed."""
+    """Return the class of the scene. Raises ValueError if it is not the one in the file, or if its
+    parameters or names have changed.
+    """
     kind = scene if isinstance(scene, type) else type(scene)
     if not issubclass(kind, Scene):
         raise ValueError(f"`scene` is {described(scene)}, expected the class of the simulated scene, or a scene of that class")
     if header["scene"] != kind.__name__:
         raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass its class")
     known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
-    check_names((*parameters, *header["static"]), known, f"`{path}` has a parameter `{{}}` that `{kind.__name__}` has not")
+    check_names((*parameters, *header["static"]), known,
+        f"`{path}` has a parameter `{{}}` that `{kind.__name__}` lacks")
     return kind
 
 
@@ -226,7 +238,7 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
     check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
     if not isinstance(header, dict):
-        raise _refused(path, "has a header that is no dictionary")
+        raise _refused(path, "has an invalid header")
     if header.get("format") != 1:
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.get("kind")
@@ -236,18 +248,19 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     if missing:
         raise _refused(path, f"lacks `{missing[0]}`")
     if header.get("digest", own := _digest(header, arrays)) != own:
-        raise _refused(path, "has another digest than it states")
+        raise _refused(path, "does not match its digest")
     return header, arrays, _checked_class(path, scene, header, arrays)
 
 
 def _unpacked(file) -> dict[str, np.ndarray]:
-    """Return the arrays of a zip archive by name. Memory is allocated only for the actual content, whatever
-    size an entry claims."""
+    """Return the arrays of a zip archive by name. Memory is allocated only for actual content,
+    whatever size an entry claims.
+    """
     found = {}
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
-            # bytes that a compressed one stands for, at most: deflate's longest match
+            # limit of the compression ratio: deflate's longest match
             if name in found or member.file_size > 1100 * member.compress_size + 1000:
                 raise ValueError(f"`{name}` occurs twice" if name in found else f"`{name}` claims {member.file_size} bytes")
             content = archive.read(member)
@@ -266,20 +279,21 @@ def _parameters(arrays: dict) -> dict:
 
 
 def _stored_fields(scene: Scene) -> tuple[dict, dict]:
-    """Return fields that are arrays, including parameters, and plain numbers or texts, such as a number of
-    bodies."""
+    """Return fields that are arrays, including parameters, and fields that are plain numbers or
+    texts, such as a number of bodies.
+    """
     values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
     arrays = {field.name: value for field, value in values.items() if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")}
     return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}
 
 
 def _refused(path, sentence: str) -> ValueError:
-    """Return the error for a file that is not as `save` wrote it."""
+    """Return the error for a file that `save` did not write."""
     return ValueError(f"`{path}` {sentence}; it is damaged or was not written by `save`")
 
 
 def _check_scene(path, scene: Scene) -> None:
-    """ValueError where parameters have shapes that do not make the scene."""
+    """Raise ValueError if parameters have shapes that do not suit the scene."""
 
     def quantities(scene):
         q, u, _ = scene.named()
@@ -290,5 +304,6 @@ def _check_scene(path, scene: Scene) -> None:
     except (ValueError, TypeError, IndexError) as error:
         said = str(error).splitlines()[0]
         raise ValueError(
-            f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class as it was when it was written"
+            f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class "
+                "as it was when it was written"
         ) from None

@@ -1,4 +1,4 @@
-"""A trajectory, with named access and its diagnostics."""
+"""Trajectory with access by name and diagnostics."""
 
 from collections.abc import Mapping
 
@@ -31,16 +31,16 @@ from jourdain_jax.scene.scene import state_names
 
 
 class Trajectory(Record, Printed):
-    """A motion over time. Times after an early end (event, failure) hold NaN.
+    """Motion over time. Times after an early end (event, failure) hold NaN.
 
-    `t_end`, `q_end`, `u_end` are the last state that was reached; for a failed motion the state of the
-    failure, with derivatives of NaN. Use `motion.nan_if_failed()` in automatic computations such as a loss,
+    `t_end`, `q_end`, `u_end` are the last state reached; for a failed motion they are the state of the
+    failure, with NaN derivatives. Use `motion.nan_if_failed()` in automatic computations such as a loss,
     or check `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
-        """Return a coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the
-        times.
+        """Return a coordinate, speed, quaternion or angular velocity by name, at
+        all times; `"t"` for the times.
         """
         if name == "t":
             return self.ts
@@ -55,36 +55,36 @@ class Trajectory(Record, Printed):
                 'pose and velocities at all times'
             )
         valid = (*state_names(self.scene), "t")
-        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; "
-            f"{nearest(name, valid)}")
+        raise UnknownNameError(
+            f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
     def __contains__(self, name: str) -> bool:
         return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
 
     @property
     def succeeded(self) -> Bool[Array, "*lanes"]:
-        """Whether the motion reached the end of its span or an event. It works under jit and vmap."""
+        """Return whether the motion reached the end of its span or an event. It works under jit and vmap."""
         return jnp.asarray(self.result) <= results.EVENT
 
     @property
     def valid(self) -> Bool[Array, "*lanes times"]:
-        """Marks of the times that the motion reached."""
+        """Return which times the motion reached."""
         return jnp.all(jnp.isfinite(self.q), axis=-1)
 
     @property
     def end(self) -> State:
-        """Return the last state reached, projected onto the constraints; for many motions a batch of such
-        states. Another motion can continue from it at its time.
+        """Return the last state reached, projected onto the constraints; for many motions a batch of states.
+        Another motion can continue from it at its time:
 
-        motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
+            motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
         """
         if self.q_end.ndim > 1:
             return eqx.filter_vmap(lambda motion: motion.end)(self)
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
     def phase(self, mode: str) -> Float[Array, "*lanes times"]:
-        """Return the number of a mode's value at all times; at an event that switches it, the value
-        afterwards.
+        """Return the number of a mode's value at all times; at an event that
+        switches it, the value afterwards.
         """
         check_name(mode, self.scene.modes.names, f"`{type(self.scene).__name__}` has no mode `{mode}`")
         return map_over_times(over_times.InputOf(mode), self)
@@ -94,23 +94,24 @@ class Trajectory(Record, Printed):
         return map_over_times(motion_at, self)
 
     def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
-        """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m,
-        from the mass centre).
+        """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates
+        `local` (m, from the mass centre).
         """
-        local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its "
-            "body frame, m")
+        local = checked_real(local, f"point of body `{body}`", (3,),
+            advice="pass three components in its body frame, m")
         return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
-        """Return kinetic and potential energy, and the integrated work, in J. `.balance` is constant for a
-        correct motion.
+        """Return kinetic and potential energy, and the integrated work, in J. `.balance` is
+        constant for a correct motion.
         """
         kinetic, potential = map_over_times(over_times.energies, self)
         return Energies(kinetic, potential, self.work, lost_of(self))
 
     def accelerations(self) -> Accelerations:
         """Return accelerations, multipliers, rank and smallest singular value at all times."""
-        usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))  # lanes of a batch have parameters of their own
+        # samples of a batch differ in parameters
+        usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))
         return map_over_times(over_times.AccelerationsBySvd(usual), self, by_inputs=True)
 
     def constraint_forces(self) -> RowReactions:
@@ -126,8 +127,8 @@ class Trajectory(Record, Printed):
         return map_over_times(over_times.contacts, self, by_inputs=True)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
-        """Return residuals of the geometric constraints (and quaternion norms), and of the velocity
-        constraints, at all times.
+        """Return residuals of the geometric constraints (and quaternion norms), and of the
+        velocity constraints, at all times.
         """
         return map_over_times(over_times.residuals, self)
 
@@ -139,14 +140,14 @@ class Trajectory(Record, Printed):
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states only
-        units of parameters. ImportError without xarray.
+        `units`: name of a coordinate or speed -> its unit, stored as `attrs["units"]`, because a scene states
+        only units of parameters. ImportError without xarray.
         """
         return labelled.to_xarray(self, units)
 
     def to_pandas(self):
-        """Return coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError
-        without pandas.
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row per time
+        (s). ImportError without pandas.
         """
         return labelled.to_pandas(self)
 
@@ -160,7 +161,7 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def message(self) -> str:
-        """How the motion ended, in words."""
+        """Return a message on how the motion ended."""
         code = int(self.result)
         text = results.MESSAGES[code]
         if code == results.EVENT:
@@ -171,12 +172,12 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def warnings(self) -> Sentences:
-        """Return reasons to doubt the motion, the most serious first; empty if there are none. The printed
-        summary shows them.
+        """Return reasons to doubt the motion, the most serious first; empty if there are none.
+        The printed summary shows them.
 
-        Reasons are a failure; rows that gain or lose rank, or come near it, so that constraint forces and
-        derived quantities may not be unique; privileged speeds of a reduction that do not determine the
-        others in this precision; contacts that would have to pull. They are computed on request and need
+        Reasons are a failure; constraints at or near a change of rank, so that constraint forces and derived
+        quantities may not be unique; independent speeds of a reduction that do not determine the others in
+        this precision; contacts that would have to pull. They are computed on request and need concrete
         numbers: not under jit or vmap.
         """
         failure = () if int(self.result) <= results.EVENT else (self.message,)
@@ -184,20 +185,20 @@ class Trajectory(Record, Printed):
 
     @property
     def wrong_parameters(self) -> Labels:
-        """Names of the scene's parameters that are not finite or have the wrong sign."""
+        """Return the names of parameters that are not finite or have the wrong sign."""
         return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
 
     @property
     def faults(self) -> Sentences:
-        """Return known causes of a failure, as texts for messages.
+        """Return known causes of a failure, for messages.
 
-        Parameters that are not finite or have the wrong sign, otherwise impossible values of bodies, contacts
-        and gravity; if steps became short, a load that jumps or has a kink.
+        Causes are parameters that are not finite or have the wrong sign, otherwise impossible values of
+        bodies, contacts and gravity; if steps became short, a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
         if code in (results.STICKS, results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
-            said = " jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`"
+            said = " jumps, or has a kink, at the last state; smooth it over a short range, as by `jnp.tanh`"
             return (f"{load}{'' if code == results.STICKS else said}",) if load else ()
         if code != results.BAD_PARAMETER:
             return ()
@@ -207,14 +208,13 @@ class Trajectory(Record, Printed):
         return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items() if bool(wrong))
 
     def nan_if_failed(self) -> "Trajectory":
-        """Return the trajectory with NaN in place of its states if it reached neither its end nor an event:
-        under `jit`, `vmap` and `grad`, for each sample.
+        """Return the trajectory with NaN states if it reached neither its end nor an event: under `jit`,
+        `vmap` and `grad`, for each sample.
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Their derivatives are NaN, too. Samples omitted from a loss by `jnp.where(motion.succeeded, ..., 0.0)`
-        do not disturb its derivatives with
-        respect to shared values.
+        Their derivatives are NaN, too. Samples excluded from a loss by `jnp.where(motion.succeeded, ...,
+        0.0)` do not disturb its derivatives with respect to shared values.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731
         failed = lambda x: jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape)  # noqa: E731
@@ -222,13 +222,13 @@ class Trajectory(Record, Printed):
 
     @of_known_numbers
     def raise_if_failed(self) -> "Trajectory":
-        """Return the trajectory itself; raise a SimulationError with reason and time if it did not reach its
-        end or an event.
+        """Return the trajectory itself; raise a SimulationError with reason and time if it reached
+        neither its end nor an event.
 
-        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; use `nan_if_failed`
-        there.
+        Raises DifferentiationModeError under `jit` and `vmap`, where numbers are
+        unknown; use `nan_if_failed` there.
         """
         if int(self.result) > results.EVENT:
-            raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: "
-                f"{self.message}")
+            raise results.SimulationError(
+                f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
         return self

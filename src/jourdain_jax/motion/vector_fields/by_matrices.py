@@ -30,18 +30,18 @@ from jourdain_jax.scene.scene import Scene
 
 
 class UsualLengths(eqx.Module):
-    """Usual lengths of the rows in scaled speeds, with their rank, and usual lengths of geometric rows and
+    """Usual lengths of constraint rows in scaled speeds, with their rank, and of geometric constraints and
     quaternion norms in the coordinates.
     """
 
     rows: UsualRows
     closures: Float[Array, "closures"]
-    own_speeds: Float[Array, "own_speeds"]  # of the rates of coordinates by each speed of the scene's own
+    own_speeds: Float[Array, "own_speeds"]  # of the coordinate rates by each of the scene's own speeds
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:
-    """Return the usual lengths for the parameters of `scene`; no derivative passes through them."""
-    with jax.ensure_compile_time_eval():  # they are kept from one call to the next, whether inside `jit` or not
+    """Return the usual lengths for the parameters of `scene`, without derivatives."""
+    with jax.ensure_compile_time_eval():  # cached between calls, whether inside `jit` or not
         own_speeds = _of_own_speeds(scene)
         if not is_traced(scene):
             return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), own_speeds)
@@ -49,8 +49,8 @@ def usual_lengths(scene: Scene) -> UsualLengths:
 
 
 def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
-    """Return lengths of rows at states probed with numbers near the class's defaults. They are computed while
-    the motion runs.
+    """Return lengths at states probed with numbers near the class's defaults. They are
+    computed while the motion runs.
     """
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(12, known.random)
@@ -68,15 +68,14 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
 
 
 def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """Return the median over states, or the largest value if half of the values are zero. NaN does not count.
-    """
+    """Return the median over states, or the largest value if half of the values are zero, ignoring NaN."""
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """Return the median size of the rates over probed states. For traced parameters it is a thousand times as
-    large, so that only much larger rates count as infinite.
+    """Return the median size of the rates over probed states. For traced parameters it is a thousand times
+    larger, so that only much larger rates count as infinite.
     """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
@@ -88,26 +87,29 @@ class ByMatrices(VectorField):
     """Shared parts of both states."""
 
     stabilisation: Baumgarte | None
-    usual: UsualLengths  # of the rows
-    inputs_in_rows: bool = static()  # some change in time, and rows depend on them: their rates are needed
-    nonlinear_rows: Indices = static()  # all, where some are nonlinear in the speeds, and none follows from the others
-    cutoff: float | None = static()  # of the projection of speeds: below it rows count as dependent; None: round-off
+    usual: UsualLengths  # of the constraints
+    # whether constraints depend on inputs that change with time, so that rates of inputs are needed
+    inputs_in_rows: bool = static()
+    # all constraints, if some are nonlinear in the speeds and none is redundant
+    nonlinear_rows: Indices = static()
+    # singular values below it count as zero when speeds are projected; None: round-off
+    cutoff: float | None = static()
 
     def now(self, inputs, t):
-        """Return the values of the inputs, and their rates where rows depend on them."""
+        """Return the values of the inputs, and their rates if constraints depend on them."""
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, at: Instant, u) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
-        """Return the motion with these speeds, its accelerations, and the eliminated rows that are nonlinear
-        in the speeds.
+        """Return the motion with these speeds, its accelerations, and the eliminated constraints that
+        are nonlinear in the speeds.
         """
         state = at.scene, at.t, at.y.q, u, at.inputs
         found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
         return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
 
     def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
-        """Add the rates of coordinates by each of the scene's own speeds, which must stay finite, to these
-        rates, pivots and rows.
+        """Add the coordinate rates by each of the scene's own speeds, which must stay finite, to these
+        rates, pivots and constraints.
         """
         power = rate_of_work(at.scene, motion, found, self.of_inputs) if self.with_work else None
         N = jax.lax.stop_gradient(rates_by_own_speeds(at.scene, at.t, at.y.q))
@@ -129,14 +131,14 @@ class ByMatrices(VectorField):
 
 
 class MinimalByMatrices(ByMatrices):
-    """Coordinates and privileged speeds."""
+    """State of coordinates and independent speeds."""
 
     independent: Indices = static()
-    rows: Indices = static()  # that determine the dependent speeds
+    rows: Indices = static()  # constraints that determine the dependent speeds
 
     @property
     def has_pivots(self) -> bool:
-        """The sign of det A_z."""
+        """Return True: the sign of det A_z is monitored."""
         return True
 
     def speeds(self, at: Instant) -> Speeds:
@@ -148,7 +150,7 @@ class MinimalByMatrices(ByMatrices):
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """As `rates`, and the sign of det A_z."""
+        """Return `rates` and the sign of det A_z."""
         known = self._kinematics(at)
         own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
         motion, found = accelerations_of(at.scene, known, at.t, at.y.q, at.inputs) if own else self.solved(at, known.u)[:2]
@@ -160,17 +162,18 @@ class MinimalByMatrices(ByMatrices):
 
 
 class FullByMatrices(ByMatrices):
-    """Coordinates and all speeds."""
+    """State of coordinates and all speeds."""
 
-    # where rows lose rank, a cut-off leaves one out, and branches cross: of their usual size, what round-off decides; None: nothing branches
+    # relative size of rows below which round-off decides between branches that cross at a loss
+    # of rank; None: no branches
     undecided: float | None = static()
-    own_equations: str = static(default="")  # of a solver that takes no accelerations: what it solves instead
+    own_equations: str = static(default="")  # equations that a solver uses instead of accelerations
 
     @property
     def reduction_name(self) -> str:
         if self.own_equations:
             return f"none, {self.own_equations}"
-        return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cut-off {self.cutoff:.0e}"
+        return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
 
     @property
     def needs_pivot(self) -> bool:
@@ -179,12 +182,12 @@ class FullByMatrices(ByMatrices):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether round-off might decide on which branch a motion continues."""
+        """Return whether round-off might decide on which branch a motion continues."""
         return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
     @property
     def near_rank_loss(self) -> bool:
-        """Whether branches may cross on the rows that a step is put back onto."""
+        """Return whether branches may cross on the constraints onto which a step is projected."""
         return self.projects and self.undecided is not None
 
     def speeds(self, at: Instant) -> Speeds:
@@ -196,8 +199,8 @@ class FullByMatrices(ByMatrices):
         return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, eliminated rows, and a number that is 1 if the rows determine the branch of the
-        motion, and -1 if only round-off determines it.
+        """Return `rates`, eliminated constraints, and 1 if the constraints determine the branch of the
+        motion, or -1 if round-off does.
         """
         motion, found, directions = self.solved(at, at.y.v)
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
@@ -206,14 +209,14 @@ class FullByMatrices(ByMatrices):
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
-    """Return the part of each row that is orthogonal to the rows before it."""
+    """Return the part of each row that is orthogonal to the earlier ones."""
     Q, R = jnp.linalg.qr(jax.lax.stop_gradient(A).T)
     return (Q * jnp.diagonal(R)).T
 
 
 def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
-    """Return the full state in place of another form, for a solver that keeps it on the rows by
-    `own_equations`.
+    """Return the full state in place of another form, for a solver that satisfies the
+    constraints by `own_equations`.
     """
     return FullByMatrices(
         independent=None,

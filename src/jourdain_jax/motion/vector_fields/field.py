@@ -1,9 +1,9 @@
 """The integrated state, and the interface of its rates.
 
-    minimal: qdot = N u + nu,  u = C y + c,  ydot = privileged rows of udot     (velocity rows hold exactly)
-    full:    qdot = N u + nu,  udot                                               (kept on the rows by projection)
+    minimal: qdot = N u + nu,  u = C y + c,  ydot = independent rows of udot     (velocity constraints hold exactly)
+    full:    qdot = N u + nu,  udot                                               (projected onto the constraints)
 
-Where some force or row does work that no potential accounts for, that work is integrated beside the state.
+Work of forces or constraints without a potential is integrated along with the state.
 """
 
 import abc
@@ -38,16 +38,16 @@ _STATES = ("auto", "minimal", "full")
 class Formulation(eqx.Module):
     """The equations that `simulate` integrates. The default is chosen for the scene.
 
-    - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto"
-      (default), the minimal one if the privileged speeds are well conditioned over the scene's domain and the
-      rows are linear or affine.
-    - `reduction`: the way to accelerations, a name or an object as in `accelerations` (default: the scene's
+    - `state`: "minimal", coordinates q and independent speeds y; "full", coordinates and all speeds u; "auto"
+      (default), the minimal one if the independent speeds are well conditioned over the scene's domain and the
+      constraints are linear or affine.
+    - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the scene's
       scalar program if there is one).
-    - `stabilisation`: the way to keep start and state on constraints that the integrated state does not
-      satisfy by construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)`
-      adds its terms to the constraints, for comparison; None does nothing.
+    - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by construction:
+      "projection" (default) projects the state after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
+      the constraints, for comparison; None does nothing.
 
-    ValueError for anything else.
+    Raises ValueError for anything else.
 
     **Examples**
 
@@ -70,12 +70,12 @@ class Formulation(eqx.Module):
 
     @property
     def projects(self) -> bool:
-        """Whether the state is put back onto the constraints after each step."""
+        """Return whether the state is projected onto the constraints after each step."""
         return isinstance(self.stabilisation, str)
 
     @property
     def baumgarte(self) -> Baumgarte | None:
-        """The terms added to the rows; None if there are none."""
+        """Return the terms added to the constraints; None without."""
         return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
 
 
@@ -83,7 +83,7 @@ _DEFAULT = Formulation()
 
 
 def as_formulation(formulation) -> Formulation:
-    """Return the formulation, the default one for None; ValueError for anything else."""
+    """Return the formulation, or the default for None; raises ValueError for anything else."""
     if formulation is None:
         return _DEFAULT
     check_kind(
@@ -94,16 +94,16 @@ def as_formulation(formulation) -> Formulation:
 
 
 def reason_for_matrices(structure: Structure, constant: bool) -> str:
-    """Return the reason why a scene with a scalar program is integrated by dense matrices. Return nothing if
-    the program is used. `constant`: whether all inputs are constant.
+    """Return why a scene with a scalar program is integrated by dense matrices; empty if the program is used.
+    `constant`: whether all inputs are constant.
     """
     if structure.rows_of_inputs and not constant:
-        return "velocity rows with inputs that change with time need dense matrices"
+        return "velocity constraints with inputs that change with time need dense matrices"
     return ""
 
 
 class Integrated(eqx.Module):
-    """The integrated state: coordinates, speeds (all, or the privileged ones), tracked work (J)."""
+    """Integrated state: coordinates, speeds (all or the independent ones), and integrated work (J)."""
 
     q: Float[Array, "coordinates *lanes"]
     v: Float[Array, "integrated_speeds *lanes"]
@@ -111,25 +111,27 @@ class Integrated(eqx.Module):
 
     @property
     def rows(self) -> Float[Array, "rows *lanes"]:
-        """All of it, one after the other."""
+        """Return all values as one array."""
         return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
 
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
-        """Return the state from these rows; `form` states how many of them are coordinates and speeds."""
+        """Return the state from these rows; `form` gives the numbers of coordinates and speeds."""
         n, end = form.coordinates, form.q_and_v
         return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
 
 
 class Watched(NamedTuple):
-    """Four quantities: rates; pivots that must keep their signs; directions of rows nonlinear in the speeds,
-    which must not turn round; and a sine that is small near a loss of rank.
+    """Rates; pivots that must keep their signs; directions of constraints nonlinear in the speeds, which must
+    not reverse; and a sine that is small near a loss of rank.
     """
 
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
     directions: Float[Array, "rows speeds *lanes"]
-    sine: PerLane | None = None  # the smallest between a row and those before it; None: rows that are solved for speeds, or none
+    # smallest sine between a constraint and the earlier ones; None if constraints are solved
+    # for speeds, or there are none
+    sine: PerLane | None = None
 
 
 class Instant(NamedTuple):
@@ -139,76 +141,74 @@ class Instant(NamedTuple):
     fixed: tuple  # the scene's part of the rates, computed once per motion
     t: PerLane  # s
     y: Integrated
-    inputs: Any  # values at the time; for `rates` and `rates_and_pivots` from `now`
+    inputs: Any  # values at this time; for `rates` and `rates_and_pivots` from `now`
 
     @property
     def of_program(self) -> tuple[tuple, Any, Any, Any, Any]:
-        """The arguments of a scalar program."""
+        """Return the arguments of a scalar program."""
         return self.fixed, self.t, self.y.q, self.y.v, self.inputs
 
 
 class VectorField(eqx.Module):
     """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
 
-    independent: Indices | None = static()  # privileged speeds; None: the full state
+    independent: Indices | None = static()  # independent speeds; None: the full state
     reduction: Reduction | GibbsAppell
     with_work: bool = static()
     conserves: bool = static()  # T + V is constant along every motion
     projects_positions: bool = static()
     projects_speeds: bool = static()
-    rows_may_contradict: bool = static()  # each other, although the start meets all (`motion/integration.py`)
-    of_inputs: Indices = static()  # numbers of the loads whose potential depends on inputs
+    rows_may_contradict: bool = static()  # although the start satisfies all of them (`motion/integration.py`)
+    of_inputs: Indices = static()  # indices of loads whose potential depends on inputs
     event_names: Labels = static()  # sorted
     stops: tuple[bool, ...] = static()  # whether each event ends the motion
 
     @property
     def name(self) -> str:
-        """ "minimal" or "full"."""
+        """Return "minimal" or "full"."""
         return "full" if self.independent is None else "minimal"
 
     @property
     def reduction_name(self) -> str:
-        """Name of the reduction, as shown in a trajectory."""
+        """Return the name of the reduction, as shown in a trajectory."""
         return getattr(self.reduction, "name", "")
 
     @property
     def lowered(self) -> Lowered | None:
-        """The scalar program of the rates; None: dense matrices."""
+        """Return the scalar program of the rates; None: dense matrices."""
         return None
 
     @property
     def lowers_events(self) -> bool:
-        """Whether stop events are part of the scalar program."""
+        """Return whether stop events are part of the scalar program."""
         return False
 
     @property
     def projects(self) -> bool:
-        """Whether a step puts the state back onto rows."""
+        """Return whether a step projects the state onto constraints."""
         return self.projects_positions or self.projects_speeds
 
     @property
     def needs_pivot(self) -> bool:
-        """Whether a motion ends where a pivot is small or changes its sign. With a full state it continues,
-        with a warning.
+        """Return whether a motion ends when a pivot is small or changes its sign. With a full state
+        it continues, with a warning.
         """
         return True
 
     @property
     @abc.abstractmethod
     def has_pivots(self) -> bool:
-        """Whether a step in which a pivot changes its sign is repeated. Within such a step the state, or a
-        row that constrains it, is lost.
+        """Return whether a step is repeated if a pivot changes its sign, because the state or a
+        constraint is lost within it.
         """
 
     @property
     def near_rank_loss(self) -> bool:
-        """Whether `rates_and_pivots` reports the distance from a loss of rank of the rows onto which steps
-        are projected.
-        """
+        """Return whether `rates_and_pivots` reports the distance of the constraints from a loss of rank."""
         return False
 
     def fixed(self, scene: Scene) -> tuple:
-        """Return what the rates need of the scene: computed once per motion."""
+        """Return the scene's part of the rates, computed once per motion."""
         return ()
 
     def now(self, inputs, t):
@@ -230,14 +230,14 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def speeds(self, at: Instant) -> Speeds:
-        """All speeds."""
+        """Return all speeds."""
 
     @abc.abstractmethod
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
-        """Return all speeds, and a measure of how well the privileged ones determine the others. The measure
-        changes its sign where they do not determine them.
+        """Return all speeds, and a measure of how well the independent ones determine the others. It
+        changes its sign where they do not.
 
-        For the full state the measure is that of its reduction, without a sign, or 1 if it has none.
+        For the full state it is the measure of the reduction, without a sign, or 1 if there is none.
         """
 
     def motion(self, at: Instant) -> Motion:
@@ -245,54 +245,54 @@ class VectorField(eqx.Module):
         return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
 
     def events(self, at: Instant) -> Float[Array, "events *lanes"]:
-        """Return values of the stop events, in the order of their names. Values are for lanes only where
-        `lowers_events` is true.
+        """Return values of the stop events, in the order of their names. Batches are
+        supported only if `lowers_events`.
         """
         return event_values(at.scene, self.motion(at))
 
     def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
-        """Return the result of `event_resets` with the integrated speeds; for lanes only where
-        `lowers_events`.
-        """
+        """Return `event_resets` for the integrated speeds. Batches are supported only if `lowers_events`."""
         found = event_resets(at.scene, self.motion(at), self.of_inputs)
         every = range(len(at.scene.speed_names))
         left_out = [len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent]
         return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
-        """Return the switching contacts at the start of a motion from (q, u): `switching.Begun` as one
-        vector.
+        """Return the switching contacts at the start of a motion from (q, u):
+        `switching.Begun` as one vector.
         """
         return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
-        """Kinetic and potential energy, J; numbers to differentiation."""
+        """Return the kinetic and potential energy, J, without derivatives."""
         at = jax.lax.stop_gradient(at)
         return jnp.stack(energies_at(at.scene, self.motion(at)))
 
     def rates(self, at: Instant) -> Integrated:
-        """Time derivative of the integrated state."""
+        """Return the time derivative of the integrated state."""
         return self.rates_and_pivots(at).rates
 
     @abc.abstractmethod
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates` with what is watched at all stages of a step."""
+        """Return `rates` with the quantities monitored at all stages of a step."""
 
     @abc.abstractmethod
     def project(self, at: Instant) -> Integrated:
-        """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
+        """Return the state projected onto geometric constraints, quaternion norms and (full
+        state) velocity constraints.
+        """
 
 
 class ByProgram(VectorField):
-    """The minimal or the full state of a lowered scene."""
+    """Minimal or full state of a lowered scene."""
 
     program: Lowered = static()
-    affine: bool = static()  # rows are, in the speeds
+    affine: bool = static()  # constraints are affine in the speeds
     native: values.Beside | None = static(default=None)
 
     @property
     def lowered(self) -> Lowered:
-        """The scalar program."""
+        """Return the scalar program."""
         return self.program
 
     @property
@@ -305,30 +305,26 @@ class ByProgram(VectorField):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether an elimination, or the rates of the coordinates, involve a division by numbers that must
-        not vanish.
-        """
+        """Return whether elimination or coordinate rates divide by numbers that must not vanish."""
         return self.pivots > 0 or bool(self.program.directions) or self.near_rank_loss
 
     @property
     def pivots(self) -> int:
-        """Return the number of monitored pivots. With multipliers these are only the pivots of the coordinate
-        rates.
-        """
+        """Return the number of monitored pivots. With multipliers, only the coordinate rates have pivots."""
         return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
 
     @property
     def needs_pivot(self) -> bool:
-        """Whether a small pivot ends a motion: with multipliers a state is all there."""
+        """Return whether a small pivot ends a motion; with multipliers the state stays complete."""
         return self.independent is not None or self.program.by_partition
 
     @property
     def near_rank_loss(self) -> bool:
-        """Whether rows are kept by multipliers, and put back onto."""
+        """Return whether constraints are enforced by multipliers and projection."""
         return self.projects and bool(self.program.squares)
 
     def fixed(self, scene: Scene) -> tuple:
-        """Return what depends on parameters alone."""
+        """Return the values that depend only on parameters."""
         return (self.native or self.program).fixed_values(scene)
 
     def speeds(self, at: Instant) -> Speeds:
@@ -357,7 +353,7 @@ class ByProgram(VectorField):
         return super().resets(at)
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, the pivots of the elimination, and the eliminated rows."""
+        """Return `rates`, the pivots of the elimination, and the eliminated constraints."""
         y = at.y
         qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(*at.of_program, self.with_work)
         pivots = pivots[: self.pivots]
