@@ -211,7 +211,7 @@ PARTS: dict[str, Case] = {
     "jj.rot_x('a')": "angle of a rotation is the text 'a', expected real numbers; give one angle in rad",
     "jj.rot_z(jnp.ones(2))": "angle of a rotation has shape (2,), expected one number",
     "jj.quaternion_to_matrix([1.0, 0.0])": "quaternion has shape (2,), expected (4,); give (w, x, y, z)",
-    "jj.quaternion_from_axis_angle([1.0, 0.0], 0.3)": "axis of a quaternion has shape (2,), expected (3,); give a unit vector",
+    "jj.quaternion_from_axis_angle([1.0, 0.0], 0.3)": "axis of a quaternion has shape (2,), expected (3,); pass a unit vector",
     "jj.rod(o, o, 'long')": "length of a rod is the text 'long', expected real numbers; give it in m",
     "jj.rod(o, eye[0], 0.0)": "length of a rod is 0.0, expected positive numbers; use metres; to keep two points together use `jj.pin`",
     "jj.rod(o, eye[0], -1.0)": "length of a rod is -1.0, expected positive numbers",

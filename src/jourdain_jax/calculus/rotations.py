@@ -145,5 +145,5 @@ def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
     about the unit vector `axis`.
     """
     half = _angle(angle) / 2
-    axis = checked_real(axis, "axis of a quaternion", (3,), advice="give a unit vector")
+    axis = checked_real(axis, "axis of a quaternion", (3,), advice="pass a unit vector")
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])

@@ -1,15 +1,15 @@
-"""The verb `sweep`: run, inspect, resume and export a study described by a file.
+"""Command `sweep`: run, inspect, resume and export a study described by a file.
 
 model = "tilting-disc"                       # a name of `jourdain-jax models`
 t1 = 2.0                                     # s
 samples = 1000
 sampler = "sobol"                            # optional, as are `seed`, `save`, `keep_every`, and the tables `set`, `options`, `correlation`
 
-[set]                                        # parameters that all lanes share
+[set]                                        # parameters shared by all samples
 mass = 1.0
 [vary]                                       # parameters that vary: normal, uniform, log-normal, log-uniform, levels, table
 radius = { normal = [0.5, 0.01] }
-[start]                                      # the same of coordinates and speeds, or numbers
+[start]                                      # same for coordinates and speeds, or numbers
 lean = { uniform = [-0.6, 0.6] }
 spin_rate = -3.0
 [outputs]                                    # end, largest, smallest, largest-magnitude, integral, event-time, happened; optional

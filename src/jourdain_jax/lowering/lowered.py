@@ -79,7 +79,7 @@ class Lowered:
     energies: Nodes  # kinetic and potential
     relations: Nodes  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
     event_relations: Nodes  # further such numbers of the stop events
-    sided: Nodes  # those of both whose branches continue beyond the zero (`lowering/sides.py`)
+    sided: Nodes  # signs whose branches both continue beyond the zero (`lowering/sides.py`)
     jumps: Nodes  # relations at whose zeros rates may jump
     projected_q: Nodes  # coordinates projected onto norms and geometric constraints, one step of Gauss-Newton
     projected_u: Nodes  # all speeds projected onto the constraints; empty if dependent speeds are eliminated
@@ -232,7 +232,7 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers whose signs are monitored during every step: those of the rates and, with
+        """Return the numbers whose signs are monitored during every step: numbers of the rates and, with
         `has_events`, of the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))

@@ -26,7 +26,7 @@ from jourdain_jax.program.graph import Graph, NodeList
 
 @lru_cache(maxsize=64)
 def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lowered:
-    """Return the program with an additional mode and event for each relation, after those of the scene.
+    """Return the program with one more mode and event for each relation, after the scene's modes and events.
 
     `modes`: indices of the inputs that are modes.
     """

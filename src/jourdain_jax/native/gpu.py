@@ -47,7 +47,7 @@ def handler_text() -> str:
     _write_described(w)
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
-        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists stand two words before their pointers
+        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists come two words before
         nothing, attributes = w.null, w.load(frame, 20, "ptr")
         blocks, number = (w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in (_BLOCKS, _KERNEL))
         words, count = w.room(ffi.WORDS * ffi.MOST_BUFFERS, "i64"), w.room(type="i64")

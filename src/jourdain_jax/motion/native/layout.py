@@ -88,14 +88,12 @@ class Form:
 
     @property
     def known(self) -> dict[str, int]:
-        """Return the numbers of rows of the known numbers other than time and state, and of their tangents.
-        """
+        """Return the row counts of known numbers (except time and state) and of their tangents."""
         return {"known": len(self.program.fixed) + len(self.program.inputs), "dknown": sum(map(len, self.moving))}
 
     @property
     def squares(self) -> Indices:
-        """Return the squared part of each constraint normal to the earlier ones, and
-        its squared size, alternating.
+        """Return each constraint's squared part normal to the earlier ones and its squared size, alternating.
         """
         return self.program.squares if self.projects else ()
 

@@ -59,9 +59,9 @@ class Found(NamedTuple):
     end: tuple[Float[Array, "y *lanes"], ...]
     t: Numbers  # of the end, since the start
     log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
-    # rows of the progress after its time, the number of goals reached in order, and the number,
-    rest: Float[Array, "rest *lanes"]
+    # rows of the progress after its time, the number of goals reached in order, then the number,
     # events, energy losses and modes of transitions
+    rest: Float[Array, "rest *lanes"]
 
     @staticmethod
     def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":

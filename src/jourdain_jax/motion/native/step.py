@@ -6,7 +6,7 @@ the search for a stop event.
 
 This is the only source of a step. A writer object provides arithmetic, memory, branches and loops:
 `MachineWriter` (`layout.py`) generates machine code, `ArrayWriter` (`motion/arrays/writer.py`) computes with
-JAX arrays. Events, including those of relations (`lowering/sides.py`), are located by the formulas of
+JAX arrays. Events, including events of relations (`lowering/sides.py`), are located by the formulas of
 `motion/integrators/event_search.py`.
 
 A step ends at every requested time and at every knot of the inputs; the step size before such a shortened

@@ -1,5 +1,5 @@
 """Modules of LLVM IR as functions of JAX; with them, values of graph nodes and quantities
-beside the steps of a motion.
+outside the steps of a motion.
 
 Arguments have no batch axis; under `vmap` the whole batch goes to one call. Many lanes run in
 the widest registers; a single one runs in narrow registers, whose instructions are faster.
@@ -10,7 +10,7 @@ Results do not depend on the width.
 Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
 programs that are too large, JAX differentiates the program run by XLA.
 
-Quantities beside the steps are numbers that depend only on parameters, and all speeds, pivots and energies at
+Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies at
 saved states. XLA computes speeds of few operations (`lowering/lowered.py`). Machine code saves XLA's tracing
 and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
 """
@@ -282,7 +282,7 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Machine code for quantities beside the steps of a program: functions of fixed values, time,
+    """Machine code for quantities outside the steps of a program: functions of fixed values, time,
     coordinates, independent speeds and inputs.
     """
 
@@ -312,7 +312,7 @@ class Beside:
 
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
-    """Return the machine code beside the steps of a program; None if it cannot be compiled."""
+    """Return the machine code outside the steps of a program; None if it cannot be compiled."""
     graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
     # limit of 60_000 operations
     if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
