@@ -9,8 +9,8 @@ and a rate that raises it continues if the value is positive after a first step:
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
 
-Otherwise the step is halved, down to that noise, lest the search find the zero at the start. If the value is
-negative or does not rise at the start, the event has happened there.
+Otherwise the step is halved, down to that noise, so that the search does not find the zero at the start. If
+the value is negative or does not rise at the start, the event has happened there.
 
 All event values are positive at t_b, or rise from zero there, and at least one is not positive at t_a. NaN is
 not positive, so it lies beyond the event. Of the values that are not positive at t_a, the search follows the

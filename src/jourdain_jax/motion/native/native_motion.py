@@ -148,7 +148,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
     if not all(isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels):
-        return "an input is a function of time that holds its own arrays"
+        return "an input is a function of time that captures arrays"
     if isinstance(reason := driven(field.program, inputs), str):
         return reason
     if has_events and not field.lowers_events:
