@@ -135,13 +135,13 @@ OPTIONS |= {
     "calls['Study.run'](parameters=None)": ("TypeError", "what is kept is said by `outputs` and `save`"),
     "calls['simulate'](backend='native', solver=diffrax.Heun())": "'native' cannot integrate `ChaplyginSleigh`: the solver is",
     "calls['rollout'](backend='native', solver=diffrax.Heun())": "'native' cannot integrate `ChaplyginSleigh`: the solver is",
-    "calls['simulate'](backend='native', formulation=jj.Formulation(reduction='kkt'))": "'native' cannot integrate `ChaplyginSleigh`: a reduction",
-    "calls['rollout'](backend='native', formulation=jj.Formulation(reduction='kkt'))": "'native' cannot integrate `ChaplyginSleigh`: a reduction",
-    "calls['simulate'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": "'xla' cannot integrate `ChaplyginSleigh`: a reduction",
-    "calls['rollout'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": "'xla' cannot integrate `ChaplyginSleigh`: a reduction",
+    "calls['simulate'](backend='native', formulation=jj.Formulation(reduction='kkt'))": "'native' cannot integrate `ChaplyginSleigh`: its own reduction",
+    "calls['rollout'](backend='native', formulation=jj.Formulation(reduction='kkt'))": "'native' cannot integrate `ChaplyginSleigh`: its own reduction",
+    "calls['simulate'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": "'xla' cannot integrate `ChaplyginSleigh`: its own reduction",
+    "calls['rollout'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": "'xla' cannot integrate `ChaplyginSleigh`: its own reduction",
     "calls['simulate'](backend='nativ')": "unknown backend `nativ` ... native",
     "calls['rollout'](backend='nativ')": "unknown backend `nativ` ... native",
-    "jax.jit(lambda rtol: calls['simulate'](rtol=rtol).q_end)(1e-8)": "`rtol` is traced, ... give a `solver` too",
+    "jax.jit(lambda rtol: calls['simulate'](rtol=rtol).q_end)(1e-8)": "`rtol` is traced, ... pass a `solver` too",
 }
 
 SOLVERS = {
@@ -248,7 +248,7 @@ PLOTTED = {
     "jj.plot([moved] * 2, 'heading', labels=['one'])": "expected a list of 2 labels, one per motion",
     "jj.plot(moved, 'heading', bands=0.5)": "`bands` is 0.5, expected fractions between 0 and 1",
     "jj.plot(moved, 'heading', bands=(50,))": "`bands` is (50,), expected fractions",
-    "jj.plot(moved, 'heading', axes=[None, None])": "`axes` holds 2 axes for 1 names, expected one for each of heading",
+    "jj.plot(moved, 'heading', axes=[None, None])": "`axes` holds 2 axes for 1 names; pass one for each of heading",
     "jj.plot([moved, sleigh], 'x')": "`plot` was given ... in place 1, expected a motion",
     "jj.plot([], 'x')": "`plot` was given an empty list",
     "jj.show(sleigh)": "`show` was given ... expected a motion from `jj.simulate`",
@@ -284,9 +284,9 @@ SWEEPS = {
     "described_file(samples=0)": "`samples` is 0",
     "described_file(sampler='sobol2')": "did you mean `sobol`",
     "described_file(set=3)": "`set` is an int, expected a table",
-    "described_file(options={'processes': 2})": "`processes` is no entry of",
-    "described_file(options={'outputs': {}})": "`outputs` is no entry of",
-    "described_file(t1=1.0, options={'t1': 2.0})": "`t1` is no entry of",
+    "described_file(options={'processes': 2})": "`processes` is not an entry of",
+    "described_file(options={'outputs': {}})": "`outputs` is not an entry of",
+    "described_file(t1=1.0, options={'t1': 2.0})": "`t1` is not an entry of",
 }
 
 CLASSES = {

@@ -208,9 +208,9 @@ NAMES: dict[str, Case] = {
 }
 
 PARTS: dict[str, Case] = {
-    "jj.rot_x('a')": "angle of a rotation is the text 'a', expected real numbers; give one angle in rad",
+    "jj.rot_x('a')": "angle of a rotation is the text 'a', expected real numbers; pass one angle in rad",
     "jj.rot_z(jnp.ones(2))": "angle of a rotation has shape (2,), expected one number",
-    "jj.quaternion_to_matrix([1.0, 0.0])": "quaternion has shape (2,), expected (4,); give (w, x, y, z)",
+    "jj.quaternion_to_matrix([1.0, 0.0])": "quaternion has shape (2,), expected (4,); pass (w, x, y, z)",
     "jj.quaternion_from_axis_angle([1.0, 0.0], 0.3)": "axis of a quaternion has shape (2,), expected (3,); pass a unit vector",
     "jj.rod(o, o, 'long')": "length of a rod is the text 'long', expected real numbers; give it in m",
     "jj.rod(o, eye[0], 0.0)": "length of a rod is 0.0, expected positive numbers; use metres; to keep two points together use `jj.pin`",
@@ -332,7 +332,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, 3.0, t1=1.0)": "`start` is a float, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None",
     "jj.simulate(b, jj.start(sleigh), t1=0.1)": "`q` of `Bead` has shape (3,), expected (2,)",
     "jj.simulate(b, jax.tree.map(lambda x: jnp.stack([x, x]), rest), t1=0.1)": "`start` holds a batch of shape (2,); use `jj.rollout`",
-    "jj.simulate(b, rest, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite; give a finite `t1` different from `t0`",
+    "jj.simulate(b, rest, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite; pass a finite `t1` different from `t0`",
     "jj.simulate(b, rest, t0=1.0, t1=1.0)": "the span from t0 = 1.0 to t1 = 1.0 s is empty",
     "jj.simulate(b, rest, t1=inf)": "the span from t0 = 0.0 to t1 = inf s is empty or not finite",
     "jj.simulate(b, rest, t1='later')": "`t1` is the text 'later', expected real numbers; give one time in s",
@@ -344,9 +344,9 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, rest, ts=[0.0, nan])": "`ts` must be finite and strictly increasing",
     "jj.simulate(b, rest, ts=[0.0, 2.0], t1=1.0)": "`ts` runs from 0.0 to 2.0 s, outside the span from t0 = 0.0 to t1 = 1.0 s",
     "jj.simulate(b, rest, ts=[1.0, 0.5], t1=2.0)": "`ts` runs from 1.0 to 0.5 s, outside the span from t0 = 0.0 to t1 = 2.0 s or in the opposite direction",
-    "jj.simulate(b, {}, t1=1.0, rtol=nan)": "`rtol` is nan, expected a positive finite number; give a tolerance such as 1e-8",
+    "jj.simulate(b, {}, t1=1.0, rtol=nan)": "`rtol` is nan, expected a positive finite number; pass a tolerance such as 1e-8",
     "jj.simulate(b, {}, t1=1.0, options={'rtol': 1e-8})": "`options` is a dict, expected `jj.Options(...)`",
-    "jj.simulate(b, {}, t1=1.0, rtol='tight')": "`rtol` is the text 'tight', expected real numbers; give one number, such as 1e-8",
+    "jj.simulate(b, {}, t1=1.0, rtol='tight')": "`rtol` is the text 'tight', expected real numbers; pass one number, such as 1e-8",
     "jj.simulate(b, {}, t1=1.0, atol=-1)": "`atol` is -1, expected a positive finite number",
     "jj.simulate(b, {}, t1=1.0, atol=[1e-8, 1e-8])": "`atol` has shape (2,), expected one number",
     "jj.simulate(b, {}, t1=1.0, max_steps=0)": "`max_steps` is 0, expected a whole number of at least 1",
@@ -360,7 +360,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation('minimum'))": "unknown state form `minimum`; did you mean `minimal`?",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(None))": "unknown state form `None`; Valid names: `auto`, `minimal`, `full`.",
     "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, formulation=jj.Formulation('minimal'))": (
-        "the rows of `Described` are nonlinear in the speeds, so there is no minimal state; use jj.Formulation('full')"
+        "constraints of `Described` are nonlinear in the speeds, so there is no minimal state; use jj.Formulation('full')"
     ),
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(reduction='QR'))": "unknown reduction `QR`; Valid names: `privileged`, `qr`",
     "jj.Formulation(stabilisation=3.0)": '`stabilisation` is a float, expected "projection", `jj.Baumgarte(alpha, beta)` or None',
@@ -373,7 +373,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, inputs={'pull': 1.0})": "`Bead` has no input `pull`; did you mean `push`?",
     "jj.simulate(b, {}, t1=1.0, inputs={'push': 'hard'})": "input `push` of `Bead` is the text 'hard', expected real numbers; give a number, a",
     "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: jnp.stack([t, t])})": "input `push` of `Bead` returned an array of shape (2,), expected",
-    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: None})": "input `push` of `Bead` returned `None`, expected one number; give a function of one",
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: None})": "input `push` of `Bead` returned `None`, expected one number; pass a function of one",
     "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda: 1.0})": "input `push` of `Bead` cannot be called with a time",
     "ended(b, {}, inputs={'push': nan})": ("result 4", "the accelerations are not finite near the last time"),
     "jj.simulate(described(events=lambda self, m: {'out': m.q.x < 1.0}), {}, t1=0.1)": "event `out` of `Described` is of type bool, expected real",
@@ -396,7 +396,7 @@ BATCHES: dict[str, Case] = {
         "parameter `mass` is an object, expected real numbers; pass an array with one entry per lane; to vary a field that is a module"
     ),
     "jj.rollout(b, {'x': ['a', 'b']}, t1=0.1)": "start `x` is a list, expected real numbers",
-    "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": "lanes differ in number: start `x` has 2, start `y` has 1; give arrays of one length",
+    "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": "lanes differ in number: start `x` has 2, start `y` has 1; pass arrays of one length",
     "jj.rollout(b, {'z': [1.0, 2.0]}, t1=0.1)": "scene `Bead` has no coordinate or speed `z`",
     "jj.rollout(b, rest, t1=0.1)": "`starts` has no axis of lanes; pass an array with one entry per lane",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters=[1.0], t1=0.1)": "`parameters` is a list, expected a dictionary by name",
@@ -407,7 +407,7 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=1.5, t1=0.1)": "`chunk` is 1.5, expected a whole number",
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite",
     "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": "`ts` must be finite and strictly increasing",
-    "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": "`diagnose` was given a Rollout, expected a `Trajectory`; for a rollout give one",
+    "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": "`diagnose` was given a Rollout, expected a `Trajectory`; for a rollout pass one",
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": "`solver` is the text 'tsit5', expected a solver object; write `diffrax.Tsit5()`",
     "lanes_ended({'x_rate': [1.0, nan]})": ("result 8", "the start is not finite; check where its values were computed: lanes 1"),
     "lanes_ended({'x_rate': [1.0, 2.0]}, parameters={'mass': [1.0, -1.0]})": ("result 7", "a parameter is not finite or has the wrong sign (`mass`): lanes 1"),
@@ -417,10 +417,10 @@ BATCHES: dict[str, Case] = {
 }
 
 FILES: dict[str, Case] = {
-    "jj.load_trajectory('nowhere.npz', Bead)": "nowhere.npz: cannot be read (No such file or directory); give the path of a trajectory file written by `save`",
-    "jj.load_trajectory('half.npz', Bead)": "`half.npz`: is no trajectory file written by `save` (File is not a zip file)",
-    "jj.load_trajectory('empty.npz', Bead)": "`empty.npz`: is no trajectory file written by `save` (File is not a zip file)",
-    "jj.load_trajectory('text.npz', Bead)": "`text.npz`: is no trajectory file written by `save`",
+    "jj.load_trajectory('nowhere.npz', Bead)": "nowhere.npz: cannot be read (No such file or directory); pass the path of a trajectory file written by `save`",
+    "jj.load_trajectory('half.npz', Bead)": "`half.npz`: not a trajectory file written by `save` (File is not a zip file)",
+    "jj.load_trajectory('empty.npz', Bead)": "`empty.npz`: not a trajectory file written by `save` (File is not a zip file)",
+    "jj.load_trajectory('text.npz', Bead)": "`text.npz`: not a trajectory file written by `save`",
     "jj.load_trajectory('.', Bead)": ".: cannot be read (Is a directory)",
     "jj.load_trajectory('a\\0b', Bead)": "`path` is the text 'a\\x00b', expected the name of a file or folder",
     "jj.load_trajectory('x' * 5000, Bead)": "xx...: cannot be read (File name too long)",
@@ -433,7 +433,7 @@ FILES: dict[str, Case] = {
     "jj.save(run, 'a\\0b')": "expected the name of a file or folder",
     "jj.save(run, '')": "cannot write ``: it is a folder",
     "jj.save(run, 'x' * 5000)": "File name too long",
-    "jj.build(b).save('.')": "cannot write `.`: it is a folder; give the name of a file in it",
+    "jj.build(b).save('.')": "cannot write `.`: it is a folder; pass the name of a file in it",
     "jj.show(run, 3)": "`path` is an int, expected the name of a file or folder",
     "jj.load_trajectory(3.5, Bead)": "`path` is a float, expected the name of a file",
     "jj.load_trajectory('run.npz', 3)": "`scene` is an int, expected the class of the simulated scene, or a scene of that class",
@@ -446,18 +446,18 @@ FILES: dict[str, Case] = {
         "`later.npz` has format 9, expected 1; read it with the version of jourdain-jax that wrote it"
     ),
     "jj.load_trajectory(rewritten('bare.npz', solver=None), Bead)": "`bare.npz` lacks `solver`; it is damaged or was not written by `save`",
-    "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": "`headless.npz`: is no trajectory file written by `save` (",
-    "jj.load_trajectory(rewritten('broken.npz', header=np.array('{')), Bead)": "`broken.npz`: is no trajectory file written by `save` (Expecting property name",
+    "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": "`headless.npz`: not a trajectory file written by `save` (",
+    "jj.load_trajectory(rewritten('broken.npz', header=np.array('{')), Bead)": "`broken.npz`: not a trajectory file written by `save` (Expecting property name",
     "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": "`listed.npz` has an invalid header",
     "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": "`minus.npz` does not match its digest",
     "jj.save(run, 'nowhere/run.npz')": "cannot write `nowhere/run.npz`: there is no folder `nowhere`; create it first",
-    "jj.save(run, '.')": "cannot write `.`: it is a folder; give the name of a file in it",
+    "jj.save(run, '.')": "cannot write `.`: it is a folder; pass the name of a file in it",
     "jj.save(run, 3.5)": "`path` is a float, expected the name of a file",
     "jj.save(b, 'b.npz')": "`save` was given a Bead, expected a `Trajectory` from `jj.simulate`",
     "jj.save(lanes.lanes, 'lanes.npz')": (
         "`save` takes one motion, but was given a batch of shape (2,); for one batch axis, save `jj.Rollout(batch)`"
     ),
-    "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; for a rollout give one "
+    "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; for a rollout pass one "
     "lane: jj.animate(rollout.lane(0), 'lane-0.gif')",
     "jj.animate(run, 'run.mp4')": "cannot write `run.mp4`: an animation is a .gif file",
     "jj.animate(run, 'run.gif', frames=0)": "`frames` is 0, expected a whole number of at least 1",
@@ -465,7 +465,7 @@ FILES: dict[str, Case] = {
     "jj.plot(run, 'x', path='nowhere/x.png')": "cannot write `nowhere/x.png`: there is no folder `nowhere`; create it first",
     "jj.plot(run, 'z')": ("UnknownNameError", "`z` cannot be plotted; Valid names: `x`, `y`, `x_rate`, `y_rate`, `energy`"),
     "jj.plot(b, 'x')": "`plot` was given a Bead, expected a motion from `jj.simulate` or a rollout",
-    "read_bicycle('nowhere.txt')": "nowhere.txt: cannot be read (No such file or directory); give the path of a bicycle parameter file",
+    "read_bicycle('nowhere.txt')": "nowhere.txt: cannot be read (No such file or directory); pass the path of a bicycle parameter file",
     "read_bicycle('.')": ".: cannot be read",
     "read_bicycle('empty.npz')": "empty.npz: the file is empty. Expected lines `name = value`",
     "read_bicycle('run.npz')": "run.npz: not UTF-8 text",
@@ -503,7 +503,7 @@ ANALYSIS: dict[str, Case] = {
 
 COMMANDS: dict[str, Case] = {
     "shell('sweep status nothing')": ("exit 2", "`nothing` does not exist"),
-    "shell('sweep nothing.toml')": ("exit 2", "nothing.toml: cannot be read (No such file or directory); give the path of a TOML file"),
+    "shell('sweep nothing.toml')": ("exit 2", "nothing.toml: cannot be read (No such file or directory); pass the path of a TOML file"),
     "shell('sweep exprot x.zarr')": ("exit 2", "did you mean `export`"),
     "shell('sweep status')": ("exit 2", "takes one folder"),
     "shell('')": ("exit 2", "the following arguments are required: VERB"),
@@ -530,7 +530,7 @@ COMMANDS: dict[str, Case] = {
     "shell('simulate skate --rtol -1')": ("exit 2", "`rtol` is -1, expected a positive finite number"),
     "shell('simulate skate --atol nan')": ("exit 2", "`atol` is nan, expected a positive finite number"),
     "shell('simulate skate --out nowhere/run.npz')": ("exit 2", "there is no folder `nowhere`"),
-    "shell('simulate skate --out .')": ("exit 2", "cannot write `.`: it is a folder; give the name of a file in it"),
+    "shell('simulate skate --out .')": ("exit 2", "cannot write `.`: it is a folder; pass the name of a file in it"),
     "shell('simulate skate --animate run.mp4')": ("exit 2", "cannot write `run.mp4`: an animation is a .gif file"),
     "shell('simulate skate --plot run.xyz')": ("exit 2", "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file; matplotlib cannot write `xyz`"),
     "shell('bicycle')": ("exit 2", "the following arguments are required: FILE"),

@@ -94,7 +94,7 @@ def test_a_derivative_across_a_jump_warns_where_no_step_ends_there():
     for slope in (jax.grad(dense), jax.jacfwd(dense)):
         (said,) = warned(slope, -1.0)
         assert "`Pushed`" in said
-        assert "omit the shift of the time of the jump" in said
+        assert "omit the shift of the jump's time" in said
     assert len(warned(jax.grad(dense), -0.1)) == 1  # whether the jump is met is not seen
 
 

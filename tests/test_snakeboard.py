@@ -46,7 +46,7 @@ def test_the_default_passes_wherever_a_step_ends_near_the_loss_of_rank():
         shifted = times + beyond * (np.arange(9) == 4)
         motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12)
         assert motion.result == results.SUCCESS, beyond
-        assert "cut-off 1e-08" in str(motion.reduction)
+        assert "cutoff 1e-08" in str(motion.reduction)
         assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance("closed_form"), beyond
 
 

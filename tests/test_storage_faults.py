@@ -232,7 +232,7 @@ def changed(**parameters):
         (changed(spring=jj.parameter(0.0, unit="N/m")), "lacks the parameter `spring` of `Belt`"),
         (changed(drag=jj.parameter(0.0, unit="N s/mm")), "the parameter `drag` in N s/m, but `Belt` takes it in N s/mm; pass the class as it was"),
         (OnBelt, "of `Belt`, expected `OnBelt`; pass its class"),
-        (type("Belt", (OnBelt,), {}), "has a parameter `drag` that `Belt` has not"),
+        (type("Belt", (OnBelt,), {}), "has a parameter `drag` that `Belt` lacks"),
         (
             type("Belt", (Belt,), {"coordinates": jj.coordinates("x z"), "domain": {}}),
             "the file holds the coordinates x, y, but `Belt` has x, z; pass the class as it was",

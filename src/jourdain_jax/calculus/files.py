@@ -102,14 +102,14 @@ def whole_number(text: str, what: str, high: int) -> int:
 
 def parsed(parse: Callable, content, source: str, what: str):
     """Return `parse(content)`. Any error of the parser becomes a ValueError that names the source and the
-    expected format `what`.
+    expected format `what`, such as "valid XML".
     """
     try:
         return parse(content)
     except RecursionError:
         raise _too_deep(source) from None
     except Exception as error:
-        raise ValueError(f"{source}: not valid {what} "
+        raise ValueError(f"{source}: not {what} "
             f"({shortened(error, 200) or type(error).__name__})") from None
 
 

@@ -86,7 +86,7 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
 
     Raises ValueError for a concrete zero quaternion; a traced one gives NaN.
     """
-    quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
+    quaternion = checked_real(quaternion, "quaternion", (4,), advice="pass (w, x, y, z)")
     if not holds(np.any, quaternion):
         raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; pass (w, x, y, z) of nonzero "
             "length, such as (1, 0, 0, 0) for no rotation")

@@ -92,7 +92,7 @@ def _sweep(options) -> bool:
 
 
 def _run(text: str, source: str, out: str, options) -> bool:
-    asked = parsed(tomllib.loads, text, source, "TOML")
+    asked = parsed(tomllib.loads, text, source, "valid TOML")
     check_depth(asked, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), source)
     study, how = described_study(asked, options.memory)
     try:

@@ -186,7 +186,7 @@ class Store:
 
     def _json(self, name: str) -> dict:
         """The dictionary in a file of JSON."""
-        found = parsed(json.loads, self._read(name), f"{self.path}/{name}", "JSON")
+        found = parsed(json.loads, self._read(name), f"{self.path}/{name}", "valid JSON")
         if not isinstance(found, dict):
             raise self._damaged(name)
         return found

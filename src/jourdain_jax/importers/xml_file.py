@@ -158,7 +158,7 @@ class XmlFile:
 
 
 def _parsed(content: str | bytes, source: str) -> Element:
-    root = parsed(ElementTree.fromstring, content, source, "XML")
+    root = parsed(ElementTree.fromstring, content, source, "valid XML")
     check_depth(root, list, source)
     return root
 

@@ -232,8 +232,8 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
     """Return header and arrays of a file of this kind, and the class of its scene."""
-    what = f"{kind} file written by `save`"
-    with opened(path, f"a {what}") as file:
+    what = f"a {kind} file written by `save`"
+    with opened(path, what) as file:
         arrays = parsed(_unpacked, file, f"`{path}`", what)
     header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
     check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
