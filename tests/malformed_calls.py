@@ -233,7 +233,7 @@ IMPOSSIBLE = {
         "moves with another body, but its `velocity` and"
     ),
     "jj.structure_of(OnLift(lambda q, up: jj.Plane(up)))": (
-        "the plane of contact `back` of `OnLift` moves along its normal ... where coordinates move it, omit the contact"
+        "the plane of contact `back` of `OnLift` moves along its normal ... if coordinates move it, omit the contact"
     ),
     "jj.structure_of(OnLift(lambda q, up: jj.Plane(tilt=q.rise)))": "the plane of contact `back` of `OnLift` moves along its normal",
 }
@@ -296,13 +296,13 @@ CLASSES = {
     "described(domain={'x': (0.0, jnp.inf)})": "for `x`, expected two finite numbers",
     "described(domain=('x', 0.0, 1.0))": "`domain` of `Described` is a tuple, expected a dictionary",
     "described(example={'x_rat': 1.0})": "`example` of `Described` names `x_rat`, which is not a coordinate or speed; did you mean `x_rate`",
-    "described(speeds=jj.speeds('a b c'))": "`Described` has speeds of its own (a, b, c) but ... ; define `coordinate_rates(self, t, q, u)`",
+    "described(speeds=jj.speeds('a b c'))": "`Described` has its own speeds (a, b, c) but ... ; define `coordinate_rates(self, t, q, u)`",
     "described(speeds='a b')": "`speeds` of `Described` is the text 'a b', expected names; write speeds = jj.speeds('a b c')",
     "described(inputs=('drive',))": "`inputs` of `Described` is a tuple, expected names; write inputs = jj.inputs",
     "described(speeds=jj.speeds('x w'), coordinate_rates=lambda self, t, q, u: u.array)": (
         "has a coordinate and a speed named `x`; rename one of them"
     ),
-    "described(mass=5.0)": "`Described` sets `mass`, a field of a class that it extends, without an annotation, which has no effect",
+    "described(mass=5.0)": "`Described` sets `mass`, a field of a base class, without an annotation, which has no effect",
     "described(priviledged=('x_rate',))": "`Described` has an attribute `priviledged`, which nothing calls; did you mean `privileged`?",
     "described(exemple=property(lambda self: {}))": "has a method `exemple`, ... did you mean `example`?",
     "jj.simulate(Bare(), {}, t1=1.0)": ("NotImplementedError", "define `bodies(self, t, q)`"),

@@ -176,8 +176,8 @@ DENSITIES: dict[str, str] = {
 }
 
 INERTIAS: dict[str, str] = {
-    "jj.log_cholesky([0.1, 0.1, 0.3])": "no body with a thickness has the principal moments",
-    "jj.log_cholesky([-0.1, 0.1, 0.1])": "no body with a thickness",
+    "jj.log_cholesky([0.1, 0.1, 0.3])": "no body of nonzero thickness has the principal moments",
+    "jj.log_cholesky([-0.1, 0.1, 0.1])": "no body of nonzero thickness",
     "jj.log_cholesky([1.0, 2.0])": "has shape (2,), expected (3, 3) or (3,)",
     "jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]))": "not symmetric; give Ixy = Iyx",
     "jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True)": "Ixy = 0.1 and Iyz = 0",

@@ -228,7 +228,7 @@ def test_a_set_in_yaml_is_read(tmp_path, text, ending):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("parameterization: benchmark", "parameterization: principal", "line 1: parameterization `principal`, expected that of the benchmark"),
+        ("parameterization: benchmark", "parameterization: principal", "line 1: parameterization `principal`, expected the benchmark's"),
         ("  c: ", "  cc: ", "unknown parameter `cc`; did you mean `c`"),
         ("  c: ", "  c = ", "expected `name: value`"),
         ("values:\n", "values:\n  c: 0.1\n", "`c` was already given in line 6"),
@@ -355,7 +355,7 @@ READINGS = shipped_measurements()["Browser"].read_text()
         (READINGS.replace("w = 1.121+/-0.002", "w = 1.1, long"), "reading of `w` is `long`, expected a number"),
         (READINGS.replace("w = 1.121+/-0.002", "w = 1.1+/--0.1"), "sigma of `w` is -0.1"),
         (READINGS + "w = 1.2\n", "`w` was already given in line"),
-        (READINGS.replace("TcB1 = 1.7", "TcB1 = 0.7"), "these readings belong to no bicycle: `IByy` (rear frame moment of inertia about y) must not"),
+        (READINGS.replace("TcB1 = 1.7", "TcB1 = 0.7"), "no bicycle has these readings: `IByy` (rear frame moment of inertia about y) must not"),
     ],
 )
 def test_bad_files_are_refused_by_name(text, told, tmp_path):

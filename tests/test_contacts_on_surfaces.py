@@ -204,7 +204,7 @@ def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
         ),
         (
             lambda scene, pose: jj.Sphere(0.09 * scene.size, side="inside"),
-            "a ball is larger than the cylinder or sphere that it rolls in",
+            "a ball is larger than its hollow cylinder or sphere",
         ),
     ],
     ids=["normal", "room"],
@@ -240,7 +240,7 @@ class OnACusp(BallInBowl):
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; a ball must be smaller"),
+        (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; make a ball smaller"),
         (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a length that differs from 1)"),
     ],
 )

@@ -186,7 +186,7 @@ def test_states_near_the_example_serve_where_none_was_found_at_random():
     class Shown(Hidden):
         example = {"x": 0.3, "y": 0.2}
 
-    with pytest.raises(ValueError, match=r"no admissible state .* or an `example` on the rows"):
+    with pytest.raises(ValueError, match=r"no admissible state .* or an `example` on the constraints"):
         structure_of(Hidden())
     assert structure_of(Shown()).degrees_of_freedom == 2
     assert jj.start(Shown(), x=0.3, y=0.2, y_rate=1.0).residual < 1e-12

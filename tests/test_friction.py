@@ -340,7 +340,7 @@ class Kept(Ball):
 
 
 def test_bad_contacts():
-    with pytest.raises(ValueError, match="cannot leave the ground; give the body coordinates of its own for its height, and write height="):
+    with pytest.raises(ValueError, match="cannot leave the ground; give the body a coordinate for its height, and write height="):
         Kept()
     with pytest.raises(ValueError, match=r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative"):
         jj.simulate(Ball(friction=-0.1), SLIDING, t1=0.1)
@@ -348,7 +348,7 @@ def test_bad_contacts():
         jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
     with pytest.raises(ValueError, match=r"contacts with friction, which cannot run back in time from t0 = 0\.0 to t1 = -1\.0 s"):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
-    with pytest.raises(ValueError, match="`linearize` needs contacts that roll and rows that hold, but `cloth` of `Ball` may slip"):
+    with pytest.raises(ValueError, match="`linearize` needs contacts that roll and constraints that hold, but `cloth` of `Ball` may slip"):
         jj.linearize(Ball(), {"z": 0.0285})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body starts below the ground" in below.message
@@ -453,7 +453,7 @@ def test_a_block_sticks_and_slips_on_a_belt():
     slope, value = with_value(jax.jacfwd, period)(0.4)
     assert_allclose(value, 1.360846391399, rtol=1e-10)
     assert_allclose(slope, 4.14018082448, rtol=1e-7)
-    with pytest.raises(ValueError, match=r"static friction of contact `belt` of `Belt` is 0\.2, expected at least that of sliding, 0\.25"):
+    with pytest.raises(ValueError, match=r"static friction of contact `belt` of `Belt` is 0\.2, expected at least the coefficient of sliding, 0\.25"):
         jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)
 
 

@@ -255,7 +255,7 @@ CHANGED = {
         r"an angular velocity that disagrees with its orientation",
     ),
     "inertia-that-changes": (systems.double_pendulum, lambda kane: _inertia_in(kane, kane._inertial), r"body `rod 2` in its own frame `B` changes in time"),
-    "inertia-in-a-loose-frame": (systems.double_pendulum, lambda kane: _inertia_in(kane, LOOSE), r"body `rod 2` is stated in a frame that has no orientation"),
+    "inertia-in-a-loose-frame": (systems.double_pendulum, lambda kane: _inertia_in(kane, LOOSE), r"body `rod 2` is stated in a frame without orientation"),
     "two-bodies-of-a-name": (systems.double_pendulum, lambda kane: setattr(kane, "_bodylist", [kane.bodies[0]] * 2), r"two bodies are called `rod 1`"),
 }
 BAD |= {name: (functools.partial(_changed, system, change), message) for name, (system, change, message) in CHANGED.items()}

@@ -234,11 +234,11 @@ WRONG = {  # the code's text in a lane, the text of the error alone
     "ball=0.6": ("no positive length: the radius of the ground less that of the ball of contact `top`", "`top` .* finds no point where body and ground touch"),
     "pipe=-0.5": ("no positive length: the radius of the ground of contact `top`", "`top` .* finds no point where body and ground touch"),
     "slope=0.1": ("a body off its ground: contact `rim`", "at a probed state its body is"),
-    "tilting=0.3": ("a plane that moves in another way than is stated: the plane of contact `rim`", "at 0 m/s by `origin`"),
+    "tilting=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", "at 0 m/s by `origin`"),
     "carried=1.0": ("a ground that another body carries: the ground of contact `top`", "moves with another body"),
     "axis=2.0": ("no unit vector: the axis of contact `top`", "the axis of contact `top` .* from 1 by 1,"),
     "normal=1.1": ("no unit vector: the normal of contact `rim`", r"normal of contact `rim` .* from 1 by 0\.1"),
-    "rise=0.3": ("a plane that moves in another way than is stated: the plane of contact `rim`", r"at 0 m/s by `origin` .* but at 0\.3 m/s"),
+    "rise=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", r"at 0 m/s by `origin` .* but at 0\.3 m/s"),
     "down=(0, 0, -2)": ("no unit vector: the direction of gravity in load 1", "gravity in load 1 .* differs from 1 by 1,"),
 }
 
@@ -300,7 +300,7 @@ class Led(jj.Scene):
 LED = {
     "slope": "a body off its ground: contact `rim`",
     "lift": "a body off its ground: contact `rim`",
-    "swing": "a plane that moves in another way than is stated: the plane of contact `tip`",
+    "swing": "a plane that contradicts its stated motion: the plane of contact `tip`",
     "stretch": "an orientation that is no rotation: body `rod`",
 }
 

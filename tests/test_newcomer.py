@@ -61,9 +61,9 @@ def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says(page):
 
 
 def test_a_scene_that_is_a_number_in_a_small_part_of_space_asks_for_a_domain():
-    with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .*`x` from -3.2 to 3.2.* state a `domain`"):
+    with pytest.raises(ValueError, match=r"the constraints of `Bowl` are NaN at all of .*`x` from -3.2 to 3.2.* state a `domain`"):
         jj.build(bowl_without_domain())
-    with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .* state a `domain`"):
+    with pytest.raises(ValueError, match=r"the constraints of `Bowl` are NaN at all of .* state a `domain`"):
         jj.sample_states(bowl_without_domain(), 4)
 
 

@@ -245,7 +245,7 @@ WITHOUT_JERK = {
 
 @pytest.mark.parametrize("way", JERKS)
 def test_a_velocity_row_that_jumps_in_time_is_refused(way):
-    with pytest.raises(ValueError, match=r"row `grip` of `OnBelt` jumps at t = .* s: speeds would have to jump"):
+    with pytest.raises(ValueError, match=r"constraint `grip` of `OnBelt` jumps at t = .* s: speeds would have to jump"):
         jj.simulate(OnBelt(way=JERKS[way]), {"x_rate": 1.0}, t1=2.0)
 
 

@@ -123,7 +123,7 @@ def test_parameters_without_defaults_may_be_traced():
 
 def test_a_traced_parameter_without_default_that_fits_no_state_of_the_domain_is_refused():
     assert jj.structure_of(SmallLoop(radius=0.02)).rank == 1
-    with pytest.raises(ValueError, match="replaced by numbers near their defaults, or near 1 if there is no default: give defaults near"):
+    with pytest.raises(ValueError, match="replaced by numbers near their defaults, or near 1 without a default: give defaults near"):
         jax.jit(lambda radius: jj.structure_of(SmallLoop(radius=radius)).rank)(0.02)
 
 

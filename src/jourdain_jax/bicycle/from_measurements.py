@@ -6,10 +6,11 @@
     swung on a level axle       (I + m l^2) angle'' + m g l sin angle = 0        T = 2 pi sqrt((I + m l^2) / (m g l))
     twisted on an upright rod   (n . I n) twist'' + k twist = 0                  T = 2 pi sqrt((n . I n) / k)
 
-n is the direction of the rod in axes of the part; the mass centre of a hung part lies below the rod. Of more than three hangings, and of three upright lines
-through one point, the sum of squares is smallest. Readings are independent; parameters that come of the same readings are not: all inertias share the
-stiffness of the rod, and the place of a mass centre its moment of inertia about y.
-Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
+n is the direction of the rod in axes of the part; the mass centre of a hung part lies below the rod. More
+hangings or plumb lines than unknowns are fitted by least squares. Readings are independent, but parameters
+from shared readings are not: all inertias share the stiffness of the rod, and the inertia about y depends on
+the mass centre. Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control
+of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
 import os
@@ -38,14 +39,14 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
         bicycle.values["IBxx"], bicycle.covariance        # kg m^2; in the order of the names in `values`
 
     Derivatives of the parameters with respect to the readings are exact; covariances are of first order in
-    the sigmas of the readings (see the head of the module). A mass centre is the point with the least sum of
+    the sigmas of the readings (see the module docstring). A mass centre is the point with the least sum of
     squared distances from the plumb lines through it. The published values are means over all pairs of lines
-    instead, in which nearly parallel lines weigh as much as others.
+    instead, in which nearly parallel lines have the same weight as others.
 
     **Arguments:** `path`, of a file of readings (`readings.py` lists its content), or the name of a shipped
     one (`shipped_measurements`). **Returns:** a `MeasuredBicycle`, with a warning for plumb lines that miss
-    the mass centre by more than their sigmas allow. **Raises** ValueError: an unreadable or incomplete file,
-    an unknown name, and readings that belong to no bicycle.
+    the mass centre by more than their sigmas allow. **Raises** ValueError for an unreadable or incomplete
+    file, an unknown name, and readings that no bicycle can have.
     """
     if isinstance(path, str) and not os.path.exists(path) and not Path(path).suffix:
         known = shipped_measurements()
@@ -58,8 +59,10 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
     jacobian = np.array([slopes[name] for name in (*PARAMETER_NAMES, *_misses(readings))]) * sigmas
     values = {name: float(found[name]) for name in PARAMETER_NAMES}
     if broken := [sentence for sentence, is_broken in violations(values).items() if is_broken]:
-        raise ValueError(f"{readings.path}: these readings belong to no bicycle: {'; '.join(broken)}. Look "
-            "for a reading in another unit, or of another part.")
+        raise ValueError(
+            f"{readings.path}: no bicycle has these readings: {'; '.join(broken)}. Look for a reading in "
+            "another unit, or of another part."
+        )
     parameters, misses = np.split(jacobian, [len(PARAMETER_NAMES)])
     covariance = parameters @ parameters.T
     return MeasuredBicycle(
@@ -88,7 +91,7 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
         # where sigmas are zero, so is the scale
         ratio = np.divide(distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0)
         worst = int(np.argmax(ratio))
-        if ratio[worst] > 3:  # standard deviations, by which lines may miss a mass centre without a word
+        if ratio[worst] > 3:  # standard deviations by which lines may miss a mass centre without a warning
             warnings.append(
                 f"upright lines through the hung part {part} miss its mass centre by up to "
                 f"{1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: these sigmas are too small, or a "
@@ -99,8 +102,8 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
 
 @compiled_quickly
 def _with_slopes(means: Values, hangings: tuple[tuple[str, Indices], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
-    """Return parameters, distances of plumb lines, and their derivatives with respect to each reading, in the
-    order of the means.
+    """Return parameters, distances of plumb lines, and the derivatives of both with respect to each reading,
+    in the order of the means.
     """
     found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
@@ -152,8 +155,8 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
 
 
 def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
-    """Return the vector from the suspension point of the handlebar to the front axle, (x, z), m; both lay on
-    a table, with the steer axis level.
+    """Return the vector from the suspension point of the handlebar to the front axle, (x, z), m. Both were
+    measured on a table, with the steer axis level.
     """
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
@@ -164,8 +167,9 @@ def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2
     """Return the vector (x, z) from the suspension point of a part to its mass centre, m, and the distances
     of the rod's lines from that centre.
 
-    cos(tilt) x + sin(tilt) z = a: the vertical line of the rod passes at the distance a from the suspension
-    point.
+        cos(tilt) x + sin(tilt) z = a
+
+    The vertical line of the rod passes at the distance a from the suspension point.
     """
     across = jnp.stack([jnp.cos(tilts), jnp.sin(tilts)], axis=1)
     r = _least_squares(across, beside)
@@ -177,14 +181,14 @@ def _least_squares(rows: Float[Array, "rows columns"], values: Float[Array, "row
 
 
 def _moments_about_y(y: Values, lengths: Values) -> Values:
-    """Return Iyy of parts whose mass centres have these distances from the axle, kg m^2, from the periods of
-    their swings.
+    """Return Iyy of the parts, kg m^2, from the periods of their swings and the distances `lengths` of their
+    mass centres from the axle.
     """
     return {f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l) for p, l in lengths.items()}
 
 
 def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, Float[Array, "_"]]) -> Values:
-    """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists, by
+    """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists; by
     least squares for more than three.
 
     A bar of known inertia calibrates the rod. Wheels are fixed to it by their rims, parts along n = (-sin
@@ -201,7 +205,7 @@ def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, 
 
 
 def _of_whole_bicycle(found: Values) -> Values:
-    """Handlebar G and fork S as one body H."""
+    """Return the handlebar G and the fork S combined as one body H."""
     mass = found["mG"] + found["mS"]
     x, z = ((found["mG"] * found[f"{axis}G"] + found["mS"] * found[f"{axis}S"]) / mass for axis in "xz")
     moments = dict.fromkeys(("xx", "yy", "zz", "xz"), jnp.zeros(()))

@@ -1,7 +1,9 @@
-"""The study of measured bicycles: files in, stability speeds with their uncertainty and simulated rides out.
+"""The study of measured bicycles: from parameter files to stability speeds with their uncertainty, and
+simulated rides.
 
-For each file: build the nonlinear Whipple bicycle, linearise it, find weave, capsize and double-root speeds by root finding, propagate the
-measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits, and ride it hands-free below, inside and above the stable range.
+For each file: build the nonlinear Whipple bicycle and linearise it; find weave, capsize and double-root
+speeds; propagate the measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits; and simulate
+hands-free rides below, inside and above the stable range.
 """
 
 import json
@@ -25,19 +27,18 @@ from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.trajectories.results import EVENT
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
-MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none
+MAX_SPEED = 50.0  # m/s; higher speeds count as none
 CAVEAT = (
-    "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many "
-    "have it. Sigmas are taken as\n"
-    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it "
-    "is known, and used.\n"
-    f"A missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
+    "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is the share "
+    "of these samples. Sigmas count as\nindependent, because parameter files contain no covariance; raw "
+    "measurements, `*Measured.txt`, have one, which is used.\nA missing sigma counts as zero. Speeds above "
+    f"{MAX_SPEED:g} m/s count as none."
 )
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A file that describes no possible bicycle, with the reason."""
+    """A file that describes no possible bicycle, and the reason."""
 
     path: str
     error: str
@@ -63,10 +64,11 @@ class Study:
     path: str
     bicycle: MeasuredBicycle
     speeds: dict[str, dict | None]  # name -> value, low, high, fraction
-    stable_fraction: float  # of the samples, those that have a stable range
+    stable_fraction: float  # share of the samples with a stable range
     grid: np.ndarray  # forward speeds of the eigenvalues, m/s
-    eigenvalues: np.ndarray  # (samples + 1, speeds, modes), the first of the measured values; castering, capsize, weave, weave
-    physical: np.ndarray  # which samples are bicycles, and count
+    # (samples + 1, speeds, modes), first the measured bicycle; castering, capsize, weave, weave
+    eigenvalues: np.ndarray
+    physical: np.ndarray  # marks of the samples that are possible bicycles
     rides: Rides
 
     def as_dict(self) -> dict:
@@ -98,7 +100,7 @@ class Study:
 
 
 def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Refused:
-    """Study one file; returns `Refused`, without an exception, if it describes no bicycle."""
+    """Return the study of one file, or `Refused`, without an exception, if it describes no bicycle."""
     try:
         bicycle = benchmark_from_measurements(path) if holds_readings(Path(path)) else read_bicycle(path)
     except ValueError as error:
@@ -106,7 +108,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     drawn = sample_parameters(bicycle, jax.random.key(seed), samples)
     nominal = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     physical = np.asarray(drawn.physical)
-    # a sample that is not a bicycle is computed as the measured one, and not counted
+    # an impossible sample is computed with the measured values, and not counted
     values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
@@ -124,8 +126,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Return speeds (m/s) by label: below, inside and above the stable range; fixed ones, labelled
-    accordingly, if there is no range.
+    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds if there is none.
     """
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
@@ -135,7 +136,7 @@ def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
 
 
 def ride(values: dict[str, float], by_label: dict[str, float]) -> Rides:
-    """Simulate rides of the bicycle with these parameters, without hands: upright running with a kick in lean
+    """Simulate hands-free rides of the bicycle with these parameters: upright running with a kick in lean
     rate, until it falls.
     """
     speeds = np.array(list(by_label.values()))
@@ -150,15 +151,15 @@ def _speeds_and_matrices(row):
     return stability_speeds(*matrices, max_speed=MAX_SPEED), matrices
 
 
-_speeds = compiled_quickly(jax.vmap(_speeds_and_matrices))  # 2,000 samples: compiled in 6 s, not 18; run in 3.4 s, not 2.0
+# 2,000 samples: compiled in 6 s instead of 18, run in 3.4 s instead of 2.0
+_speeds = compiled_quickly(jax.vmap(_speeds_and_matrices))
 
 
 _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=grid), (0, None)))
 
 
 def _interval(values, physical) -> dict | None:
-    """Return value, low, high and fraction of one speed; None where neither the bicycle nor any sample has
-    it.
+    """Return value, low, high and fraction of one speed; None if neither the bicycle nor any sample has it.
     """
     if np.isnan(values).all():
         return None
@@ -167,8 +168,8 @@ def _interval(values, physical) -> dict | None:
 
 
 def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndarray:
-    """Return uniform speeds beyond the known ones, and denser ones near the double root, where two
-    eigenvalues separate like a square root.
+    """Return speeds for the plot: uniform ones beyond the known speeds, and denser ones near the double root,
+    where two eigenvalues separate like a square root.
     """
     known = [v for v in (weave, capsize) if np.isfinite(v)]
     top = float(np.clip(1.6 * max(known, default=6.0), 8.0, 20.0))
@@ -177,7 +178,7 @@ def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndar
 
 
 def run(paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None) -> list[Study | Refused]:
-    """Study all files, one after another through the same compiled programs."""
+    """Return the studies of all files, in order, with shared compiled programs."""
     studies = []
     for path in paths:
         progress(f"{path} ...")
@@ -218,7 +219,7 @@ def _cell(speed: dict | None) -> str:
 def _notes(one: Study) -> list[str]:
     notes = [f"ride at {r['speed']:.2f} m/s, {r['label']}: {r['message']} at t = {r['t_end']:.2f} s" for r in one.as_dict()["rides"]]
     if refused := int(np.sum(~one.physical)):
-        notes.append(f"{refused} samples are no bicycles and do not count")
+        notes.append(f"{refused} samples are impossible bicycles and do not count")
     if one.bicycle.covariance is not None:
         notes.append("parameters from raw measurements, with their covariance")
     if one.bicycle.without_sigma:

@@ -1,8 +1,9 @@
-"""Measured bicycle parameter files, `name = value+/-sigma` per line, read into values, sigmas and remarks.
+"""Files of measured bicycle parameters, `name = value+/-sigma` per line, read into values, sigmas and
+warnings.
 
-Format of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al. 2007, `#` comments.
-Its sets in YAML, `name: value`, with or without a section `values`, are read as well. A missing sigma counts as zero. The
-files carry no covariance: sigmas belong to independent errors.
+The format is that of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al.
+2007, `#` comments. YAML files, `name: value`, with or without a section `values`, are read as well. A missing
+sigma counts as zero. The files contain no covariance, so errors count as independent.
 """
 
 import re
@@ -25,7 +26,7 @@ from .parameters import PARAMETER_NAMES, doubts, violations
 
 _FORMAT = "`name = value` or `name = value+/-sigma`, for example `rF = 0.35+/-0.001`"
 _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
-_OUT_OF_PLANE = ("yB", "yH")  # a Whipple bicycle is symmetric: zero
+_OUT_OF_PLANE = ("yB", "yH")  # zero for the symmetric Whipple bicycle
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,13 @@ class MeasuredBicycle:
 
     name: str
     values: dict[str, float]  # every name of PARAMETER_NAMES, in that order
-    sigmas: dict[str, float]  # the same names; zero where the file gives none
+    sigmas: dict[str, float]  # the same names; zero if the file gives none
     path: str
-    without_sigma: Labels  # names whose sigma the file does not give
-    ignored: Labels  # names in the file that the Whipple bicycle does not use
-    warnings: Labels  # sentences: odd values, taken as they are
-    covariance: Float[np.ndarray, "parameters parameters"] | None = None  # in the order of `values`; None: not known, and sigmas count as independent
+    without_sigma: Labels  # names without a sigma in the file
+    ignored: Labels  # names in the file that the Whipple bicycle lacks
+    warnings: Labels  # sentences on odd values, which are used as they are
+    # in the order of `values`; None: unknown, and errors count as independent
+    covariance: Float[np.ndarray, "parameters parameters"] | None = None
 
     @property
     def with_independent_errors(self) -> "MeasuredBicycle":
@@ -48,20 +50,20 @@ class MeasuredBicycle:
 
     @property
     def scene(self) -> WhippleBicycle:
-        """The bicycle as a scene, with the measured values."""
+        """Return the bicycle as a scene, with the measured values."""
         return WhippleBicycle(**self.values)
 
     @property
     def prior(self) -> dict[str, Normal]:
-        """Independent distributions of the measured parameters, for `jj.Study(bicycle.scene,
+        """Return independent distributions of the measured parameters, for `jj.Study(bicycle.scene,
         vary=bicycle.prior)`. Parameters without a sigma are omitted.
         """
         return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
 
     @property
     def joint_prior(self) -> dict[str, Normal | Correlated]:
-        """The joint prior of the measured parameters, with its covariance if known: `jj.fit(bicycle.scene,
-        data, free=bicycle.joint_prior)`.
+        """Return the joint prior of the measured parameters, with their covariance if known:
+        `jj.fit(bicycle.scene, data, free=bicycle.joint_prior)`.
         """
         if self.covariance is None:
             return dict(self.prior)
@@ -72,7 +74,7 @@ class MeasuredBicycle:
 def measured_bicycle(name: str) -> MeasuredBicycle:
     """Return one of the bicycles shipped with the package, by its name: `measured_bicycle("Browser")`.
 
-    **Raises** ValueError: an unknown name, with the nearest known ones; and as `read_bicycle`.
+    **Raises** ValueError for an unknown name, with the nearest known ones, and as in `read_bicycle`.
     """
     known = shipped_bicycles()
     check_name(name, known, f"there is no measured bicycle `{name}`")
@@ -80,9 +82,7 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
 
 
 def shipped_bicycles() -> dict[str, Path]:
-    """Return the parameter files shipped with the package, name -> path (including `Tms`, which is
-    degenerate).
-    """
+    """Return the parameter files shipped with the package, name -> path; `Tms` is degenerate."""
     return _shipped("Benchmark")
 
 
@@ -90,8 +90,8 @@ def shipped_measurements() -> dict[str, Path]:
     """Return the files of raw measurements shipped with the package, name -> path, for
     `benchmark_from_measurements`.
 
-    The files of `Silver` do not contain the parts of that bicycle; `Gyro`, `Rigidcl` and `Stratos` have no
-    published parameters.
+    The readings of `Silver` are of another bicycle's parts; `Gyro`, `Rigidcl` and `Stratos` have no published
+    parameters.
     """
     return _shipped("Measured")
 
@@ -102,14 +102,15 @@ def _shipped(ending: str) -> dict[str, Path]:
 
 
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
-    """Read one parameter file: text, or YAML by the ending of `path`.
+    """Return the bicycle of one parameter file, read as text, or as YAML by the ending of `path`.
 
         bicycle = read_bicycle(shipped_bicycles()["Browser"])
         bicycle.values["c"], bicycle.sigmas["c"]  # trail and its standard deviation, m
 
-    **Raises:** `ValueError` naming file, line and parameter: a file that cannot be read or is not text; a line of another
-    form; an unknown (with the nearest valid one), repeated or missing name; a number that is none, not finite, or a
-    negative sigma; a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of inertia).
+    **Raises** ValueError, with file, line and parameter, for an unreadable file; a malformed line; an unknown
+    (with the nearest valid one), repeated or missing name; a value that is not a finite number; a negative
+    sigma; and a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of
+    inertia).
     """
     path = Path(files.name_of(path))
     text = read_lines(path)
@@ -124,8 +125,10 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
     missing = [name for name in PARAMETER_NAMES if name not in values]
     if missing:
-        raise ValueError(f"{path}: missing {listed(missing)}; a bicycle needs all of "
-            f"{' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
+        raise ValueError(
+            f"{path}: missing {listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. Add a "
+            f"line {_FORMAT} for each."
+        )
     known = {name: values[name] for name in PARAMETER_NAMES}
     broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
     if broken:
@@ -147,7 +150,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
 
 def read_lines(path: Path) -> str:
-    """Return the text of a file of parameters or readings, which is not empty."""
+    """Return the text of a file of parameters or readings. Raises ValueError if it is empty."""
     text = read_text(path, 1_000_000, f"a bicycle parameter file with lines {_FORMAT}")
     if not text.strip():
         raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
@@ -163,8 +166,8 @@ def text_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
-    """Return numbers and content of the lines of a YAML file, as of a text file: those of the section
-    `values`, or all lines without one.
+    """Yield numbers and content of the lines of a YAML file, in the format of a text file, from the section
+    `values`, or from the whole file if it has none.
     """
     lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)
@@ -177,8 +180,10 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
         if has_section and not is_indented:
             inside = name == "values"
             if name == "parameterization" and value.strip("\"'") not in ("benchmark", "Meijaard2007"):
-                raise ValueError(f"{path}, line {number}: parameterization `{shortened(value)}`, expected "
-                    f"that of the benchmark: {' '.join(PARAMETER_NAMES)}")
+                raise ValueError(
+                    f"{path}, line {number}: parameterization `{shortened(value)}`, expected the "
+                    f"benchmark's: {' '.join(PARAMETER_NAMES)}"
+                )
         elif inside and not value:
             raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: "
                 "value`, for example `rF: 0.35`")
@@ -188,7 +193,7 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
 
 def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str) -> Iterator[tuple[str, str, str]]:
     """Yield the location, the name and the text after `=` of each line. Raises ValueError for another `form`
-    and for a repeated name.
+    or a repeated name.
     """
     given: dict[str, int] = {}
     for number, line in lines:
@@ -203,8 +208,8 @@ def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str)
 
 
 def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, float | None]:
-    """Return the finite number in `text` and its sigma (None if not given); `what`: "value" or "reading";
-    `name`: its name, for the error.
+    """Return the finite number in `text` and its sigma (None if not given); `name` and `what` ("value" or
+    "reading") are for the message.
     """
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or omit this bicycle."
@@ -217,15 +222,16 @@ def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, floa
 
 
 def _check_known(name: str, where: str) -> None:
-    # bodies G and S together are H, and v is not of the bicycle
+    # bodies G and S together are H, and v does not describe the bicycle
     if not re.fullmatch(r"v|I[RF]zz|y[BH]|m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)", name):
         check_name(name, PARAMETER_NAMES, f"{where}: unknown parameter `{shortened(name)}`")
 
 
 def _ignored_but_telling(values: dict[str, float]) -> Labels:
-    """Return warnings where an ignored value contradicts the symmetry that the model assumes."""
+    """Return warnings for ignored values that contradict the symmetry of the model."""
     found = [
-        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0
+        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its "
+        "plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0
     ]
     for name, twin in _REPEATED.items():
         if values.get(name, values[twin]) != values[twin]:

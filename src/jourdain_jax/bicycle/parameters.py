@@ -1,7 +1,8 @@
-"""The parameters of the Whipple bicycle, and the values that a real bicycle can have.
+"""The parameters of the Whipple bicycle, and their possible values.
 
-Names of Meijaard, Papadopoulos, Ruina & Schwab (Proc. R. Soc. A 463, 2007, table 1): origin at the rear contact, x
-forward, z down; R rear wheel, B rear frame with rider, H handlebar and fork, F front wheel. Wheels have Izz = Ixx.
+Names as in Meijaard, Papadopoulos, Ruina & Schwab (Proc. R. Soc. A 463, 2007, table 1): origin at the rear
+contact, x forward, z down; R rear wheel, B rear frame with rider, H handlebar and fork, F front wheel. Wheels
+have Izz = Ixx.
 """
 
 import math
@@ -15,17 +16,17 @@ from jaxtyping import Bool
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import Labels, Sentences
 
-# name -> unit, meaning and sign, in the order of the paper's table; arrays of parameters keep this order
+# name -> unit, meaning and sign, in the order of the paper's table and of arrays of parameters
 PARAMETERS: dict[str, Mapping] = {field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")}
 PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
-    """Return the conditions that make a bicycle impossible, each as a sentence, with marks of the values that
-    violate it. NaN counts as a violation.
+    """Return the conditions that make a bicycle impossible, each as a sentence, with marks of the violating
+    values. NaN counts as a violation.
 
     **Arguments:** `values`: number, or array of samples of one common shape, for every name of
-    `PARAMETER_NAMES`. **Returns:** sentence -> True where the values break it.
+    `PARAMETER_NAMES`. **Returns:** sentence -> True for values that violate it.
     """
     broken = {}
     for name, known in PARAMETERS.items():
@@ -39,16 +40,18 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
 
 
 def doubts(values: Mapping[str, float]) -> Sentences:
-    """Return one sentence for each oddity of a bicycle's values that does not prevent a simulation.
+    """Return one sentence for each oddity of a bicycle's values that does not prevent a simulation, from the
+    conditions of a rigid body's inertia.
 
-    A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the
-    other two. **Arguments:** `values`: number for every name of `PARAMETER_NAMES`.
+    The inertia matrix is positive definite, and each principal moment is at most the sum of the other two.
+    **Arguments:** `values`: number for every name of `PARAMETER_NAMES`.
     """
     found = []
     for wheel in "RF":
         if values[f"I{wheel}yy"] > 2 * values[f"I{wheel}xx"]:
-            found.append(f"`I{wheel}yy` > 2 `I{wheel}xx`: no wheel, even a flat one, has such moments of "
-                "inertia")
+            found.append(
+                f"`I{wheel}yy` > 2 `I{wheel}xx`: no wheel, even a flat one, has such moments of inertia"
+            )
     for body in "BH":
         xx, yy, zz, xz = (values[f"I{body}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
         middle, half_spread = (xx + zz) / 2, math.hypot((xx - zz) / 2, xz)

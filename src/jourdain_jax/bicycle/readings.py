@@ -1,18 +1,20 @@
-"""Files of raw measurements of a bicycle, `name = reading+/-sigma, reading+/-sigma, ...` per line: lengths, masses, angles and periods of its parts.
+"""Files of raw measurements of a bicycle, `name = reading+/-sigma, reading+/-sigma, ...` per line: lengths,
+masses, angles and periods of its parts.
 
-Format of BicycleParameters (Moore, Hubbard & Kooijman), files `*Measured.txt`. Several readings of one quantity count as their mean m, whose standard
-deviation is sqrt(sum sigma^2) / readings. Part and number follow the name of what was read: `TtB2` is the period of the rear frame B, second hanging.
+Format of BicycleParameters (Moore, Hubbard & Kooijman), files `*Measured.txt`. Several readings of one
+quantity are replaced by their mean, with the standard deviation sqrt(sum sigma^2) / readings. A name consists
+of quantity, part and number: `TtB2` is the twisting period of the rear frame B, second hanging.
 
-| name | what was read | unit |
+| name | reading | unit |
 |---|---|---|
-| `dR nR`, `dF nF` | way of a wheel over so many turns; turns | m |
+| `dR nR`, `dF nF` | distance rolled by a wheel; number of turns | m |
 | `w gamma f`, or `h1`...`h5`, `d1`...`d4`, `d` | wheelbase, slope of the steer axis, fork offset; or heights and diameters on a level table | m, deg |
-| `mR mF mB mH`, or `mG mS` for `mH` | masses of wheels, rear frame, fork with handlebar; or of the handlebar G and the fork S by themselves | kg |
+| `mR mF mB mH`, or `mG mS` for `mH` | masses of wheels, rear frame, fork with handlebar; or of handlebar G and fork S separately | kg |
 | `lR TcR1`, `lF TcF1`, `TcB1`, `TcH1` | swung: from axle to middle of a wheel, period; frame and fork hang by the middle of their wheel | m, s |
 | `TtR1`, `TtF1` | twisted on an upright rod, about a diameter of the wheel | s |
-| `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, place of the rod beside the middle of the wheel, period; three hangings or more | deg, m, s |
-| `mP lP dP TtP1` | a steel bar of known inertia, by which the rod is gauged | kg, m, s |
-| `h6 h7 d5 d6 l` | where the handlebar G hung, seen from the front axle; only with G and S | m |
+| `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, offset of the rod from the middle of the wheel, period; three hangings or more | deg, m, s |
+| `mP lP dP TtP1` | a steel bar of known inertia, which calibrates the rod | kg, m, s |
+| `h6 h7 d5 d6 l` | suspension point of handlebar G relative to the front axle; only with G and S | m |
 | `g` | gravity | m/s^2 |
 """
 
@@ -47,7 +49,7 @@ class Readings:
 
     @property
     def by_table(self) -> bool:
-        """Whether wheelbase and fork offset follow from heights and diameters on a table."""
+        """Return whether wheelbase and fork offset follow from heights and diameters on a table."""
         return "w" not in self.means
 
 
@@ -57,10 +59,10 @@ def holds_readings(path: Path) -> bool:
 
 
 def read_readings(path: str | Path) -> Readings:
-    """Read one file of raw measurements.
+    """Return the readings of one file of raw measurements.
 
-    **Raises** ValueError naming file, line and quantity, for a file that cannot be read, a line of another
-    form, a repeated quantity or a negative sigma; and for missing readings.
+    **Raises** ValueError, with file, line and quantity, for an unreadable file, a malformed line, a repeated
+    quantity, a negative sigma, or missing readings.
     """
     path = Path(name_of(path))
     means: dict[str, float] = {}
@@ -97,7 +99,6 @@ def _hangings(means: dict[str, float], part: str) -> Indices:
 
 
 def _mean(readings: list[tuple[float, float | None]]) -> tuple[float, float | None]:
-    """Return the mean of the readings in a line, and its standard deviation (None where no reading has one).
-    """
+    """Return the mean of the readings in a line, and its standard deviation (None if no reading has one)."""
     squares = [sigma**2 for _, sigma in readings if sigma is not None]
     return math.fsum(value for value, _ in readings) / len(readings), math.sqrt(math.fsum(squares)) / len(readings) if squares else None

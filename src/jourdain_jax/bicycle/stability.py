@@ -3,7 +3,8 @@
     M q'' + v C1 q' + (g K0 + v^2 K2) q = 0,   q = (lean, steer)
     p(s; v) = det(s^2 M + s v C1 + g K0 + v^2 K2) = a4 s^4 + a3 s^3 + a2 s^2 + a1 s + a0
 
-With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x), and polynomials in x tell
+With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x), and polynomials in
+x determine
 
     where an eigenvalue is zero             b0 = 0
     where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if omega^2 = b1/b3 > 0)
@@ -11,14 +12,16 @@ With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), 
         D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
         D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
 
-All their positive roots are found, and polished by steps of Newton's method that carry derivatives. With H for the second one, which is the product of all sums
-of two eigenvalues times b4^3 v, its slope says which way a pair crosses: down where H' b3 > 0. A real one crosses zero upward where b0' b1 < 0; and two that
-meet become a pair where dp/dv and d2p/ds2 have one sign. Coefficients stand highest power first.
+All their positive roots are found, and refined by steps of Newton's method that carry derivatives. The second
+polynomial, H, is the product of all sums of two eigenvalues times b4^3 v. A pair crosses downwards where H'
+b3 > 0, and a real eigenvalue crosses zero upwards where b0' b1 < 0. Two that coincide become a pair where
+dp/dv and d2p/ds2 have equal signs. Coefficients are ordered from the highest power.
 
 M, C1, K0 and K2 come from the nonlinear model, linearised about upright straight running at rest and at one
-speed; that C grows with v and K with v^2 is a fact of the model, checked in the tests.
+speed. That C is proportional to v and K affine in v^2 is checked in the tests.
 
-Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant (Orlando) and discriminant are textbook.
+Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant
+(Orlando) and discriminant are textbook.
 """
 
 from collections.abc import Mapping
@@ -60,11 +63,11 @@ class StabilitySpeeds(eqx.Module):
     Eigenvalues there: `jj.critical`, `eigenvalues`.
     """
 
-    weave_speed: Scalar  # above it the oscillation of lean and steer decays
-    capsize_speed: Scalar  # above it a slow fall to one side grows
-    double_root_speed: Scalar  # above it the two unstable real eigenvalues are the weave pair
-    stable_from: Scalar  # the widest range of speeds where all four eigenvalues decay (no derivative)
-    stable_to: Scalar  # its end: the largest speed looked at if it is still stable there (no derivative)
+    weave_speed: Scalar  # lean and steer oscillations decay above it
+    capsize_speed: Scalar  # a slow fall to one side grows above it
+    double_root_speed: Scalar  # the two unstable real eigenvalues are the weave pair above it
+    stable_from: Scalar  # start of the widest range of speeds with four decaying modes (no derivative)
+    stable_to: Scalar  # its end, at most the largest speed examined (no derivative)
     stable_range_exists: Flag
 
 
@@ -77,8 +80,8 @@ def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
 
 
 def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
-    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. It works under jit
-    and vmap.
+    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Works under jit and
+    vmap.
     """
     return _matrices({name: jnp.asarray(value) for name, value in values.items()})
 
@@ -94,7 +97,8 @@ def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
     return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
 
 
-_matrices = compiled_quickly(_linearised)  # the first call in 10 s of processor time, not in 23; the second in 6 ms
+# the first call takes 10 s of processor time instead of 23; the second 6 ms
+_matrices = compiled_quickly(_linearised)
 
 
 def eigenvalues(
@@ -107,8 +111,8 @@ def eigenvalues(
 ) -> Complex[Array, "speeds 4"]:
     """Return the four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
 
-    Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues). If two
-    real eigenvalues lie on either side of a pair, the lower is castering, the higher capsize, and the pair is
+    Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues). If real
+    eigenvalues lie on both sides of a pair, the lower is castering, the higher capsize, and the pair is
     weave. A pair has its negative frequency first.
     """
     M, C1, K0, K2, g = _as_matrices(M, C1, K0, K2, g)
@@ -135,14 +139,13 @@ def stability_speeds(
         speeds = stability_speeds(M, C1, K0, K2, 9.81)
         jax.vmap(stability_speeds)(*many)  # a leading axis on each of the five, g included
 
-    Weave: a pair +-i omega crosses into the left half-plane as v grows. Capsize: the lowest speed at which a real
-    eigenvalue crosses zero upwards. Double root: the highest speed, below the weave speed where there is one, at which
-    two positive real eigenvalues meet and become a pair.
+    Weave: a pair +-i omega crosses into the left half-plane as v grows. Capsize: the lowest speed at which a
+    real eigenvalue crosses zero upwards. Double root: the highest speed, below the weave speed if there is
+    one, at which two positive real eigenvalues meet and become a pair.
 
-    **Arguments:** `M`, `C1`, `K0`, `K2`, (2, 2) in the order lean, steer; `g` (m/s^2); `max_speed`, the largest speed
-    (m/s) looked at.
-    **Returns:** a `StabilitySpeeds`. Derivatives follow from the implicit function theorem; where a speed does not exist
-    its value is NaN and its derivative zero.
+    **Arguments:** `M`, `C1`, `K0`, `K2`, (2, 2) in the order lean, steer; `g` (m/s^2); `max_speed`, the
+    largest speed (m/s) examined. **Returns:** a `StabilitySpeeds`. Derivatives follow from the implicit
+    function theorem; a speed that does not exist is NaN with derivative zero.
     """
     matrices = _as_matrices(M, C1, K0, K2, g)
     return _speeds(matrices, jax.lax.stop_gradient(jnp.asarray(max_speed, matrices.M.dtype)))
@@ -178,7 +181,7 @@ _speeds = compiled_quickly(_stability_speeds)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
-    """Return the order castering, capsize, weave, weave that `eigenvalues` describes."""
+    """Return eigenvalues in the order castering, capsize, weave, weave that `eigenvalues` describes."""
     values = values[jnp.lexsort((values.imag, values.real))]
     is_pair = values.imag != 0
     pair_between = is_pair[1] & is_pair[2] & ~is_pair[0] & ~is_pair[3]
@@ -191,7 +194,7 @@ def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
 
 
 def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """b4, b3, b2(x), b1(x), b0(x) of the module's head."""
+    """Return b4, b3, b2(x), b1(x), b0(x) of the module docstring."""
     M, C1, K0, K2, g = matrices
 
     def mixed(A, B):  # det(A + B) - det A - det B
@@ -211,20 +214,20 @@ def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
 
 
 def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
-    """a4, a3, a2, a1, a0 at one speed."""
+    """Return a4, a3, a2, a1, a0 at one speed."""
     b4, b3, b2, b1, b0 = (jnp.polyval(b, v**2) for b in _coefficients(matrices))
     return jnp.stack([b4, v * b3, b2, v * b1, b0])
 
 
 def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return two polynomials in x (defined in the module's head). The first is zero where two eigenvalues sum
-    to zero, the second where two eigenvalues coincide.
+    """Return two polynomials in x (defined in the module docstring): the first is zero if two eigenvalues sum
+    to zero, the second if two coincide.
     """
     b4, b3, b2, b1, b0 = _coefficients(matrices)
     x = jnp.array([1.0, 0.0], b0.dtype)
 
     def combined(*terms):
-        """Return the sum of products, each a factor and polynomials."""
+        """Return the sum of `terms`, each a factor times a product of polynomials."""
         return reduce(jnp.polyadd, (factor * reduce(jnp.polymul, parts) for factor, *parts in terms))
 
     opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
@@ -238,7 +241,7 @@ def _slope(polynomial: Polynomial, x: Array) -> Array:
 
 
 def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:
-    """Return the positive real roots up to `top` with first and second derivatives, and a mask of them.
+    """Return the positive real roots up to `top`, with first and second derivatives, and a mask of them.
     Entries outside the mask are 1.
 
     The inverses of the roots are computed, since the leading coefficients may vanish.

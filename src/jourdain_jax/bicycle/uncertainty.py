@@ -1,8 +1,9 @@
 """Limits of quantities that depend on the parameters, by Monte Carlo from measured standard deviations.
 
-Parameters are drawn from a normal distribution with the measured values and their covariance; where that is not known, as from files of parameters, each
-with its sigma independently of the others. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of
-samples that have it, and its limits are those of these samples.
+Parameters are drawn from a normal distribution with the measured values and their covariance, or
+independently if the covariance is unknown, as from parameter files. A quantity that only some bicycles have
+(a capsize speed) is reported with the fraction of samples that have it, and its limits are taken over these
+samples.
 """
 
 import equinox as eqx
@@ -23,8 +24,8 @@ class ParameterSamples(eqx.Module):
     """Sampled parameters of one bicycle, in SI units, with marks of the possible ones."""
 
     values: Float[Array, "samples parameters"]  # columns in the order of `PARAMETER_NAMES`
-    physical: Bool[Array, " samples"]  # False where a sample has, say, a negative radius
-    refused: dict[str, Array]  # condition that some samples break, as a sentence -> how many break it
+    physical: Bool[Array, " samples"]  # False for a sample with a negative radius, for example
+    refused: dict[str, Array]  # violated condition, as a sentence -> number of samples
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
         """Return one array of samples per parameter, for `jax.vmap` over a function of a dict of parameters.
@@ -38,19 +39,19 @@ class Interval(eqx.Module):
     value: Scalar  # NaN if there is none
     low: Scalar  # 2.5 % quantile, NaN if no sample has the quantity
     high: Scalar  # 97.5 % quantile
-    fraction: Scalar  # of the samples counted, those that have the quantity
+    fraction: Scalar  # share of the counted samples that have the quantity
 
 
 def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
-    """Draw `count` bicycles from a normal distribution with the measured values and their covariance. If
-    there is no covariance, parameters are independent, with their sigmas.
+    """Return `count` bicycles drawn from a normal distribution with the measured values and their covariance.
+    Without a covariance, parameters are independent, with their sigmas.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())
 
-    **Arguments:** `bicycle`; `key`, a JAX random key; `count`, number of samples.
-    **Returns:** all samples, the unphysical ones included, marked and counted by what is wrong with them.
-    **Raises:** `ValueError` if `count` is not positive.
+    **Arguments:** `bicycle`; `key`, a JAX random key; `count`, number of samples. **Returns:** all samples,
+    including impossible ones, which are marked and counted by violation. **Raises** ValueError if `count` is
+    not positive.
     """
     if count < 1:
         raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about "
@@ -67,11 +68,11 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
 
 
 def _root(bicycle: MeasuredBicycle) -> np.ndarray:
-    """R with R R' the covariance, which need not have full rank."""
+    """Return R with R R' the covariance, which may be singular."""
     sigma = np.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
     if bicycle.covariance is None:
         return np.diag(sigma)
-    scale = np.where(sigma > 0, sigma, 1.0)  # of correlations: units do not matter
+    scale = np.where(sigma > 0, sigma, 1.0)  # scales to correlations, so that units do not matter
     squares, directions = np.linalg.eigh(bicycle.covariance / np.outer(scale, scale))
     return scale[:, None] * directions * np.sqrt(np.maximum(squares, 0.0))
 
@@ -84,10 +85,10 @@ def interval(
 ) -> Interval:
     """Return limits of a sampled quantity, over the samples that have it (finite ones).
 
-    **Arguments:** `values`, one per sample, NaN where a sample has no such quantity; `nominal`, the quantity of the
-    bicycle as measured (default: the median of the samples); `counted`, False for samples to leave out altogether, such
-    as unphysical ones.
-    **Returns:** `value`, 2.5 % and 97.5 % quantiles, and the fraction of the counted samples that have the quantity.
+    **Arguments:** `values`, one per sample, NaN if a sample lacks the quantity; `nominal`, the quantity of
+    the bicycle as measured (default: the median of the samples); `counted`, False for samples to exclude,
+    such as impossible ones. **Returns:** `value`, 2.5 % and 97.5 % quantiles, and the fraction of the counted
+    samples that have the quantity.
     """
     counted = jnp.ones(values.shape, bool) if counted is None else counted
     has = counted & jnp.isfinite(values)

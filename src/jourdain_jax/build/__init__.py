@@ -1,3 +1,3 @@
-"""Facts found once about a scene: probed states, rank, privileged speeds, time dependence, the traced graph
-of scalars.
+"""Facts found once per scene: probed states, rank, privileged speeds, time dependence, the traced graph of
+scalars.
 """

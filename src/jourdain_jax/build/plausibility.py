@@ -1,16 +1,16 @@
 """Checks of the numbers that a scene gives for its bodies, contacts and gravity.
 
-m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
-n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground,   0 < r of what rolls and of its ground,   0 <= tyre < r
-d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
+    m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
+    n.n = 1,   e.e = 1 of gravity,   0 < r of a rolling body and of its ground,   0 <= tyre < r
+    gap = 0 with height="coordinates"
+    d[n.(p - o)]/dt = - n.(v + w x (p - o))    p fixed; a plane's motion, stated by o, n and by v, w
+    dg/dt along the motion of other bodies = 0  or  v, w != 0      g: pose of a contact's ground
+    I_3 <= I_1 + I_2
 
-dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
-I_3 <= I_1 + I_2
-
-They are one table, `CHECKS`, of functions of numbers at some states. It is looked at where a scene is probed, where a fault is an error with its text. What
-has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the
-start,
-which may hide a fault, and at random states of the domain, projected onto the geometric rows.
+The table `CHECKS` lists them as functions of numbers at some states. It is evaluated when a scene is probed,
+and a fault raises its text. Checks with a `label` also run in the compiled program of each motion, where a
+fault is a result code. They run at the start, which may hide a fault, and at random states of the domain,
+projected onto the geometric constraints.
 """
 
 from collections.abc import Callable
@@ -38,14 +38,18 @@ from jourdain_jax.scene.names import Sentences
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
-TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
-_ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
+TOLERANCE = 1e-4  # relative: covers rounded constants, while mistakes are larger
+_ROWS_INSTEAD = (
+    "write its constraints in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - "
+    "ground.velocity_at(point))"
+)
 
-Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]  # by kind, and by what has them; at one state or, with a leading axis, at many; or nodes
+# kind -> name of the owner -> values; at one state or, with a leading axis, at many; or nodes
+Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
 
 
 def numbers_of(scene: Scene, motion: Motion) -> Numbers:
-    """Return the numbers that the table judges, from known poses and velocities."""
+    """Return the numbers that the table checks, from known poses and velocities."""
     pose = motion.pose()
     contacts = contacts_of(scene, pose)
     laws = {f"contact `{name}`": c.friction for name, c in contacts.items() if c.friction is not None}
@@ -62,21 +66,21 @@ def numbers_of(scene: Scene, motion: Motion) -> Numbers:
 
 
 def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers:
-    """Return the numbers that poses and loads have at one state."""
+    """Return the numbers of poses and loads at one state."""
     bodies = {f"body `{name}`": body.body for name, body in pose.bodies.items()}
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
     size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
-    away = _round_off(pose)  # in the places of contacts that are far out
+    away = _round_off(pose)  # relative round-off, for contacts far from the origin
     return {
         "mass": {name: body.mass for name, body in bodies.items()},  # kg
-        # kg m^2; the fourth row is round-off: moments of bodies whose radius of gyration is below 1e-9 m
+        # kg m^2; the fourth row is round-off: moments of a body with a radius of gyration of 1e-9 m
         "inertia": {name: jnp.concatenate([body.inertia, jnp.full((1, 3), 1e-18 * body.mass)]) for name, body in rigid.items()},
         "orientation": {name: body.orientation for name, body in rigid.items()},
         "unit": {f"the normal of {name}": c.plane.normal @ c.plane.normal for name, c in contacts.items()}
         | {f"the axis of {name}": c.ground.axis @ c.ground.axis for name, c in contacts.items() if isinstance(c.ground, Cylinder)},
-        # m; and the distance of the contact from the mass centre
+        # m; with the distance of the contact from the mass centre
         "gap": {name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)]) for name, c in closed.items()},
         "length": {f"{what} of {name}": length for name, c in contacts.items() for what, length in _lengths(c).items()},  # m
         "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
@@ -107,14 +111,15 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: the kind of numbers, the test (axis of states first), the sentence for one
-    state, and a label if it ends a motion."""
+    """One check: the kind of numbers, the test (axis of states first), the sentence for one state, and a
+    label if it ends a motion.
+    """
 
     of: str
     wrong: Callable
     says: Callable[[np.ndarray], str]
     label: str = ""
-    group: str = "faults"  # "grounds" and "moments": what is computed, but hardly meant; "gravity"
+    group: str = "faults"  # "grounds" and "moments": computable, but unlikely to be intended; "gravity"
 
 
 def _size(x):
@@ -128,7 +133,8 @@ def _lopsided(x):
 
 def _negative(x):
     """Return whether an inertia matrix has a negative eigenvalue, by its principal minors, relative to its
-    largest entry or to a point's inertia."""
+    largest entry or to the inertia of a point.
+    """
     I, size = x[..., :3, :], _size(x)
     I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
     at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
@@ -151,21 +157,24 @@ def _off(square):
 
 
 def _nowhere(x):
-    """Return whether no state has finite numbers, for every state."""
+    """Return whether no state has finite numbers, as one flag per state."""
     bad = ~all_finite(x.reshape(len(x), -1), axis=1)
     return bad & np.all(bad)
 
 
 def _exceeds_the_others(x):
-    """Return whether the largest moment of a body with a thickness exceeds the sum of the others. For thin
-    wheels both are equal, to the digits of published values.
+    """Return whether the largest moment of a body exceeds the sum of the others; flat bodies are exempt. For
+    thin wheels both are equal, to the digits of published values.
     """
     least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
     return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))
 
 
 def _says_nothing(piece: str) -> Callable:
-    return lambda _: f"has no finite {piece} at any probed state, expected finite numbers; check what its {piece} is computed from"
+    return lambda _: (
+        f"has no finite {piece} at any probed state, expected finite numbers; check the computation of its "
+        f"{piece}"
+    )
 
 
 def _unit(kind: str, group: str) -> Check:
@@ -174,7 +183,7 @@ def _unit(kind: str, group: str) -> Check:
         lambda square: _off(square) > TOLERANCE,
         lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; "
             "divide it by its length",
-        "no unit vector",
+        "not a unit vector",
         group,
     )
 
@@ -186,10 +195,10 @@ def _stated_twice(kind: str) -> Check:
         lambda x: (
             f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by "
             "`velocity` and `angular_velocity`; state the motion in both: velocity = d origin/dt, "
-            "angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
+            "angular_velocity = (0, d tilt/dt, 0); if coordinates move it, omit the contact and "
             f"{_ROWS_INSTEAD}"
         ),
-        "a plane that moves in another way than is stated",
+        "a plane that contradicts its stated motion",
         "grounds",
     )
 
@@ -200,16 +209,15 @@ CHECKS = (
         "touch",
         _nowhere,
         lambda _: (
-            "finds no point where body and ground touch at any probed state; a ball must be smaller than the "
-            "cylinder or sphere that it rolls in, a surface needs a gradient that does not vanish, "
-            "coordinates a `domain` that lies near it"
+            "finds no point where body and ground touch at any probed state; make a ball smaller than its "
+            "hollow cylinder or sphere, give a surface a nonzero gradient, and state a `domain` near the "
+            "ground"
         ),
     ),
     Check(
         "mass",
         lambda m: m < 0,
-        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check what its mass is "
-            "computed from",
+        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check its computation",
         "a negative mass",
     ),
     Check(
@@ -240,15 +248,15 @@ CHECKS = (
     Check(
         "orientation",
         lambda R: _volume(R) < 0,
-        lambda R: "has an orientation of determinant -1, a reflection and no rotation; turn one of its axes "
-            "round",
+        lambda R: "has an orientation of determinant -1, a reflection instead of a rotation; reverse one "
+                  "axis",
         "a reflected orientation",
     ),
     _unit("unit", "grounds"),
-    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check what it is "
-        "computed from", "no positive length"),
-    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius of its section "
-        "that is not negative", "a negative tyre"),
+    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check its "
+                                                "computation", "no positive length"),
+    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius that is not "
+                                             "negative", "a negative tyre"),
     Check(
         "gap",
         lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],
@@ -262,8 +270,8 @@ CHECKS = (
     Check(
         "static",
         lambda x: x[..., 0] < x[..., 1],
-        lambda x: f"is {x[0]:.4g}, expected at least that of sliding, {x[1]:.4g}",
-        "static friction below that of sliding",
+        lambda x: f"is {x[0]:.4g}, expected at least the coefficient of sliding, {x[1]:.4g}",
+        "static friction below sliding friction",
     ),
     Check("restitution", lambda x: (x < 0) | (x > 1), lambda x: f"is {x:.4g}, expected a number from 0 to 1", "a restitution that is not from 0 to 1"),
     _unit("gravity", "gravity"),
@@ -271,7 +279,7 @@ CHECKS = (
         "ground",
         lambda x: (x[..., 0] > TOLERANCE) & ~(x[..., 1] > 0).any(0),
         lambda _: (
-            "moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body "
+            "moves with another body, but its `velocity` and `angular_velocity` are zero; if that is a body "
             f"of the scene, omit the contact and {_ROWS_INSTEAD}"
         ),
         "a ground that another body carries",
@@ -291,33 +299,31 @@ CHECKS = (
 )
 
 
-BY_ROWS = "gap", "own plane"  # kinds of numbers that geometric rows may keep right, or not
+BY_ROWS = "gap", "own plane"  # kinds of numbers that depend on the projection onto geometric constraints
 
 
 def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return random states t, q, u of the scene's domain, not projected onto the geometric rows."""
+    """Return random states t, q, u of the scene's domain, not projected onto the geometric constraints."""
     return random_states(scene, 3, np.random.default_rng(0))
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return for each fault whether the scene has it, at this state or, for faults of the kind `elsewhere`,
-    with the coordinates of `others`.
+    """Return for each fault whether the scene has it, at this state or at one of the states from `elsewhere`
+    with the coordinates `others`.
 
     It works under jit and vmap. NaN is no fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
     states = tuple(jnp.concatenate([x[None], more.astype(x.dtype)]) for x, more in pairs)
-    # loads may be callbacks, which need not know batches
+    # not vmapped: loads may be callbacks without batching
     numbers = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states)
     seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
     return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether numbers show a fault, for each of their kinds. Their first axis is that of states, the
-    second that of bodies or grounds.
-    """
+    """Return whether any number shows a fault, by kind. Axes: states first, then bodies or grounds."""
     found = [check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked]
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
 
@@ -325,10 +331,10 @@ def any_wrong(stacked: dict[str, Array]) -> Flag:
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     """Return velocities (m/s) of the ground of every contact.
 
-    "plane": velocities of the contact's plane along its normal, once from origin and tilt and once from
-    velocity and angular velocity, with an upper bound. A plane that is tangent to a ground at rest has none.
-    "own plane": the same for a `Contact` whose point the user states. "ground": the rates of all numbers that
-    describe the ground, due to the motion of other bodies, and the ground's stated velocity.
+    "plane": velocities of the contact's plane along its normal, from origin and tilt and from velocity and
+    angular velocity, with an upper bound. A plane tangent to a ground at rest has none. "own plane": the same
+    for a `Contact` with a user-defined point. "ground": the rates of all numbers that describe the ground,
+    due to the motion of other bodies, and the ground's stated velocity.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
@@ -363,10 +369,10 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
 
 
 def impossible_bodies(scene: Scene, q) -> Sentences:
-    """Return one sentence for each body that no distribution of mass can make. Bodies without thickness whose
+    """Return one sentence for each body that no distribution of mass can have. Bodies without thickness whose
     other moments are zero are omitted.
 
-    m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
+        m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
     stated = {kind: at_index(_weights(scene, q)[kind], None) for kind in ("mass", "inertia")}
     return sentences(scene, stated, "faults") + sentences(scene, stated, "moments")
@@ -378,8 +384,8 @@ def _weights(scene: Scene, q) -> Numbers:
 
 
 def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:
-    """Return one sentence for each fault of a group of the table, about the first of the given states that
-    shows it. Numbers that are not finite are reported as such only.
+    """Return one sentence for each fault of a group of the table, about the first of the given states with
+    the fault. Numbers that are not finite are reported as such only.
     """
     found = []
     for check in (check for check in CHECKS if check.group == group):

@@ -3,7 +3,8 @@
     A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
     q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-A scene is traced once per class for it, and what is looked at stands ready as nodes of its graph: other values of parameters are other inputs of that graph.
+A scene is traced once per class, with the probed quantities as nodes of its graph and the parameters as
+inputs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,34 +31,37 @@ from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, 
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
 
-SparseRows = list[dict[int, int]]  # of each row: variable -> node of its slope
+SparseRows = list[dict[int, int]]  # by row: variable -> node of the derivative
 
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
-# What poses and rows decide, and a motion can hardly be integrated without: where calls compute it, states far off are asked. Of loads nothing is believed.
+# Quantities that an integration cannot do without. If calls compute them, distant states are probed; for
+# loads, nothing is assumed.
 _MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at rest", "motion at rest", "inertia", "nonlinear"})
 
 
 class Probed(eqx.Module):
-    """Findings at one state, or with a leading axis at many; trees have arrays as leaves."""
+    """Probed quantities at one state, or at many with a leading axis; trees have arrays as leaves."""
 
-    q: Float[Entries, "*states coordinates"]  # on the geometric rows
-    position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
+    q: Float[Entries, "*states coordinates"]  # on the geometric constraints
+    position_error: Float[Entries, "*states"]  # of these constraints; this and the next two as in `Assembled`
     error: Float[Entries, "*states"]  # of the coordinates
     outside: Float[Entries, "*states"]  # of the domain
     G: Float[Entries, "*states closures coordinates"]
     A: Float[Entries, "*states rows speeds"]
     A_other: Float[Entries, "*states rows speeds"]  # at other speeds
-    A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were projected onto the geometric constraints
+    A_beyond: Float[Entries, "*states rows speeds"]  # before projection onto the geometric constraints
     M: Float[Entries, "*states speeds speeds"]
     vanishing: dict[str, Float[Entries, "*states entries"]]  # as in `LookedAt`
     numbers: Numbers
-    unproved: frozenset[str] = static(default=frozenset())  # what may be other than zero where no probe lies
-    in_calls: frozenset[str] = static(default=frozenset())  # what calls of JAX compute of poses and rows
+    # quantities that may be nonzero away from the probes
+    unproved: frozenset[str] = static(default=frozenset())
+    # quantities of poses and constraints computed by calls of JAX
+    in_calls: frozenset[str] = static(default=frozenset())
 
 
 def generic_inputs(scene: Scene) -> np.ndarray:
-    """Return values of inputs at which no term passes for absent."""
+    """Return values of inputs at which no term happens to vanish."""
     return np.linspace(0.5, 1.0, len(scene.inputs))
 
 
@@ -68,18 +72,19 @@ class LookedAt:
     traced: TracedScene
     rows: SparseRows  # d phi/du, each row by the nodes of the speeds
     velocities: SparseRows  # d (v, omega)/du
-    closures: list[int]  # geometric rows and unit norms
+    closures: list[int]  # geometric constraints and unit norms
     of_closures: SparseRows  # their derivatives with respect to q
-    # what may be zero everywhere: "rows at rest" and "motion at rest" (velocities and rates of coordinates), at u = 0; rates in time by `TIMED`, while
-    # coordinates, speeds and inputs are held (for loads and potentials: the motion); rates of the "inertia" along the motion, and along a generic change of
-    # the inputs those of "rows of inputs", and of each load's potential, "potential 0", ...
+    # Quantities that may be zero everywhere: "rows at rest" and "motion at rest" (velocities and rates of
+    # coordinates), at u = 0; rates in time by `TIMED`, at fixed coordinates, speeds and inputs (for loads and
+    # potentials: at fixed motion); rates of the "inertia" along the motion; and along a generic change of the
+    # inputs, the rates "rows of inputs" and those of each load's potential, "potential 0", ...
     vanishing: dict[str, list[int]]
-    in_calls: frozenset[str]  # what passes calls of JAX
-    nonanalytic: frozenset[str]  # what passes an operation that is not analytic
+    in_calls: frozenset[str]  # quantities that depend on calls of JAX
+    nonanalytic: frozenset[str]  # quantities that depend on an operation that is not analytic
 
     @property
     def graph(self) -> Graph:
-        """The graph."""
+        """Return the graph."""
         return self.traced.graph
 
 
@@ -115,14 +120,14 @@ def looked_at(scene: Scene) -> LookedAt:
 
 @once_per_class
 def coordinates_on_rows(scene: Scene) -> np.ndarray:
-    """Return which coordinates geometric rows or unit norms depend on, (coordinates,)."""
+    """Return which coordinates the geometric constraints or unit norms depend on, (coordinates,)."""
     nodes = looked_at(scene)
     return np.isin(nodes.traced.q, [n for row in nodes.of_closures for n in row])
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities in which operations of these kinds occur. "rank" stands for constraints,
-    "nonlinear" for constraints as functions of the speeds.
+    """Return the quantities in which operations of these kinds occur. "rank" stands for the constraint rows,
+    "nonlinear" for their dependence on the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
@@ -134,10 +139,10 @@ def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: 
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
-    """Probe the scene at states (t, q, u), projected onto the geometric constraints, and its constraints at
-    `u_other`. `generic`: marks of random states.
+    """Probe the scene at states (t, q, u), projected onto the geometric constraints, and its constraints also
+    at `u_other`. `generic`: marks of random states.
 
-    `limits`: as of `assemble`. Raises `Unsupported` where a call has no derivative in JAX.
+    `limits`: as in `assemble`. Raises `Unsupported` for a call without a derivative in JAX.
     """
     return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(u_other)
 
@@ -155,8 +160,8 @@ def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Ass
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
-    """Return whether these velocity rows are combinations of the others wherever positions satisfy the
-    geometric rows, at generic parameters.
+    """Return whether these velocity constraints are combinations of the others at all states that satisfy the
+    geometric constraints, at generic parameters.
 
     The rows satisfy `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` if the residual of least squares is at most the
     round-off of either side.
@@ -173,14 +178,16 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 
 
 def generic_states(traced: TracedScene, near: Probes) -> IdentityProbes:
-    """Return generic states on the geometric constraints, at generic parameters; found from those `near`."""
+    """Return generic states on the geometric constraints, at generic parameters, found from the states
+    `near`.
+    """
     coordinates = {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
     attitudes = [f"q_{first + i}" for first in traced.quaternions for i in range(4)]
     return on_rows(identity_probes(near, attitudes), near, traced.closures, coordinates)
 
 
 class _AtStates:
-    """Values on the graph at the probed states."""
+    """Evaluation of the graph at the probed states."""
 
     def __init__(self, nodes: LookedAt, scene: Scene, t, q, u, inputs, generic, **limits: int):
         self.nodes, self.traced, self.graph, self.scene = nodes, nodes.traced, nodes.graph, scene
@@ -191,7 +198,7 @@ class _AtStates:
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
-        """Return the graph at coordinates and speeds of the states numbered `which`."""
+        """Return the graph at coordinates and speeds of the states with indices `which`."""
         return Probes(self.graph, named_values(self.scene, self.t[which], q, u, self.inputs[which]))
 
     def probed(self, u_other) -> Probed:
@@ -218,7 +225,7 @@ class _AtStates:
         return _values(self.values, nodes)
 
     def real(self, x: np.ndarray) -> np.ndarray:
-        """Return numbers in the precision in use; probes are computed in double precision."""
+        """Return numbers in the current precision; probes are computed in double precision."""
         return np.asarray(x, real_type())
 
     def _matrices(self, probes: Probes, entries: SparseRows, columns: list[int]) -> np.ndarray:
@@ -232,18 +239,18 @@ class _AtStates:
         return found
 
     def _row_matrices(self, probes: Probes) -> np.ndarray:
-        """Return a at these probes."""
+        """Return A at these probes."""
         return self._matrices(probes, self.nodes.rows, self.traced.u.tolist())
 
     def _mass_matrix(self) -> np.ndarray:
-        """`M = sum m beta' beta + gamma' I gamma`."""
+        """Return `M = sum m beta' beta + gamma' I gamma`."""
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
         partial = self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist())
         return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
-        """Return speeds projected onto the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN
-        where rows are not numbers.
+        """Return speeds projected onto the constraints, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds;
+        NaN where constraints are NaN.
         """
         at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
@@ -265,7 +272,9 @@ class _AtStates:
         return moved(np.where(np.isfinite(last)[:, None], x, np.nan), every)
 
     def _assembled(self, q) -> Assembled:
-        """Return coordinates projected onto geometric rows and unit norms, inside the domain if possible."""
+        """Return coordinates projected onto geometric constraints and unit norms, inside the domain if
+        possible.
+        """
         q = np.array(q, float)
         for first, _ in self.scene.coordinates.quaternions:
             length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
@@ -293,8 +302,8 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
 
 
 def _inverse_root(M: np.ndarray) -> np.ndarray:
-    """Return `L'^-1` with `M = L L'`, or the identity if M is singular. The projection then makes the
-    smallest change of scaled speeds.
+    """Return `L'^-1` with `M = L L'`, or the identity if M is singular; the projection is then Euclidean in
+    scaled speeds.
     """
     try:
         root = np.linalg.cholesky(M)

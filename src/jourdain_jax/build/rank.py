@@ -19,16 +19,16 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Scaled(eqx.Module):
-    """The quantities that decide ranks and pivots, at every probed state."""
+    """The quantities from which ranks and pivots are decided, at every probed state."""
 
     A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
-    lengths: Float[np.ndarray, "states rows"]  # of the rows before
+    lengths: Float[np.ndarray, "states rows"]  # of the rows before scaling
     M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
     c: Float[np.ndarray, "states speeds"]  # scales of the speeds
 
 
 def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
-    """`d A c` with the scales that the accelerations use (`scaling.row_scale`)."""
+    """Return `d A c` with the scales used for accelerations (`scaling.row_scale`)."""
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
@@ -36,59 +36,63 @@ def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
 
 
 def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
-    """Return the ranks of scaled rows. The cut-off is that of the accelerations or, if larger, the error of
-    the configuration.
+    """Return the ranks of scaled rows. The cut-off is `rank_cutoff` or, if larger, 100 times the error of the
+    configuration.
     """
     if not A.size:
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
-    # singular values below 100 errors of the configuration are of the error, not of the rows
+    # smaller singular values are errors of the configuration, not of the rows
     return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1).tolist()
 
 
 def contradictions(
     who: str, names: Labels, A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
 ) -> Labels:
-    """Return a sentence on the rows that no speeds satisfy together at some of the random states.
+    """Return a sentence on constraints that no speeds satisfy together at any of the random states.
 
-    A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
+        A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
 
-    `A`, `at_rest`: scaled rows and their values phi_0 at u = 0, of rows that are affine in the speeds.
+    `A`, `at_rest`: scaled rows and their values phi_0 at u = 0, for constraints affine in the speeds.
     """
     U = np.linalg.svd(A, full_matrices=False)[0]
     U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
     left = at_rest - (U @ (U.transpose(0, 2, 1) @ at_rest[..., None]))[..., 0]
-    # numbers may be typed with a few digits, mistakes are larger
+    # covers rounded constants; mistakes are larger
     unmet = np.abs(left) > 1e-4 * largest(at_rest, 1, keepdims=True)
     if not unmet.size or not unmet.any(axis=1).all():
         return ()
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
     idle = [name for name, s in wrong if not A[:, s].any()]
     if idle:
-        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state relations "
-            "between coordinates in `geometric_constraints`",)
+        return (
+            f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
+            "relations between coordinates in `geometric_constraints`",
+        )
     several = ", ".join(f"`{name}`" for name, _ in wrong)
-    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of "
-        f"{len(A)} random states; omit one, or correct it",)
+    return (
+        f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of {len(A)} "
+        "random states; omit or correct one",
+    )
 
 
 def redundant_rows(
     found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: Labels, far: Callable[[], Scaled]
 ) -> Labels:
     """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
-    state and stays far from losing it.
+    state and is well conditioned.
 
-    An omitted row is a combination of the others. Large coefficients count as unbounded. For example, the
-    coefficients that express a wheel's row along y by its row along x and those of the wheel beside it are
-    tangents of the heading. `generic`: which of the states `found` are random; `far`: rows at full turns of
-    all angles.
+    An omitted row is a combination of the others, with bounded coefficients; large ones count as unbounded.
+    For example, the lateral row of one wheel is a combination of its longitudinal row and the other wheel's,
+    with tangents of the heading as coefficients. `generic`: which of the states `found` are random; `far`:
+    rows at angles far from them.
     """
-    if not ranks:  # no state serves, which is a fault of its own
+    if not ranks:  # no usable state is reported as another fault
         return ()
     kept, everywhere = list(range(len(names))), None
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
-            break  # somewhere those that are left are independent
+            break  # the remaining rows are independent somewhere
         rest = [i for i in kept if i != s]
         if ranks_of(found.A[:, rest], errors) != ranks:
             continue
@@ -141,7 +145,7 @@ def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Ind
 
 
 def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray:
-    """Smallest singular value of A_z at every probe."""
+    """Return the smallest singular value of A_z at every probe."""
     if rank == 0:
         return np.ones(len(scaled))
     return np.linalg.svd(scaled[:, :, dependent], compute_uv=False)[:, rank - 1]
@@ -149,7 +153,7 @@ def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray
 
 def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
     """Return the smallest pivot over the domain; zero if the determinant of A_z changes sign between probes,
-    since it then vanishes between them.
+    since it vanishes in between.
     """
     if rank and scaled.shape[1] == rank:
         signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
@@ -159,8 +163,8 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
 
 
 def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
-    """Return the independent speeds for which the worst pivot over all probes is largest; among equals the
-    largest typical pivot decides.
+    """Return the independent speeds with the largest worst pivot over all probes; the largest typical pivot
+    breaks ties.
     """
     if rank == 0:
         return tuple(range(count))
@@ -179,7 +183,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
 
 
 def _greedy(A: np.ndarray, rank: int) -> Indices:
-    """Return columns chosen one after another by largest remaining length (pivoted QR)."""
+    """Return columns chosen in turn by largest remaining length (pivoted QR)."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):
         lengths = np.linalg.norm(remaining, axis=0)

@@ -3,7 +3,7 @@ derivatives, the mass matrix.
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
 
-Unit norms of quaternions count as geometric rows.
+Unit norms of quaternions count as geometric constraints.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from jourdain_jax.scene.identity import once_per_class, with_reference_parameter
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
-Matrix = dict[tuple[int, int], int]  # row and column -> node, of entries that are not zero
+Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class RowProgram:
     """
 
     graph: Graph
-    parameters: tuple[Indices, ...]  # of each leaf of the scene, entry by entry; -1 for what is not needed
+    parameters: tuple[Indices, ...]  # of each leaf of the scene, by entry; -1 for unused ones
     t: int
     q: Indices
     u: Indices
@@ -44,9 +44,10 @@ class RowProgram:
     G: Matrix
     phi: Indices
     A: Matrix
-    M: Matrix | None  # lower triangle; None where it is too large to be written out
-    right: int  # whether parameters and bodies are
-    others: Indices  # coordinates of other states, projected onto the geometric rows, on which that depends too
+    M: Matrix | None  # lower triangle; None if too large to be written out
+    right: int  # truth value: parameters and bodies are valid
+    # coordinates of other states, projected onto the geometric constraints, on which `right` also depends
+    others: Indices
 
 
 @once_per_class
@@ -85,9 +86,9 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     """Return the node of a truth value, true for valid parameters, and the coordinates of other states on
     which it depends.
 
-    Parameters are valid if each is finite, has its sign, and causes no fault of `plausibility.CHECKS`. Faults
-    that do not depend on parameters are found where the scene is probed. If geometric rows depend on
-    parameters, so do the coordinates of these states.
+    Parameters are valid if each is finite, has its required sign, and causes no fault of
+    `plausibility.CHECKS`. Faults independent of parameters are found when the scene is probed. If geometric
+    constraints depend on parameters, so do the coordinates of these states.
     """
     g, traced = looked.graph, looked.traced
     states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0
@@ -127,8 +128,8 @@ def _entries(rows: list[dict[int, int]], variables: list[int]) -> Matrix:
 
 
 def _mass_matrix(nodes: LookedAt, u: list[int]) -> Matrix | None:
-    """`M = d^2 T/du^2`, the lower triangle."""
-    # products of entries of velocities: beyond, the mass matrix is not written out
+    """Return the lower triangle of `M = d^2 T/du^2`, or None if it is too large."""
+    # more products of entries of velocities than this: too large to be written out
     if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:
         return None
     graph, (kinetic, _) = nodes.graph, nodes.traced.at.energies.tolist()

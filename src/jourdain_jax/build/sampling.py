@@ -1,5 +1,5 @@
-"""States of a scene's domain, projected onto its constraints: random ones, and the symmetric configurations
-(zero and right angles), where partitions that are regular at random states may be singular.
+"""States of a scene's domain, projected onto its constraints: random ones, and symmetric configurations (zero
+and right angles), where partitions that are regular at random states may be singular.
 """
 
 import itertools
@@ -16,11 +16,12 @@ from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 
 GUESSES = 8  # of a start, of each kind
-NEARLY_INSIDE = 0.05  # of the width of the domain
+NEARLY_INSIDE = 0.05  # in widths of the domain
 
 
 class NoStateFoundError(ValueError):
-    """Raised where no state in a scene's domain satisfies the geometric rows and has rows without NaN."""
+    """Error for a domain without a state that satisfies the geometric constraints and has finite constraints.
+    """
 
 
 @of_known_numbers
@@ -28,16 +29,16 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     """Return at most `count` random admissible states (t, q, u) from the scene's domain, on the constraints,
     each with a leading axis of states.
 
-    `seed`: of the generator. Raises ValueError where no state satisfies the geometric rows, or where rows are
-    NaN at all such states; DifferentiationModeError where the scene's parameters are traced.
+    `seed`: of the generator. Raises ValueError if no state satisfies the geometric constraints, or if
+    constraints are NaN at all such states. Raises DifferentiationModeError for traced parameters.
     """
     scene = as_scene(scene)
     checked_whole(count, "`count`", 1, expected="of states, at least 1")
     checked_whole(seed, "`seed`", 0, expected="that is not negative")
-    drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
+    drawn = -(-count // 32) * 32  # a multiple of 32, so that one program serves all small samples
     for t, *begin in drawn_states(scene, drawn, np.random.default_rng(seed)):
         q, u, found = sampled_on_graph(scene, t, *begin)
-        numbers = all_finite(u, axis=1)  # put on rows that are none, speeds are none
+        numbers = all_finite(u, axis=1)  # projection onto constraints that are NaN gives NaN
         if (found.on_rows & numbers).any():
             break
     good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)) & numbers)[:count]
@@ -47,34 +48,34 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
-    """Return the error of a scene whose rows are not numbers at any of `count` random states."""
+    """Return the error for a scene whose constraints are NaN at all of `count` random states."""
     low, high = coordinate_bounds(scene)
     attitude = {first + k for first, _ in scene.coordinates.quaternions for k in range(4)}
     spans = [f"`{name}` from {low[i]:.4g} to {high[i]:.4g}" for i, name in enumerate(scene.coordinate_names.entries) if i not in attitude]
     return NoStateFoundError(
-        f"the rows of `{type(scene).__name__}` are numbers at none of {count} random "
-        f"states, with {', '.join(spans)}: a pose, a contact or a row is no number "
-        "there, such as the square root of a negative number; state a `domain` inside "
-        "which they are numbers, "
-        'as in `domain = {"x": (-0.1, 0.1)}`'
+        f"the constraints of `{type(scene).__name__}` are NaN at all of {count} random states, with "
+        f"{', '.join(spans)}: a pose, a contact or a constraint is undefined there, such as the square root "
+        "of a negative number; state a `domain` inside which they are defined, as in `domain = "
+        f"{{'x': (-0.1, 0.1)}}`"
     )
 
 
 def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield states from the domain, not yet projected; if these fail, yield states near the scene's example,
-    if it has one.
+    """Yield states from the domain, not yet projected; if these fail, states near the scene's example, if it
+    has one.
     """
     yield random_states(scene, count, generator)
     if scene.example:
         t, q, u = random_states(scene, count, generator)
         low, high = coordinate_bounds(scene)
-        near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
+        # fractions of the domain: constraints may be satisfiable, or defined, only in a small part of it
+        near = 10.0 ** -(1.0 + np.arange(count) % 6)
         yield t, vectors_named(scene, scene.example)[0] + near[:, None] * (q - (low + high) / 2), u
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
-    """Yield configurations near q: first of the `states` on the constraints (nearest in coordinates that are
-    not `free`), then elsewhere in the domain.
+    """Return configurations to start from: near q, then `states` on the constraints (nearest in coordinates
+    that are not `free`), then elsewhere in the domain.
     """
     on = array_module(q)
     q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
@@ -91,7 +92,7 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
     """Return marks of usable states: on the geometric constraints to round-off and inside the domain. If few
     random states are inside, the nearest ones count as well.
 
-    Raises ValueError where no random state lies on the rows.
+    Raises ValueError if no random state satisfies the geometric constraints.
     """
     good = np.isfinite(found.error)
     if not good[generic].any():
@@ -99,34 +100,35 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
             ""
             if np.isfinite(found.position_error[generic]).any()
             else (
-                "; no row is a finite number anywhere: a contact finds no point where a ball is larger than "
-                "the cylinder or sphere that it rolls in, or where the gradient of a surface vanishes"
+                "; no constraint is finite anywhere: a contact has no point if a ball is larger than its "
+                "hollow cylinder or sphere, or if the gradient of a surface vanishes"
             )
         )
         raise NoStateFoundError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the "
-            f"geometric rows by {np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer "
-            "to an assembled configuration, or an `example` on the rows, or check the geometric rows against "
-            "each other (traced parameters were replaced by numbers near their defaults, or near 1 if there "
-            f"is no default: give defaults near the values in use){nowhere}"
+            f"geometric constraints by {np.min(found.position_error[generic]):.1e} or more; state a `domain` "
+            "nearer to an assembled configuration, or an `example` on the constraints, or check whether "
+            "constraints contradict each other (traced parameters were replaced by numbers near their "
+            f"defaults, or near 1 without a default: give defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
-    # with fewer than 8 random states inside the domain, those nearest to it are used as well
+    # with fewer than 8 random states inside the domain, the nearest ones count as well
     return good & (found.outside <= max(outside[min(8, len(outside)) - 1], NEARLY_INSIDE))
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
-    """Return configurations with zero and right angles (within the domain) in one or two coordinates; of many
-    coordinates, in some of them one by one.
+    """Return configurations with zero and right angles (within the domain) in one or two coordinates; for
+    scenes with many coordinates, in single ones of them.
     """
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
     turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
-    # chains of hundreds of bodies are looked at in fewer configurations, 12,000 coordinates together, but in 24
+    # long chains get fewer configurations: 12,000 coordinates in all, but at least 24 configurations
     most = max(24, min(200, 12_000 // max(1, len(low))))
     if len(turns) < most:
-        pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
+        # equal angles first: headings of one axle
+        pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])
         chosen = [(), *((turn,) for turn in turns), *pairs]
     else:
         chosen = [(), *((turns[k],) for k in np.linspace(0, len(turns) - 1, most - 1).astype(int))]

@@ -1,12 +1,13 @@
-"""Smoothness of the motion of bodies: where the velocity of a pose jumps, its force of inertia, a second
-derivative, is lost.
+"""Smoothness of the motion of bodies: where the velocity of a pose jumps, its second derivative and with it
+the inertia force is lost.
 
-    r(t, q), R(t, q), g(t, q)      once continuously differentiable, or mass times a jump of velocity is lost in silence
+    r(t, q), R(t, q), g(t, q)      once continuously differentiable; otherwise the impulse of a jump is lost
     qdot(t, q, u)                  continuous, for the same reason
-    phi(t, q, 0)                   of velocity rows, continuous in time: where it jumps and A does not, speeds would have to jump
+    phi(t, q, 0)                   continuous in time: if it jumps and A does not, speeds would have to jump
 
-A piecewise linear interpolation has a second derivative of zero wherever one looks. What a branch or a call of JAX decides on the way to these quantities is
-therefore looked at along lines in t and q, where it or its rate may jump: r, R and g, and v, omega and dg/dt at some speeds.
+A piecewise linear interpolation has a second derivative of zero at every evaluated point. Branches and calls
+of JAX that affect these quantities are therefore evaluated along lines in t and q, to find jumps of the
+quantity or its rate: r, R and g, and v, omega and dg/dt at some speeds.
 """
 
 from collections import Counter
@@ -24,20 +25,20 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
 SPEEDS_WOULD_JUMP = (
-    "speeds would have to jump there, by an impulse that no acceleration holds. Let it change within a short "
-    "time, as by a `jj.Sampled` input, or end the motion there and start another with the speeds after the "
-    "jump"
+    "speeds would have to jump there, by an impulse that no acceleration holds. Let it change gradually, as "
+    "by a `jj.Sampled` input, or end the motion there and start another with the new speeds"
 )
 
 
 def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
-    """Return one sentence for each body, row or coordinate that jumps or whose velocity jumps; `q`, `u`: some
-    states.
+    """Return one sentence for each body, constraint or coordinate that jumps or whose velocity jumps; `q`,
+    `u`: some states.
     """
     nodes = looked_at(scene)
     at, geometric = nodes.traced.at, len(nodes.traced.at.closure)
     smooth = owned(scene, **{name: getattr(at, name) for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")})
-    rows = dict(zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True))  # they must not jump as time continues
+    # values of velocity constraints, which must be continuous in time
+    rows = dict(zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True))
     if not any(passes(nodes.graph, smooth | rows, NONANALYTIC | CALLS)):
         return ()
 
@@ -47,8 +48,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
         return Probes(nodes.graph, named_values(scene, points[:, 0], points[:, 1:], *others))(wanted).T
 
     def met(wanted: list[int], a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Return, for every interval between points `a` and `b` that holds a jump, the node that jumps and
-        the points before and behind the jump.
+        """Yield, for every interval between points `a` and `b` with a jump, the node that jumps and the
+        points before and after the jump.
         """
         for k, *sides in jumps(lambda points: values(wanted, points), a, b):
             yield wanted[k], np.stack(sides)
@@ -57,10 +58,11 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
     for node, sides in met([*smooth, *rows], *_in_time(scene, q)):
         if node in smooth:
             found.setdefault(smooth[node], _said(scene, smooth[node], f"at t = {sides[1, 0]:.6g} s"))
-        elif np.allclose(*values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9):  # where rows change, a state may meet both
-            found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = "
-                f"{sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
-    # three kinks along coordinates make a look-up: a single one may lie where no motion comes
+        # if A changes too, a state may satisfy both
+        elif np.allclose(*values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9):
+            found.setdefault(rows[node], f"constraint `{rows[node]}` of `{type(scene).__name__}` jumps at t "
+                                         f"= {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
+    # three kinks along coordinates indicate a look-up table; a single one may lie off any motion
     for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(scene, q))).items():
         if count >= 3:
             found.setdefault(name, _said(scene, name, "at several places on its way"))
@@ -68,8 +70,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
 
 
 def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return intervals of time for one of the states `q`: 192 in the usual span, and others around the
-    numbers in the scene's arrays (up to 128 of each), which may be knots.
+    """Return intervals of time, each with one of the states `q`: 192 in the usual span, and others around the
+    numbers in the scene's arrays (up to 128 of each), which may be sample times.
     """
     span = float(scene.example_span)
     t = np.linspace(1e-6 * span, span, 193)
@@ -88,11 +90,11 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return intervals on 6 lines across the box that contains some states `q`, 48 on each, at random times.
+    """Return intervals on 6 lines across the bounding box of the states `q`, 48 on each, at random times.
 
     The lines are projected onto the geometric constraints: elsewhere, as inside a body that others roll on, a
-    constraint may jump where no motion comes. An interval is omitted if an end does not arrive, or if its ends
-    arrive in different places.
+    constraint may jump at states that no motion reaches. Intervals with an end that does not converge, or
+    with ends at distant places, are omitted.
     """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))

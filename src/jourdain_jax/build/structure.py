@@ -1,9 +1,10 @@
 """Facts that hold at every state of a scene, found once by probing: rank, privileged velocities, kinds of
 constraints.
 
-States are drawn from the scene's domain, together with the symmetric configurations (zero and right angles), where partitions that look
-well at random states are singular; all are projected onto the geometric rows. Probing runs on concrete numbers also while a scene's
-parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
+Random states are drawn from the scene's domain. Symmetric configurations (zero and right angles) are added,
+since partitions that are regular at random states may be singular there. All are projected onto the geometric
+constraints. Probing uses concrete numbers even while a scene's parameters are traced (numbers near the
+class's defaults), so that the choice is static.
 """
 
 from collections.abc import Iterable, Iterator
@@ -30,7 +31,7 @@ from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
-WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
+WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is the default
 
 
 @dataclass(frozen=True)
@@ -38,84 +39,83 @@ class Structure:
     """Static facts about a scene."""
 
     row_names: Labels
-    rank: int  # of the rows at generic states
+    rank: int  # at generic states
     ranks: tuple[int, ...]  # at all probed states
     redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: Labels  # those of them that no identity makes follow from the others: they may not, where no probe lies
-    rank_losses: Labels  # configurations among the probed ones with fewer independent rows, as text
+    may_set_in: Labels  # those of them that may be independent away from the probes
+    rank_losses: Labels  # probed configurations with fewer independent rows, as text
     independent: Indices  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
     typical_pivot: float  # its median
-    affine: bool  # rows are linear or affine in the speeds
+    affine: bool  # constraints are linear or affine in the speeds
     homogeneous: bool  # phi vanishes at u = 0
-    timed: Labels  # what depends on time by itself, out of `TIMED`
-    driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
-    massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
+    timed: Labels  # quantities that depend explicitly on time, from `TIMED`
+    driven: bool  # bodies or coordinates move while all speeds are zero
+    massless: bool  # M is singular: some free motion has no inertia
     varying_inertia: bool  # masses or central inertias change along the motion
-    potentials_of_inputs: Indices  # numbers of the loads whose potential depends on inputs
-    rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
+    potentials_of_inputs: Indices  # indices of the loads whose potential depends on inputs
+    rows_of_inputs: bool  # constraints depend on inputs; accelerations then depend on their rates
     chosen_by_user: bool
-    kinks: Labels  # what is not smooth, as sentences
+    kinks: Labels  # quantities that are not smooth, as sentences
     odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
-    odd_grounds: Labels  # grounds of contacts that move in another way than is stated
-    faults: Labels  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
-    row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
-    plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
-    times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
+    odd_grounds: Labels  # grounds of contacts whose motion contradicts the stated one
+    faults: Labels  # impossible bodies and planes, contradictory constraints; as sentences
+    row_lengths: np.ndarray = field(compare=False, repr=False)  # typical, in scaled speeds
+    plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in unscaled speeds
+    times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric constraints
     coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
-    random: int  # how many of them are random ones
-    closure_slopes: np.ndarray = field(compare=False, repr=False)  # derivatives of geometric rows and unit norms, at the first of them
-    row_slopes: np.ndarray = field(compare=False, repr=False)  # derivatives of the rows in the speeds, at the same
+    random: int  # number of random ones
+    closure_slopes: np.ndarray = field(compare=False, repr=False)  # of closures, first states
+    row_slopes: np.ndarray = field(compare=False, repr=False)  # A, same states
 
     @property
     def decisions(self) -> tuple:
-        """Return the findings that decide the integration of the scene; the others describe it."""
+        """Return the findings that decide how the scene is integrated; the others describe it."""
         of_rows = self.row_names, self.rank, self.redundant_rows, self.may_set_in, self.affine, self.homogeneous, self.rows_of_inputs
         of_speeds = self.independent, self.chosen_by_user, self.well_conditioned, self.typical_pivot >= WELL_CONDITIONED
         return *of_rows, *of_speeds, self.timed, self.driven, self.massless, self.varying_inertia, self.potentials_of_inputs
 
     @property
     def rheonomic(self) -> bool:
-        """Whether anything depends explicitly on time: rows, poses, inertias, coordinate rates, loads or
-        potentials."""
+        """Return whether any quantity of `TIMED` depends explicitly on time."""
         return bool(self.timed)
 
     @property
     def timed_kinematics(self) -> bool:
-        """Whether rows, poses or coordinate rates do."""
+        """Return whether constraints, poses or coordinate rates depend explicitly on time."""
         return not {"rows", "poses", "coordinate rates"}.isdisjoint(self.timed)
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of independent speeds at generic states."""
+        """Return the number of independent speeds at generic states."""
         return len(self.independent)
 
     @property
     def kept_rows(self) -> Indices:
-        """Numbers of the rows that are not redundant."""
+        """Return indices of the rows that are not redundant."""
         return tuple(s for s, name in enumerate(self.row_names) if name not in self.redundant_rows)
 
     @property
     def dependent_rows(self) -> bool:
-        """Whether rows depend on each other although none may be omitted, since each is needed somewhere."""
+        """Return whether the kept rows still depend on each other, each being needed at some state."""
         return len(self.kept_rows) > self.rank
 
     @property
     def rows_may_contradict(self) -> bool:
-        """Return whether constraints are redundant and prescribe motion even at rest. The omitted constraints
-        then do not necessarily follow from the others.
+        """Return whether constraints are redundant and prescribe motion at rest. The omitted constraints may
+        then contradict the others.
         """
         return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
 
     @property
     def has_minimal_state(self) -> bool:
-        """Whether the integrated state is by default the coordinates and privileged speeds."""
+        """Return whether the integrated state is by default the coordinates and privileged speeds."""
         return self.affine and self.well_conditioned
 
     @property
     def well_conditioned(self) -> bool:
         """Return whether the privileged velocities are usable everywhere in the domain."""
-        # of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+        # for a chain of n rows that each couple two neighbours the value falls as 1/n, although no pivot does
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
 
@@ -125,8 +125,8 @@ def _moves(rates: np.ndarray) -> bool:
 
 
 def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
-    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because rows
-    may be stated in any unit.
+    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because
+    constraints may have any unit.
     """
     size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
     return bool(np.any(np.abs(difference) > tolerance * size))
@@ -142,7 +142,7 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         found = probed_on_graph(scene, t, q, u, u_other, generic)
         if not found.in_calls:
             return found
-        # no graph says what calls do where the probes do not show it: a few states are looked at that are far off, as they are
+        # the graph does not show how calls behave away from the probes, so a few distant states are probed
         generator, count = np.random.default_rng(1), 16
         far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
         for first, _ in scene.coordinates.quaternions:
@@ -158,7 +158,7 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
-    """Return the nonzero quantities at distant states; for constraints, those above round-off."""
+    """Return the quantities that are nonzero at distant states; for constraints, above round-off."""
     some = np.sqrt(eps_of(found.A))
     seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
     rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
@@ -176,19 +176,19 @@ def structure_of(scene: Scene) -> Structure:
     conditioning, kinds of constraints; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers
-    replace traced parameters. Raises ValueError where no admissible state is found, where bodies do not move
-    smoothly, where a free motion has no inertia, or where `privileged` names unknown or too few speeds; for
-    known parameters also for impossible numbers of bodies or planes, and for contradictory rows.
+    replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not move
+    smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For known
+    parameters, raises it also for impossible numbers of bodies or planes, and for contradictory constraints.
     """
     structure = structure_whatever_its_faults(scene)
-    # numbers that replace traced parameters prove nothing of bodies and grounds
+    # replaced parameters prove nothing about bodies and grounds
     if wrong := structure.kinks or (is_judged(scene) and (structure.odd_grounds or structure.faults)):
         raise ValueError(wrong[0])
     return structure
 
 
 def structure_whatever_its_faults(scene: Scene) -> Structure:
-    """Static facts about a scene whose numbers may be wrong."""
+    """Return static facts about a scene without raising its faults."""
     return _structure(as_scene(scene))
 
 
@@ -206,26 +206,27 @@ def trust(scene: Scene) -> float:
 
 
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
-    """Typical lengths of the rows of `A` in the units of the speeds."""
+    """Return typical lengths of the rows of `A` in the units of the speeds."""
     return structure_whatever_its_faults(scene).plain_row_lengths * trust(scene)
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
     """Return typical lengths of the geometric rows (of their rates) and of quaternion norms in the
-    coordinates, for `project_positions`."""
+    coordinates, for `project_positions`.
+    """
     geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
     return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
 
 
 def usual_rows(scene: Scene) -> UsualRows:
-    """Typical lengths of the rows in scaled speeds, and their rank at generic states."""
+    """Return typical lengths of the rows in scaled speeds, and their rank at generic states."""
     known = structure_whatever_its_faults(scene)
     return UsualRows(known.row_lengths * trust(scene), np.asarray(known.rank, np.int32))
 
 
 @once_per_values
 def _structure(scene: Scene) -> Structure:
-    with np.errstate(all="ignore"):  # what is not a number at a probe does not count there
+    with np.errstate(all="ignore"):  # probes with NaN are ignored
         return _probed_structure(scene)
 
 
@@ -243,20 +244,23 @@ def _probed_structure(scene: Scene) -> Structure:
     usable = all_finite(A, axis=(1, 2)) & on_rows
     if not faults and not usable.any():
         finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
-        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
-        faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected "
-            "numbers; check how they are computed",)
+        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "(all)"
+        faults = (
+            f"constraints {named} of `{type(scene).__name__}` are not finite at any probed state, expected "
+            "numbers; check their computation",
+        )
     if usable.any() and not usable[generic].any():
-        raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone tell no rank
+        raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone do not show the generic rank
     typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
     beyond = found.A_beyond[generic]
     t, u, generic, found = at_index((t, u, generic, found), usable)
     scaled = scaled_states(found, typical)
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
-    if not faults:  # a negative mass is named as such
+    if not faults:  # a negative mass is reported as a fault instead
         _check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
-    candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
+    # at isolated losses of rank no partition has the generic size
+    candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
     independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
     dependent = [i for i in range(count) if i not in independent]
@@ -264,14 +268,16 @@ def _probed_structure(scene: Scene) -> Structure:
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
     acts, at_rest = lambda name: name in unproved or _moves(found.vanishing[name]), found.vanishing["rows at rest"]
     affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
-    # near round-off: work that turns out as zero does less harm than work left out
+    # near round-off: integrating zero work does less harm than omitting work
     homogeneous = "rows at rest" not in unproved and not _exceeds(at_rest, 32 * eps, _speeds(found, u))
     rows_of_inputs = acts("rows of inputs")
-    asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))  # smaller numbers may be errors of tables and of iterations
+    # smaller numbers may be errors of tables and iterations
+    asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
         faults = contradictions(type(scene).__name__, names, scaled.A[generic], asked, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
-    faults = faults or sentences(scene, found.numbers, "gravity")  # last: what replaces a traced direction must hide nothing else
+    # last, since the replacement of a traced direction must not hide another fault
+    faults = faults or sentences(scene, found.numbers, "gravity")
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
@@ -309,8 +315,7 @@ def _probed_structure(scene: Scene) -> Structure:
 
 
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Return times, speeds, marks of random states, and findings, at the given random states and at symmetric
-    ones."""
+    """Return times, speeds, marks of random states, and findings, at random and symmetric states."""
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES
@@ -318,13 +323,12 @@ def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _is_singular(M: np.ndarray) -> bool:
-    """Return whether scaled inertias are singular at all of some states."""
+    """Return whether scaled inertias are singular at all states."""
     return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M)))
 
 
 def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
-    """Raise ValueError with the names of the speeds along which free motion meets no inertia of a body at
-    every generic state."""
+    """Raise ValueError for speeds along which free motion has no inertia at every generic state."""
     moved = []
     for A, M, c in zip(found.A, found.M, found.c, strict=True):
         free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
@@ -339,14 +343,15 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
     raise ValueError(
         f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
-        "constraint determines it, so that its acceleration is not determined; give a body that moves with "
-        "it a mass (or inertia), add a constraint, or omit the coordinate"
+        "constraint determines it; give a body that moves with it a mass (or inertia), add a constraint, or "
+        "omit the coordinate"
     )
 
 
 def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
-    """Return scaled rows at coordinates up to half a turn away from the given ones that satisfy the geometric
-    constraints."""
+    """Return scaled rows at states on the geometric constraints whose coordinates differ from the given ones
+    by up to half a turn.
+    """
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
     turned = q + generator.uniform(-np.pi, np.pi, q.shape)
@@ -366,10 +371,10 @@ class Reference:
     """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
 
     Two references are equal if their scenes lead to the same decisions (`Structure.decisions`), and then
-    share one program. So the arguments of a call determine what it runs, not the order of calls. Parameters
+    share one program. So the arguments of a call determine its program, not the order of calls. Parameters
     that are already traced are replaced by the class's defaults.
 
-    `varied`: names of parameters that differ between lanes (None: all). They are replaced by numbers nearby,
+    `varied`: names of parameters that differ within a batch (None: all). They are replaced by numbers nearby,
     so that coincidences do not count.
     """
 
@@ -381,7 +386,7 @@ class Reference:
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
-        """Inside, its numbers stand in."""
+        """Return a context in which its numbers replace traced parameters."""
         with reference_parameters(self.scene, self._varied):
             yield
 

@@ -1,14 +1,15 @@
-"""A scene traced to a graph of scalars, at the level of velocities: the input of Jourdain's principle before
-any derivative.
+"""A scene traced to a graph of scalars at velocity level: the input of Jourdain's principle before any
+derivative.
 
-v, omega (body axes), phi, qdot      of (t, q, u)
-g                                    geometric rows at the level of positions
-F, L (body axes), Q_direct, power    impressed forces
-m, I                                 inertias
-c                                    stop events
-T, V                                 energies
+    v, omega (body axes), phi, qdot      of (t, q, u)
+    g                                    geometric constraints at position level
+    F, L (body axes), Q_direct, power    impressed forces
+    m, I                                 inertias
+    c                                    stop events
+    T, V                                 energies
 
-The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
+The same graph serves probing (`probed_on_graph`) and lowering. Traces are cached per class and shapes of the
+parameters.
 """
 
 from collections.abc import Callable
@@ -61,32 +62,36 @@ class VelocityQuantities(eqx.Module):
     force: PerBody
     torque: PerBody  # body axes
     direct: Num[Entries, "speeds"]
-    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
+    # of loads without a potential, and of potentials that depend on time or on inputs
+    power: Num[Entries, ""]
     events: Num[Entries, "events"]  # sorted by name
-    resets: Num[Entries, "events rows"]  # as `event_resets` has them
+    resets: Num[Entries, "events rows"]  # as in `event_resets`
     energies: Num[Entries, "2"]  # kinetic and potential
     slip_turns: Num[Entries, "directions"]  # rates of directions of slip, the last coordinates
-    held: Num[Entries, "coordinates_and_speeds"]  # projected onto the constraints of contacts that are closed; none where no contact switches
+    # projected onto the constraints of closed contacts; empty without switching contacts
+    held: Num[Entries, "coordinates_and_speeds"]
     start: Num[Entries, "numbers"]  # `switching.Begun`
-    responses: Num[Entries, "states numbers"]  # of contacts that switch, of which the others are made: at coordinates, speeds and inputs, which come first
+    # of switching contacts, from which the others follow: after the coordinates, speeds and inputs at which
+    # they hold
+    responses: Num[Entries, "states numbers"]
 
 
 class Particulars(eqx.Module):
     """Quantities for probing only; arrays of numbers, or of nodes."""
 
     numbers: Numbers
-    potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
-    explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
+    potentials: Num[Entries, "loads"]  # of the loads; zero for a load without one
+    explicit: dict[str, PyTree]  # rates in time of loads and potentials at fixed motion
 
 
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
-    """Return the potential of each load, zero where it has none."""
+    """Return the potential of each load; zero for a load without one."""
     stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
     return jnp.stack(stored) if stored else jnp.zeros(0, motion.q.array.dtype)
 
 
 def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
-    """Return rates in time of loads and potentials while the motion, poses included, is held."""
+    """Return rates in time of loads and potentials at fixed motion, poses included."""
 
     def pieces(t):
         held = eqx.tree_at(lambda m: m.t, motion, t)
@@ -100,7 +105,8 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: Indices = (), w
     depends on inputs.
     """
     at = At(scene, motion) if scene.switching.contacts else None
-    stated = loads_at(scene, motion, at.found if at else None)  # once: a second time a callback would be another one
+    # once: evaluated twice, a callback would count as two
+    stated = loads_at(scene, motion, at.found if at else None)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(
         velocities.linear,
@@ -139,7 +145,7 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None
     """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the stored
     energy of the loads `of_inputs`.
 
-    The arrays have no rows if all events stop the motion.
+    The arrays are empty if all events stop the motion.
     """
     every = events_of(scene, motion) | (contact_changes(at or At(scene, motion)) if scene.switching.contacts else {})
     events = [event for _, event in sorted(every.items())]
@@ -163,7 +169,7 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None
 
 @dataclass
 class Variables:
-    """A graph and a scene's inputs of it, as nodes and arrays of nodes."""
+    """A graph and the inputs of a scene in it, as nodes and arrays of nodes."""
 
     graph: Graph
     t: int
@@ -175,33 +181,34 @@ class Variables:
 
 @dataclass
 class TracedScene(Variables):
-    """A graph with the scene's inputs and its quantities on the level of velocities, as arrays of nodes."""
+    """A graph with the scene's inputs and its quantities at velocity level, as arrays of nodes."""
 
     at: VelocityQuantities
     particulars: Particulars
-    effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
-    quaternions: Indices  # the coordinate that is the first part of each
+    effects: str  # name of a side effect in the scene, such as printing; empty if there is none
+    quaternions: Indices  # index of the first coordinate of each
 
     @property
     def attitudes(self) -> list[list[int]]:
-        """The four parts of each quaternion."""
+        """Return the four parts of each quaternion."""
         return [self.q[first : first + 4].tolist() for first in self.quaternions]
 
     @property
     def closures(self) -> list[int]:
-        """Geometric rows, and the unit norms of quaternions as rows."""
+        """Return the geometric constraints, and the unit norms of quaternions as constraints."""
         g = self.graph
         return [*self.at.closure.tolist(), *(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in self.attitudes)]
 
     @property
     def motion(self) -> list[np.ndarray]:
-        """The functions of the state, from poses and constraints, of which derivatives are taken."""
+        """Return the functions of the state, from poses and constraints, whose derivatives are needed."""
         at = self.at
         return [at.v, at.omega, at.position, at.orientation, at.mass, at.inertia, at.phi, at.closure, at.qdot]
 
 
 def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
-    """Return the scene as a new graph. Parts without a scalar form, or with their own derivative, are calls.
+    """Return the scene as a new graph. Parts without a scalar form, or with a user-defined derivative, are
+    calls.
 
     `of_inputs`: indices of the loads whose potential depends on inputs.
     """
@@ -209,7 +216,8 @@ def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
     if isinstance(found, str):
         raise Unsupported(found)
     graph = copy(found.graph)
-    vars(graph).update({name: copy(x) for name, x in vars(graph).items()})  # its lists, to which nodes may be added
+    # its lists, to which nodes may be added
+    vars(graph).update({name: copy(x) for name, x in vars(graph).items()})
     return replace(found, graph=graph)
 
 
@@ -217,16 +225,16 @@ def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
     """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
     and inputs, and their shapes.
 
-    `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError where a method
-    reads a value that JAX traces elsewhere.
+    `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError if a method reads a
+    value that JAX traces elsewhere.
     """
     return _traced(scene, of_inputs)[0]
 
 
 @once_per_class
 def _traced(scene: Scene, of_inputs: Indices) -> tuple:
-    """Return the jaxpr with its shapes, and the scene on a graph that nothing is added to, or the operation
-    that has no scalar form.
+    """Return the jaxpr with its shapes, and the scene on a graph that must not be changed, or the name of the
+    operation without a scalar form.
     """
     closed, shape = _jaxpr(scene, of_inputs)
     try:
@@ -281,38 +289,38 @@ def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
     named["t_0"] = t
     for prefix, values in zip("qui", (q, u, inputs), strict=True):
         named |= {f"{prefix}_{i}": column for i, column in enumerate(np.moveaxis(np.asarray(values), -1, 0))}
-    return {name: np.asarray(value, np.float64) for name, value in named.items()}  # whatever precision motions have
+    # in double precision, whatever the motion's precision
+    return {name: np.asarray(value, np.float64) for name, value in named.items()}
 
 
 def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
-    """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`; the first owner
-    counts.
+    """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`. If owners share a
+    node, the first counts.
     """
     of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {"mass": "mass of", "inertia": "inertia of"}
     of_bodies |= {"force": "force on", "torque": "torque on"}
     named = {field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)] for field, what in of_bodies.items()}
     named["direct"] = [f"the force along `{name}`" for name in scene.speed_names.entries]
     named["qdot"] = [f"the rate of coordinate `{name}`" for name in scene.coordinate_names.entries]
-    named["closure"] = named["phi"] = [f"row `{name}`" for name in names_of_position_rows(scene)]
+    named["closure"] = named["phi"] = [f"constraint `{name}`" for name in names_of_position_rows(scene)]
     pairs = [pair for field, nodes in fields.items() for pair in zip(named[field], nodes, strict=False)]
     return {node: owner for owner, nodes in reversed(pairs) for node in np.ravel(nodes).tolist()}
 
 
 def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
-    """Potential energy in J of the loads with the numbers `of_inputs`."""
+    """Return the potential energy in J of the loads with the indices `of_inputs`."""
     loads = tuple(loads_of(scene, motion))
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
 def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None) -> Scalar:
-    """Return the part of `rate_of_work` without accelerations, W: loads without a potential, and potentials
-    that depend on time or on inputs.
+    """Return the part of `rate_of_work` without accelerations, in W: of loads without a potential, and of
+    potentials that depend on time or on inputs.
 
-    sum F.v + L.omega + Q_k u_k           loads without a potential
-    dV/dt at fixed poses                  potentials that depend on time
-    F_i.v + L_i.omega + Q_i u - dV_i/dt   loads whose potential depends on inputs, in place of that potential
+    sum F.v + L.omega + Q_k u_k loads without a potential dV/dt at fixed poses potentials that depend on time
+    F_i.v + L_i.omega + Q_i u - dV_i/dt loads whose potential depends on inputs, in place of that potential
 
-    `loads`: those of the scene at this motion, if they are already known.
+    `loads`: the scene's loads at this motion, if already known.
     """
     by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
     return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
@@ -343,8 +351,8 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> S
 def power_of_loads(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: Indices | None = None, loads: tuple[Load, ...] | None = None
 ) -> Scalar:
-    """Return `sum F.v + L.omega + Q_k u_k` in W, over loads with a potential (`conservative=True`), without
-    one (`False`), or with the indices `among`.
+    """Return `sum F.v + L.omega + Q_k u_k` in W, over the loads with a potential (`conservative=True`),
+    without one (`False`), or with the indices `among`.
 
     `loads`: as in `explicit_power`.
     """
@@ -355,9 +363,7 @@ def power_of_loads(
 
 
 def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
-    """Return `dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u
-    = 0`.
-    """
+    """Return `dV/dt` of a `potential` with fixed poses, and with the coordinates moving as at `u = 0`."""
     q = motion.q.array
     nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
 
@@ -369,8 +375,8 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
 
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """Return `f` reduced to the operations that its result needs. Forces of the same loads that do not matter
-    may then lack a derivative.
+    """Return `f` reduced to the operations that its result needs, so that unused forces of the same loads may
+    lack a derivative.
     """
     pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

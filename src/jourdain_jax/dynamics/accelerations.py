@@ -1,6 +1,6 @@
-"""Accelerations of a scene at one state: all dynamics below time integration.
+"""Accelerations of a scene at one state: the dynamics underlying time integration.
 
-kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
+    kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
 """
 
 import equinox as eqx
@@ -34,10 +34,11 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Baumgarte(eqx.Module):
-    """Stabilisation terms: `A udot = -drift - 2 a phi - b^2 g` on geometric rows, `- a phi` on velocity rows.
+    """Stabilisation terms of constraints: `A udot = -drift - 2 a phi - b^2 g` for geometric ones, `- a phi`
+    for velocity constraints.
 
-    `alpha` a, `beta` b in 1/s. Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more
-    accurate.
+    `alpha` a, `beta` b in 1/s. Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection
+    (the default of `simulate`) is more accurate.
     """
 
     alpha: Scalar = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
@@ -45,24 +46,28 @@ class Baumgarte(eqx.Module):
 
 
 class Accelerations(eqx.Module):
-    """Accelerations of one state with their diagnostics: `M udot + h = Q + A' lambda`, `A udot = -drift`.
+    """Accelerations of one state with diagnostics: `M udot + h = Q + A' lambda`, `A udot = -drift`.
 
-    Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
+    Units are those of the speeds per s; a `constraint_force` acts on a speed, in N or N m.
     """
 
     udot: Speeds
-    multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
+    # lambda of minimum norm: the constraint force on the speeds is A' lambda
+    multipliers: Float[Array, "rows"]
     constraint_force: Speeds  # A' lambda = M udot + h - Q
-    rank: Count  # of the rows at this state
-    smallest_singular_value: Scalar  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
-    residual: Scalar  # |A udot + drift| in scaled rows; large where rows contradict each other
+    rank: Count  # of A at this state
+    # of scaled A, the last one within its usual rank (1 without constraints); the reduction's pivot if
+    # smaller
+    smallest_singular_value: Scalar
+    residual: Scalar  # |A udot + drift| in scaled rows; large where constraints contradict each other
     applicable: Flag  # whether this reduction works at this state
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
-    """Return all reductions by short name, with the scene's privileged velocities where they need them.
+    """Return all reductions by short name: "privileged", "qr", "svd", "kkt", "udwadia-kalaba",
+    "gibbs-appell".
 
-    Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    Two of them use the scene's privileged velocities.
     """
     independent = structure_of(as_scene(scene)).independent
     return {
@@ -76,7 +81,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
 
 
 def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
-    """Return a reduction from its short name, or the object itself; for None the null space by QR."""
+    """Return a reduction from its short name, or the object itself; the null space by QR for None."""
     if reduction is None:
         return NullSpaceQR()
     if isinstance(reduction, str):
@@ -90,13 +95,15 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
     chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
     if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
-        raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the "
-            "reduction by its name")
+        raise ValueError(
+            f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its "
+            "name"
+        )
     return reduction
 
 
 def as_stabilisation(stabilisation) -> Baumgarte | None:
-    """Return the Baumgarte terms, or None; a ValueError for anything else."""
+    """Return the Baumgarte terms, or None. Raises ValueError for anything else."""
     check_kind(stabilisation, Baumgarte | None, "`stabilisation`", "`jj.Baumgarte(alpha, beta)` or None")
     return stabilisation
 
@@ -108,23 +115,22 @@ def accelerations(
 
         M udot + h = Q + A' lambda,   A udot = -drift
 
-    - `inputs`: values of the scene's inputs (default: zero), which count as constant.
+    - `inputs`: values of the scene's inputs (default: zero), assumed constant.
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt",
       "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default:
-      those of this scene).
+    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: the
+      scene's).
 
-    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is
-    constant. Check `applicable`
-    and `residual`: nothing is raised where a reduction does not apply. ValueError for an unknown reduction,
-    and for known parameters with impossible
-    values of bodies, loads or planes. Eqs. (41), (68)-(70).
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
+    `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError for
+    an unknown reduction, and for known parameters that give impossible bodies, loads or planes. Eqs. (41),
+    (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
     if usual is None:
-        structure_of(scene)  # numbers that cannot be those of a scene are refused by name
+        structure_of(scene)  # raises for impossible values of the scene
         usual = usual_rows(scene)
     return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual)
 
@@ -150,14 +156,16 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
 
 
 def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced:
-    """Return only accelerations and constraint force, for use inside the integration; arguments as of
+    """Return only accelerations and constraint force, for use inside the integration. Arguments as in
     `accelerations`.
     """
     return reduced_at(scene, t, q, u, inputs, reduction, None, usual_rows(scene))[0]
 
 
 def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
-    """Return accelerations with the equations and rows that they solve; arguments as of `accelerations`, but `usual` is not optional."""
+    """Return accelerations with the equations and constraint rows that they solve. Arguments as in
+    `accelerations`, with `usual` required.
+    """
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)

@@ -1,9 +1,10 @@
-"""The equations of Newton and Euler for each body: their residual is the constraint force and torque on the
+"""The equations of Newton and Euler for each body: their residuals are the constraint force and torque on the
 body.
 
     R = m a - F,   I alpha + omega x I omega - L
 
-Forces of potentials that a scene states as a whole are `-dV/dr` and `-dV/dtheta` of its poses. Source: Wang and Pao (2003), eqs. (1)-(3).
+A potential stated for the whole scene gives the forces `-dV/dr` and torques `-dV/dtheta` on its bodies.
+Source: Wang and Pao (2003), eqs. (1)-(3).
 """
 
 import equinox as eqx
@@ -27,8 +28,8 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     L` (N m, about the mass centre); (1)-(3).
 
     Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of
-    the scene's inputs (default: zero). Impressed forces that the scene states on its speeds, not on bodies,
-    count as constraint forces here.
+    the scene's inputs (default: zero). Impressed forces stated on speeds instead of bodies count as
+    constraint forces here.
     """
     q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
@@ -42,8 +43,8 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
 
 def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
-    """Return the forces of the scene's own potential: `-dV/dr` and torques `-dV/dtheta` on the bodies, and
-    `-N' dV/dq` at fixed poses on the speeds.
+    """Return the forces of the scene's own potential: `-dV/dr` and `-dV/dtheta` on the bodies, and `-N'
+    dV/dq` at fixed poses on the speeds.
     """
     t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
     zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
@@ -60,7 +61,7 @@ def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
 
 
 def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
-    """Return a pose moved by `shift` and turned by the small rotation vector `turn` (inertial frame), to
+    """Return a pose displaced by `shift` and rotated by the small rotation vector `turn` (inertial frame), to
     first order.
     """
     moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)

@@ -1,10 +1,11 @@
-"""Normal forces of contacts built into the coordinates, from Newton's equations of the carried bodies.
+"""Normal forces of contacts built into the coordinates, from Newton's equations of the supported bodies.
 
     sum_i N_i n_i = f = sum_j (m_j a_j - F_j - R_j)                                        over the carried bodies j and the contacts i that touch them
     sum_i N_i (p_i - o) x n_i = sum_j (r_j - o) x (m_j a_j - F_j - R_j) + T_j              R_j, T_j: of the rows; T also of inertia and loads
 
-The coordinates may hold more than contacts can (a guide keeps a disc upright): the forces are met first, in the sense of least squares, then the moments
-as far as the forces leave room, and what is then still free has minimum norm. So the normal forces on a plane always add up to what the bodies press.
+The coordinates may impose more than contacts can (a guide keeps a disc upright). So the forces are balanced
+first, by least squares, and then the moments as far as the forces leave freedom; the remaining freedom has
+minimum norm. Normal forces on a plane therefore always sum to the total load of the bodies.
 """
 
 import equinox as eqx
@@ -29,10 +30,10 @@ def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float
     """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
     determined.
 
-    - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: forces on them that come
-      neither from loads nor from rows.
-    - `spare`: forces of the rows for multipliers that change no motion, with a leading axis; zero where the
-      rows are independent.
+    - `bodies`, `positions`: names and mass centres (m) of all bodies.
+    - `hidden`: forces on the bodies that neither loads nor constraints account for.
+    - `spare`: forces for multipliers that do not affect the motion, with a leading axis; zero for independent
+      constraints.
     - `size`: the magnitude of the forces, N.
     """
     carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
@@ -43,7 +44,7 @@ def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float
 
 
 def _supports(carried: dict[str, Indices]) -> list[list[str]]:
-    """Contacts that carry bodies in common, directly or through others, belong together."""
+    """Return groups of contacts that share carried bodies, directly or through other contacts."""
     groups: list[list[str]] = []
     for name, own in carried.items():
         together = [group for group in groups if any(set(own) & set(carried[other]) for other in group)]
@@ -52,7 +53,8 @@ def _supports(carried: dict[str, Indices]) -> list[list[str]]:
 
 
 def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, tuple]:
-    sets = tuple(dict.fromkeys(carried[name] for name in names))  # of bodies, whose equations these contacts share
+    # of bodies, whose equations these contacts share
+    sets = tuple(dict.fromkeys(carried[name] for name in names))
     points = jnp.stack([contacts[name].point for name in names])
     normals = jnp.stack([contacts[name].plane.normal for name in names])
     here = jnp.mean(points, axis=0)
@@ -71,7 +73,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     by_moment = (by_set * jnp.cross(levers, normals).T).reshape(-1, len(points)) / length  # moment/length = by_moment N
 
     first = pseudo_inverse(by_force)
-    left = jnp.eye(len(points)) - first @ by_force  # what the forces leave open
+    left = jnp.eye(len(points)) - first @ by_force  # freedom left by the forces
     turning = by_moment @ left
     turning = jnp.where(largest(turning) > rank_cutoff(turning.dtype), turning, 0.0)
     second = pseudo_inverse(turning)
@@ -90,19 +92,19 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
 
 
 def _resultant(wrench: Wrenches, positions, sets: tuple[Indices, ...], here):
-    """Return force and moment about a point for each of several sets of bodies."""
+    """Return force and moment about a point `here` for each set of bodies."""
     moment = wrench.torque + jnp.cross(positions - here, wrench.force)
     summed = [[jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)]
     return tuple(jnp.concatenate(parts, axis=-1) for parts in summed)
 
 
 def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> Bool[Array, "contacts"]:
-    """Return which normal forces do not depend on multipliers that the motion leaves open."""
+    """Return which normal forces are independent of multipliers that the motion does not determine."""
     size = jnp.maximum(largest(spare.force), largest(spare.torque))
     return largest(changes, 0) <= tolerance * size
 
 
 def _carried(contact: Contact, name: str, bodies: Labels) -> Indices:
-    """Return numbers of the bodies that a contact holds up."""
+    """Return indices of the bodies that a contact supports."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
     return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

@@ -1,15 +1,14 @@
 """The power that changes the energy T + V of a scene.
 
     d(T + V)/dt = sum F.v + L.omega + Q_k u_k   loads without a potential
-                + (A' lambda).u                 rows that do real work: prescribed, nonhomogeneous or nonlinear in u
-                + sum R.v_0 + T.omega_0         what drives poses given as functions of time; v_0, omega_0: velocities at u = 0
+                + (A' lambda).u                 constraints that do work: prescribed, nonhomogeneous, nonlinear
+                + sum R.v_0 + T.omega_0         poses driven in time; v_0, omega_0: velocities at u = 0
                 + dV/dt at fixed poses          potentials that depend on time
                 + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
 
-A term that is zero at every state by the scene's structure is omitted, not computed. Inputs count as constant
-here (their rates reach rows
-through the accelerations). Where the potential V_i of a load depends on inputs, these do the work dV_i/df . df/dt besides. It is found without a
-derivative of the inputs, which may jump:
+Terms that are zero at every state by the scene's structure are not computed. Inputs count as constant here;
+their rates enter constraints through the accelerations. If the potential V_i of a load depends on inputs f,
+these also do the work dV_i/df . df/dt. It is computed without differentiating the inputs, which may jump:
 
     W = integral of (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)        (`rate_of_work`, `stored_by_inputs`)
 
@@ -37,20 +36,20 @@ class Power(eqx.Module):
     """Power in W by origin; positive where it adds to T + V."""
 
     loads: Scalar  # of loads without a potential
-    rows: Scalar  # of constraint rows that do real work
-    driven: Scalar  # of whatever moves poses that are given functions of time
+    rows: Scalar  # of constraints that do real work
+    driven: Scalar  # of drives of poses given as functions of time
     potential: Scalar  # explicit rate of potentials that depend on time
-    inertia: Scalar  # of masses and inertias that change
+    inertia: Scalar  # of changing masses and inertias
 
     @property
     def total(self) -> Scalar:
-        """`d(T + V)/dt`."""
+        """Return `d(T + V)/dt`."""
         return sum(jax.tree.leaves(self))
 
 
 def needs_work(scene: Scene, structure: Structure) -> bool:
-    """Return whether anything changes T + V: then the work must be integrated with the motion. Terms that are
-    zero by structure do not count.
+    """Return whether anything changes T + V, so that the work must be integrated with the motion. Terms that
+    are zero by structure do not count.
     """
     by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
     return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
@@ -66,7 +65,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     zero = jnp.zeros_like(motion.t)
     return Power(
         loads=power_of_loads(scene, motion, conservative=False),
-        # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
+        # lambda . (A u), which is lambda . phi = 0 for constraints homogeneous and linear in u
         rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
         potential=explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
@@ -75,8 +74,8 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 
 
 def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices) -> Scalar:
-    """Return the integrand of the work, in W: the power of the loads. For the loads `of_inputs`, forces count
-    in place of potentials.
+    """Return the integrand of the work, in W: the power of the loads. The loads `of_inputs` contribute by
+    their forces instead of their potentials.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. Their stored energy
     (`stored_by_inputs`) is added to the integral.
@@ -94,7 +93,7 @@ def _power_of_drives(scene: Scene, motion: Motion, udot) -> Scalar:
 
 
 def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Scalar:
-    """`sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
+    """Return `sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
     t, q, now = motion.t, motion.q.array, velocities_of(motion)
     _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))
     return 0.5 * (rate.mass @ jnp.sum(now.linear**2, axis=1) + jnp.einsum("bi,bij,bj->", now.angular, rate.inertia, now.angular))

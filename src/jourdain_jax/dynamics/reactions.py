@@ -1,11 +1,11 @@
-"""Constraint forces by row and by body, and the forces in rolling contacts (rows S1 and S4).
+"""Constraint forces by constraint and by body, and the forces in rolling contacts (rows S1 and S4).
 
     force    R_j^s = lambda_s d phi_s/d v_j          on body j
     torque   T_j^s = lambda_s d phi_s/d omega_j      about its mass centre
     direct   lambda_s d phi_s/d u at fixed v, omega  on the speeds themselves
 
-The rows are evaluated from the velocities that a `Motion` carries, so one reverse pass per row gives the force on every body.
-Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
+The constraints are functions of the velocities in a `Motion`, so one reverse pass per row gives the forces on
+all bodies. Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
 """
 
 import equinox as eqx
@@ -34,24 +34,26 @@ from jourdain_jax.scene.validated import contacts_of
 
 
 class RowReactions(eqx.Module):
-    """The constraint force of every constraint on every body, and its direct part on the speeds. Along a
-    motion the first axis is that of times.
+    """Force of every constraint on every body, and its direct part on the speeds. For a motion the first axis
+    is time.
     """
 
     multipliers: Float[Array, "*times rows"]
     force: Float[Array, "*times rows bodies 3"]  # N
     torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
-    direct: Float[Array, "*times rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
-    determined: Bool[Array, "*times rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
+    # on speeds, from constraints written in coordinates, rates or speeds
+    direct: Float[Array, "*times rows speeds"]
+    # whether the multiplier is unique; False for dependent rows, with minimum norm
+    determined: Bool[Array, "*times rows"]
     row_names: Labels = static()
     body_names: Labels = static()
 
     def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
-        """Force on one body (N), by row."""
+        """Return the forces on one body (N), by constraint row."""
         return self._by_row(self.force, body)
 
     def torques_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
-        """Torque on one body about its mass centre (N m), by row."""
+        """Return the torques on one body about its mass centre (N m), by constraint row."""
         return self._by_row(self.torque, body)
 
     def _by_row(self, values, body):
@@ -62,17 +64,19 @@ class RowReactions(eqx.Module):
 class ContactForce(eqx.Module):
     """The force of the ground on the body at one rolling contact."""
 
-    normal: Scalar  # N, along the plane's normal; negative where the contact would have to pull
+    normal: Scalar  # N, along the plane's normal; negative if the contact would have to pull
     tangential: Float[Array, "2"]  # N, along the plane's tangents
-    friction_needed: Scalar  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
+    # |tangential| / normal; infinite if the contact would have to pull, zero if it carries no load
+    friction_needed: Scalar
     pulls: Flag  # whether the normal force is negative beyond round-off: the body would lift off
-    determined: Flag  # whether the rows at hand determine these numbers
-    normal_determined: Flag  # whether they determine the normal force, though two wheels of one axle may share the tangential one
+    determined: Flag  # whether the constraints determine these numbers
+    # whether they determine the normal force; two wheels of one axle may still share the tangential one
+    normal_determined: Flag
 
 
 @eager_if_concrete
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
-    """Return constraint forces per row and per body at (t, q, u), from the multipliers of known
+    """Return constraint forces per row and per body at (t, q, u), from the multipliers of the given
     `accelerations`.
 
     Their generalized forces add up to `A' lambda`: `sum_s beta' R^s + gamma' T^s + direct^s`.
@@ -84,13 +88,13 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
 def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowReactions:
     on_bodies, direct, spare = unit
     force, torque = (multipliers[:, None, None] * part for part in (on_bodies.force, on_bodies.torque))
-    determined = jnp.diagonal(spare) == 0  # a multiplier is unique where its row is no combination of the others
+    determined = jnp.diagonal(spare) == 0  # a multiplier is unique if its row is no combination of the others
     return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined, names_of_rows(scene), tuple(motion.bodies))
 
 
 def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
-    """Return the forces on bodies and on speeds for unit multipliers of each constraint (leading axes), and
-    `_spare_multipliers`.
+    """Return the forces on bodies and on speeds for a unit multiplier of each row (leading axes), and the
+    result of `_spare_multipliers`.
     """
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
     if not names_of_rows(scene):
@@ -109,17 +113,15 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Arr
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
-    """Return the motion with velocities of the bodies and speeds replaced by given ones, which need not
-    agree.
-    """
+    """Return the motion with the given velocities of bodies and speeds, which need not be consistent."""
     bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
     qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
 def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]) -> Float[Array, "rows rows"]:
-    """Return multipliers, as columns, that change no motion, `A' lambda = 0`; all zero where the rows are
-    independent.
+    """Return multipliers, as columns, with `A' lambda = 0`, which do not affect the motion; zero for
+    independent rows.
 
     `typical`: lengths of the rows, as in `row_scale`.
     """
@@ -131,16 +133,17 @@ def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray
 
 @eager_if_concrete
 def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> dict[str, ContactForce]:
-    """Return the normal and tangential force of every rolling contact, and the friction coefficient that it
-    needs to roll without slip.
+    """Return the normal and tangential force of every rolling contact, and the friction coefficient needed to
+    roll without slip.
 
-    The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the
-    multiplier of the height row. With `height="coordinates"` it follows from the balance of forces and
-    moments (row S1) of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)`, and the same
-    for moments; the sum on the left is over all contacts of these bodies. If the balance does not determine
-    it (four wheels on a plane), the normal force has minimum norm and is marked as not determined. It is also
-    marked if a moment remains that no contact can exert, such as that of a guide that keeps a robot level.
-    Forces on speeds (`generalized_force`) are assumed to have no resultant force or moment on these bodies.
+    The tangential force is the multiplier of the no-slip constraints. With `height="row"` the normal force is
+    the multiplier of the height constraint. With `height="coordinates"` it follows from the balance of forces
+    and moments (row S1) of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)`, and the
+    same for moments; the left sum is over all contacts of these bodies. If the balance does not determine it
+    (four wheels on a plane), the normal force has minimum norm and is marked as not determined. The same mark
+    shows a remaining moment that no contact can exert, such as the moment of a guide that keeps a robot
+    level. Forces on speeds (`generalized_force`) are assumed to have no resultant force or moment on these
+    bodies.
     """
     motion = motion_at(scene, t, q, u, inputs)
     contacts = contacts_of(scene, motion.pose())
@@ -151,7 +154,8 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     total = newton_residual(scene, t, q, u, accelerations.udot, inputs)
     size = _size_of_forces(scene, motion, total.linear)
     margin = rank_cutoff(size.dtype) * size
-    held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
+    # exerted by the choice of coordinates
+    held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))
     spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit[2], part), unit[0])
     positions = of_bodies(motion, "position")
     rolling = {name: contact for name, contact in contacts.items() if contact.friction is None}
@@ -181,7 +185,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
 
 
 def _size_of_forces(scene: Scene, motion: Motion, total) -> Scalar:
-    """Return the reference size of forces (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
+    """Return a reference size of forces (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
     size = largest(total) + largest(resultants(scene, motion).force)
     for body in motion.bodies.values():
         size = size + body.mass * largest(body.velocity) * largest(body.angular_velocity)

@@ -1,19 +1,21 @@
 """Ignorable coordinates, found by probing, and the reduced Appell equations (42) without them (S9).
 
-A dependent coordinate (its rate is no privileged velocity) is *cyclic* when nothing of the following depends on it, all of it
-in the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial velocities beta and partial
-angular velocities gamma, the inertias R I R' of the bodies, the impressed forces and torques, those on speeds, the potential's
-gradient. (What no beta depends on, no betadot depends on either.) In these axes the spin of an axisymmetric wheel is cyclic.
-A coordinate is *ignorable* when the privileged accelerations do not depend on it: a symmetry, and a weaker statement.
+A dependent coordinate, whose rate is no privileged velocity, is *cyclic* if none of these quantities depends
+on it, in the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial
+velocities beta and partial angular velocities gamma, the inertias R I R' of the bodies, the impressed forces
+and torques, the forces on speeds, and the potential's gradient. (If beta does not depend on it, neither does
+betadot.) In these axes the spin of an axisymmetric wheel is cyclic. A coordinate is *ignorable* if the
+privileged accelerations do not depend on it, a symmetry and a weaker condition.
 
-Both are held at the reference, and the system is integrated in the others, the *kept* coordinates k, alone:
+Both kinds are fixed at the reference, and the system is integrated in the other, *kept* coordinates k alone:
 
     dk/dt = B_k(t, k) y + b_k(t, k),     dy/dt = yddot(t, k, y)
 
-The dropped coordinates d would follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in groups: a group may need
-those recovered before it (the disc's x and y need its yaw); `simulate` integrates them with the others. An ignorable coordinate is kept where a kept
-rate needs it, or where its own rate does (quaternions, the sleigh's heading): then no quadrature gives it.
-Source: Wang and Pao (2003), eq. (42).
+The dropped coordinates d follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in
+groups: a group may need coordinates recovered before (the disc's x and y need its yaw). `simulate` integrates
+them with the others instead. An ignorable coordinate is kept if a kept rate depends on it, or if its own rate
+does (quaternions, the sleigh's heading), since quadrature cannot recover it. Source: Wang and Pao (2003), eq.
+(42).
 """
 
 from dataclasses import dataclass
@@ -35,7 +37,7 @@ from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 
-DEPENDS = 1e-9  # change relative to the size of the quantity; larger means that the quantity depends on the coordinate
+DEPENDS = 1e-9  # relative change of a quantity above which it depends on the coordinate
 
 
 class AdmissibleRates(eqx.Module):
@@ -48,19 +50,20 @@ class AdmissibleRates(eqx.Module):
 
 
 class Dependence(eqx.Module):
-    """Dependence of quantities on coordinates (columns), anywhere among the probed states."""
+    """Dependence of quantities on coordinates (columns) at any of the probed states."""
 
-    cyclic_quantities: Bool[np.ndarray, "coordinates"]  # anything of what a cyclic coordinate must not appear in
-    rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, row by row
+    # any quantity that a cyclic coordinate must not affect
+    cyclic_quantities: Bool[np.ndarray, "coordinates"]
+    rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, by entry
     accelerations: Bool[np.ndarray, "coordinates"]  # the privileged accelerations
     privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is a privileged velocity
 
 
 def cyclic_coordinates(scene: Scene) -> Labels:
-    """Return the dependent coordinates that appear neither in B, b, beta, gamma, R I R' nor in the impressed
-    forces.
+    """Return the dependent coordinates on which neither B, b, beta, gamma, R I R' nor the impressed forces
+    depend.
 
-    There are none where rows are nonlinear in the speeds. A quaternion is never cyclic: its own rate depends
+    There are none for constraints nonlinear in the speeds. A quaternion is never cyclic: its own rate depends
     on it.
     """
     if not structure_of(scene).affine:
@@ -72,7 +75,7 @@ def cyclic_coordinates(scene: Scene) -> Labels:
 def ignorable_coordinates(scene: Scene) -> Labels:
     """Return coordinates on which the privileged accelerations do not depend; a quaternion counts as a whole.
 
-    There are none where rows are nonlinear in the speeds.
+    There are none for constraints nonlinear in the speeds.
     """
     if not structure_of(scene).affine:
         return ()
@@ -97,10 +100,11 @@ def _named(scene: Scene, chosen) -> Labels:
 
 @once_per_values
 def dependence(scene: Scene) -> Dependence:
-    """Find the dependence of quantities on coordinates by displacing each coordinate alone at random states.
+    """Return the dependence of quantities on coordinates, found by displacing each coordinate alone at random
+    states.
 
-    The states do not satisfy the geometric rows: if they did, a held coordinate would seem to have no
-    influence. Rows must be affine in the speeds.
+    The states do not satisfy the geometric constraints: otherwise a coordinate that they hold would seem to
+    have no influence. Constraints must be affine in the speeds.
     """
     generator = np.random.default_rng(0)
     t, q, u = sample_states(scene, 8)
@@ -114,7 +118,7 @@ def dependence(scene: Scene) -> Dependence:
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
     """Return, for each entry and coordinate, whether the entry changes with it at any state. Values have
-    shape (states, 1 + coordinates, entries); index 0 of the second axis is without displacement.
+    shape (states, 1 + coordinates, entries); index 0 of the second axis is the undisplaced state.
     """
     size = np.max(np.abs(values), initial=np.finfo(values.dtype).tiny)
     limit = DEPENDS if values.dtype == np.float64 else 1e-4
@@ -123,8 +127,8 @@ def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
 
 @eval_numpy
 def _probe(scene: Scene, t, q, u, shifts):
-    """Return quantities by name at every state, without displacement and with each coordinate displaced in
-    turn. Only coordinates whose rate is one speed are displaced.
+    """Return quantities by name at every state, without displacement and with each coordinate displaced
+    alone, and the coordinates whose rate is one speed.
     """
 
     def one(t, q, u, shifts):
@@ -140,8 +144,8 @@ def _probe(scene: Scene, t, q, u, shifts):
 
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
-    """Return the rates `B y + b`, the privileged accelerations, and the terms on which a cyclic coordinate
-    must have no effect (inertial frame).
+    """Return the rates `B y + b`, the privileged accelerations, and the terms that a cyclic coordinate must
+    not affect (inertial frame).
     """
     structure = structure_of(scene)
     chosen = np.array(structure.independent, int)
@@ -159,7 +163,8 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     forces = [loads.force, loads.torque, loads.direct @ C, potential.force, potential.torque, potential.direct @ C]
     return {
         "rates": motion.qdot.array,
-        "accelerations": jnp.concatenate([found.udot[chosen], y]),  # y, which depends on nothing, gives free motion a size
+        # y, constant in the coordinates, gives free motion a size
+        "accelerations": jnp.concatenate([found.udot[chosen], y]),
         "B and b": jnp.concatenate([rates.B.ravel(), rates.b, C.ravel(), rates.c]),
         "beta and gamma": jnp.concatenate([velocities, beta.ravel(), gamma.ravel()]),
         "inertia": inertia.ravel(),
@@ -168,7 +173,7 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
 
 
 def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
-    """Return C, c, B and b at one state of a scene whose rows are affine in the speeds."""
+    """Return C, c, B and b at one state of a scene whose constraints are affine in the speeds."""
     structure = structure_of(scene)
     y = u[jnp.array(structure.independent, jnp.int32)]
     return _rates_of(scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y))
@@ -179,13 +184,13 @@ def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
     C = known.c[:, None] * known.split.C / known.c[chosen]
     N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(known.u)
     B, y = N @ C, known.u[chosen]
-    # what is left of speeds and rates at y = 0
+    # speeds and rates at y = 0
     return AdmissibleRates(C, known.u - C @ y, B, coordinate_rates(scene, t, q, known.u) - B @ y)
 
 
 @dataclass(frozen=True)
 class ReducedCoordinates:
-    """The coordinates that the reduced equations keep, and the groups in which the others are recovered."""
+    """The coordinates kept by the reduced equations, and the groups in which the others are recovered."""
 
     kept: Labels
     dropped: tuple[Labels, ...]  # groups, in the order of their recovery
@@ -193,18 +198,20 @@ class ReducedCoordinates:
 
     @property
     def recovered(self) -> Labels:
-        """All dropped coordinates in the order of their recovery."""
+        """Return all dropped coordinates in the order of their recovery."""
         return tuple(name for group in self.dropped for name in group)
 
 
 def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
-    """Return the coordinates to keep and to omit. Raises ValueError for constraints nonlinear in the speeds,
+    """Return the kept and the dropped coordinates. Raises ValueError for constraints nonlinear in the speeds,
     which have no linear B and b.
     """
     structure = structure_of(scene)
     if not structure.affine:
-        raise ValueError(f"`{type(scene).__name__}` has constraints nonlinear in the speeds, and therefore "
-            "no reduced equations; integrate all coordinates and speeds")
+        raise ValueError(
+            f"`{type(scene).__name__}` has constraints nonlinear in the speeds, and therefore no reduced "
+            "equations; integrate all coordinates and speeds"
+        )
     found, names = dependence(scene), scene.coordinate_names.entries
     cyclic_or_ignorable = (~found.cyclic_quantities & ~found.privileged) | ~found.accelerations
     groups = _groups(set(np.flatnonzero(cyclic_or_ignorable).tolist()), found.rates)
@@ -217,7 +224,7 @@ def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
 
 
 def _groups(droppable: set[int], needs) -> list[list[int]]:
-    """Return groups of coordinates that quadrature recovers one after another; `needs[i, j]`: whether the
+    """Return groups of coordinates in the order in which quadrature recovers them; `needs[i, j]`: whether the
     rate of i depends on j.
     """
     while True:
@@ -226,18 +233,19 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
         while ready := [i for i in sorted(droppable - known) if set(np.flatnonzero(needs[i]).tolist()) <= known]:
             groups.append(ready)
             known |= set(ready)
-        in_circles = droppable - known  # rates that need themselves or one another
+        in_circles = droppable - known  # rates that depend on themselves or on each other
         if not needed_by_kept | in_circles:
             return groups
         droppable = droppable - needed_by_kept - in_circles
 
 
 def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y) -> Float[Array, "freedoms"]:
-    """Return privileged accelerations of the reduced equations (42) as a function of time, kept coordinates
-    and privileged speeds only.
+    """Return privileged accelerations of the reduced equations (42), a function only of time, kept
+    coordinates and privileged speeds.
     """
     structure = structure_of(scene)
     places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]
-    q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)  # the dropped ones at the reference
+    # dropped coordinates are at the reference
+    q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)
     known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
     return accelerations_of(scene, known, t, q)[1].udot[jnp.array(structure.independent, jnp.int32)]

@@ -1,14 +1,14 @@
-"""Coulomb's law at all contacts, their forces, and impulses, by small systems that unroll to scalars.
+"""Coulomb's law at all contacts, with their forces and impulses, by small systems unrolled to scalars.
 
-Accelerations of the gap and of slip are `G L + b` with the forces L, and so are changes of speeds with
-impulses: one law serves both.
+Accelerations of the gap and of slip are `G L + b` with the forces L. Changes of speeds depend on impulses in
+the same way, so one law serves both.
 
     closed:   (G L + b)_n = target             open:   L = 0
     sticks:   (G L + b)_t = 0, |L_t| <= mu L_n
     slips:    L_t = -mu L_n e,  (G L + b)_t along e
 
-Rows of a contact: normal, then the two tangents of the ground.
-Source of the limit directions: M. Antali and G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
+Rows of a contact: normal, then the two tangents of the ground. Source of the limit directions: M. Antali and
+G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,12 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar
 
-SWEEPS, STEPS = 4, 5  # of Gauss-Seidel for each contact, of Newton's method for one and one more for each other
-SLOW = 5e-6  # m/s: below, the direction of slip turns as it does at this speed
+# Gauss-Seidel sweeps per contact; Newton steps for one contact, plus one for each further one
+SWEEPS, STEPS = 4, 5
+SLOW = 5e-6  # m/s: below this slip speed the direction turns as at this speed
 ROUND_OFF = 1e-9  # of responses
-LEAST_SLIP = 1e-8  # m/s: round-off, of speeds that impulses change
-LEAST_PIVOT = 1e-12  # beside the entry that it is what is left of
+LEAST_SLIP = 1e-8  # m/s: round-off of speeds that impulses change
+LEAST_PIVOT = 1e-12  # relative to the diagonal entry before elimination
 
 
 def solved(
@@ -32,7 +33,7 @@ def solved(
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
-    An unknown whose pivot vanishes becomes zero, such as the force across a plane in which all bodies move;
+    An unknown with a vanishing pivot becomes zero, such as the force across a plane in which all bodies move;
     `vanishes`: whether a pivot may vanish.
     """
     count, inverses = len(K), []
@@ -56,7 +57,7 @@ def solved(
 
 
 class Modes(NamedTuple):
-    """The modes of all contacts, as numbers 0 or 1, and the directions of slip of those that slip."""
+    """The modes of all contacts, as numbers 0 or 1, and the directions of slip of slipping ones."""
 
     closed: Float[Array, "contacts"]
     rolls: Float[Array, "contacts"]
@@ -79,8 +80,8 @@ def system(
 def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """Return `K^-1 right` of a `system`.
 
-    Unknowns of tangents are eliminated first. Every pivot is then positive, unless a slipping contact has no
-    solution (Painleve's paradox).
+    The tangential unknowns are eliminated first. Every pivot is then positive, unless a slipping contact has
+    no solution (Painleve's paradox).
     """
     count = len(K) // 3
     order = [3 * i + k for i in range(count) for k in (1, 2)] + [3 * i for i in range(count)]
@@ -95,27 +96,27 @@ def responses(
     modes: Modes,
     friction: Float[Array, "contacts"],
 ) -> Float[Array, "rows columns"]:
-    """Return the forces at all contacts in their modes for each of several b, by `system`."""
+    """Return the forces at all contacts in their modes, one column for each column of b, by `system`."""
     K, s = system(G, modes, friction)
     return forces(K, -s[:, None] * b)
 
 
 class Law(NamedTuple):
-    """The contacts of one Coulomb problem; `G P + b` are their speeds, or their accelerations."""
+    """The contacts of one Coulomb problem; `G P + b` are their speeds or accelerations."""
 
     G: Float[Array, "rows rows"]
     b: Float[Array, "rows"]
     target: Float[Array, "contacts"]  # least normal response
     friction: Float[Array, "contacts"]  # mu of slip
     static: Float[Array, "contacts"]  # mu of sticking
-    touches: Bool[Array, "contacts"]  # others have no force
-    slides: Bool[Array, "contacts"]  # in the direction e, whatever the response
-    begins: Bool[Array, "contacts"]  # to slip: closed, in a direction to be found
+    touches: Bool[Array, "contacts"]  # all others have no force
+    slides: Bool[Array, "contacts"]  # slips in the direction e, whatever the response
+    begins: Bool[Array, "contacts"]  # starts to slip: closed, in an unknown direction
     e: Float[Array, "contacts 2"]
 
 
 class Solution(NamedTuple):
-    """Forces of all contacts, their modes, and whether these satisfy the law at each."""
+    """Forces of all contacts, their modes, and whether both satisfy the law, by contact."""
 
     P: Float[Array, "contacts 3"]
     modes: Modes
@@ -123,18 +124,18 @@ class Solution(NamedTuple):
 
 
 def coulomb(law: Law) -> Solution:
-    """Return forces that satisfy Coulomb's law at all contacts at once, with w = G P + b.
+    """Return forces that satisfy Coulomb's law at all contacts simultaneously, with w = G P + b.
 
-    w_n >= target and P_n >= 0, one of them with equality;
-    w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
+        w_n >= target and P_n >= 0, one of them with equality;
+        w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
 
-    Sweeps of projected Gauss-Seidel come first. Then Newton's method solves the equations of the modes,
-    directions included, and decides the modes before each step: by the signs of
+    Projected Gauss-Seidel sweeps come first. Then Newton's method solves the equations of the modes for
+    forces and directions. Before each step it chooses the modes by the signs of
 
         N = P_n - (w_n - target)/G_nn,   |T| - mu_s N with T = P_t - w_t/tr G_tt
 
-    Derivatives are those of these equations. Shares of redundant contacts stay as the sweeps find them.
-    Source: P. Alart and A. Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
+    Derivatives are those of these equations. Redundant contacts keep the shares that the sweeps find. Source:
+    P. Alart and A. Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
     """
     G, b, count = law.G, law.b, len(law.target)
     normal, tangential = _scales(G)
@@ -178,7 +179,7 @@ def _improved(
 ) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
     """Return forces and directions of slip after one step of Newton's method.
 
-    Unknowns are P and the angles of those directions e that are not known; for these n.w_t = 0, with n = J e.
+    The unknowns are P and the angles of the unknown directions e, which satisfy n.w_t = 0 with n = J e.
     """
     (K, s), e = system(law.G, modes, law.friction), modes.direction
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
@@ -197,7 +198,7 @@ def _improved(
 
 
 def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, "contacts"]:
-    """Return at which contacts these forces satisfy the law, but for round-off."""
+    """Return for each contact whether these forces satisfy the law, up to round-off."""
     normal, tangential = _scales(law.G)
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction
     least = ROUND_OFF * jnp.sum(jnp.abs(law.b))
@@ -212,13 +213,13 @@ def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, 
 
 
 def unit(x: Float[Array, "*contacts 2"]) -> Float[Array, "*contacts 2"]:
-    """Return unit vectors, and zero for zero."""
+    """Return unit vectors; zero for zero."""
     square = jnp.sum(x * x, axis=-1, keepdims=True)
     return x / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
 def moves(w: Float[Array, "*contacts 3"], least: float) -> Bool[Array, "*contacts"]:
-    """Return whether slip is faster than `least`, m/s."""
+    """Return whether the slip is faster than `least`, m/s."""
     return jnp.sum(w[..., 1:] ** 2, axis=-1) > least**2
 
 
@@ -226,8 +227,8 @@ class Impulse(NamedTuple):
     """The impulse at a contact that strikes."""
 
     P: Float[Array, "3"]  # N s
-    slips: Flag  # afterwards
-    exists: Flag  # whether the law has an answer
+    slips: Flag  # after the impact
+    exists: Flag  # whether the law has a solution
 
 
 def impulse(
@@ -239,17 +240,17 @@ def impulse(
 ) -> Impulse:
     """Return the impulse at a contact that strikes with the speeds w; `restitution`: e.
 
-    dw/ds = G (1, -mu e_t) along the normal impulse s, e_t along w_t; once slip has stopped, the contact
-    sticks, or slips along the limit direction
+        dw/ds = G (1, -mu e_t) along the normal impulse s, e_t along w_t; once slip has stopped, the contact
+        sticks, or slips along the limit direction
 
-    newton:     until w_n+ = -e w_n
-    poisson:    until s = (1 + e) s_c              c: the compression, which ends at w_n = 0
-    energetic:  until W_r = -e^2 W_c               W: work of the normal impulse, in both parts
+        newton:     until w_n+ = -e w_n
+        poisson:    until s = (1 + e) s_c              c: the compression, which ends at w_n = 0
+        energetic:  until W_r = -e^2 W_c               W: work of the normal impulse, in both parts
 
-    The speeds w change linearly along each of two pieces. P is NaN where slip would turn during the first.
-    Source: W. J. Stronge, Impact Mechanics (2000).
+    The speeds w change linearly in each of two pieces, before and after the end of slip. P is NaN if slip
+    would turn during the first. Source: W. J. Stronge, Impact Mechanics (2000).
     """
-    at_rest = coulomb(_one(G, friction))  # for w_n to rise by one
+    at_rest = coulomb(_one(G, friction))  # for a unit rise of w_n
     by_stop, sticks = at_rest.P[0], at_rest.modes.rolls[0] > 0
     then = 1 / by_stop[0]  # slope of w_n once slip has stopped
     moving = moves(w, LEAST_SLIP)
@@ -260,10 +261,10 @@ def impulse(
     stops = jnp.where(
         moving, jnp.where(slowing > 0, e @ w[1:] / jnp.where(slowing > 0, slowing, 1.0), jnp.inf), 0.0
     )
-    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n as slip stops
+    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n when slip stops
 
     def reached(goal: Scalar) -> Scalar:
-        """The normal impulse at which w_n reaches a value."""
+        """Return the normal impulse at which w_n reaches the value `goal`."""
         early = moving & (first > 0) & ((goal <= stop_w) | ~jnp.isfinite(stops))
         return jnp.where(
             early,
@@ -272,7 +273,7 @@ def impulse(
         )
 
     compressed = reached(jnp.zeros_like(w[0]))
-    within = compressed < stops  # compression ends while it slips
+    within = compressed < stops  # compression ends during slip
     rise = jnp.where(within, first, 1.0)
     if kind == "newton":
         total = reached(-restitution * w[0])
@@ -284,7 +285,8 @@ def impulse(
             w[0] ** 2 / (2 * rise),
             -(w[0] + stop_w) * jnp.where(within, 0.0, stops) / 2 + stop_w**2 / (2 * then),
         )
-        one = restitution * jnp.sqrt(2 * jnp.where(within, rise, then) * work)  # were it one piece
+        # if restitution were one piece
+        one = restitution * jnp.sqrt(2 * jnp.where(within, rise, then) * work)
         rest = restitution**2 * work - stop_w**2 / (2 * rise)
         two = within & jnp.isfinite(stops) & (rest > 0)
         total = reached(jnp.where(two, jnp.sqrt(jnp.where(two, stop_w**2 + 2 * then * rest, 1.0)), one))
@@ -297,6 +299,6 @@ def impulse(
 
 
 def _one(G: Float[Array, "3 3"], friction: Scalar) -> Law:
-    """Return the law of one contact at rest, whose normal speed must rise by one."""
+    """Return the law of one contact at rest whose normal speed must rise by one."""
     b, one, no = jnp.zeros(3, G.dtype).at[0].set(-1.0), jnp.ones(1, G.dtype), jnp.zeros(1, bool)
     return Law(G, b, 0 * one, friction * one, friction * one, ~no, no, no, jnp.zeros((1, 2), G.dtype))

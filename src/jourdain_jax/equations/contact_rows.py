@@ -1,5 +1,5 @@
-"""How contacts that switch move, and rows that hold up to a force: gaps, their rates, and slip, with the
-derivatives that their forces need.
+"""Kinematics of switching contacts, and of constraints that hold up to a force: gaps, their rates, and slip,
+with the derivatives that their forces need.
 
     w = (dg/dt, slip along the tangents)    of each contact;   w = A u + a,   dw/dt = A udot + drift
 """
@@ -22,7 +22,7 @@ from jourdain_jax.scene.validated import contacts_of, held_rows_of
 
 
 class ContactRows(eqx.Module):
-    """The rows of all switching contacts at one state, three for each of them."""
+    """Gaps, speeds and their derivatives of all switching contacts at one state, three rows per contact."""
 
     gap: Float[Array, "contacts"]
     w: Float[Array, "rows"]
@@ -31,29 +31,31 @@ class ContactRows(eqx.Module):
 
 
 class SwitchingRow(NamedTuple):
-    """The part of a contact with friction, or of a row that holds up to a force, in the laws of contact."""
+    """A contact with friction, or a constraint that holds up to a force, as used by the laws of contact."""
 
     friction: Coulomb
     slip: Float[Array, "2"]  # m/s or rad/s
-    contact: Contact | None  # None: a row, with a normal force of one
+    contact: Contact | None  # None: a constraint, with unit normal force
 
     @property
     def restitution(self) -> Scalar:
-        """Newton's, of impacts; zero of rows."""
+        """Return Newton's coefficient of restitution; zero for constraints."""
         return jnp.zeros_like(self.slip[0]) if self.contact is None else jnp.asarray(self.contact.restitution)
 
     @property
     def impact(self) -> str:
-        """The law of impacts."""
+        """Return the law of impacts."""
         return "moreau" if self.contact is None else self.contact.impact
 
     def lean(self) -> Scalar | None:
-        """Lean of a disc or wheel (`Contact.lean`)."""
+        """Return the lean of a disc or wheel (`Contact.lean`)."""
         return None if self.contact is None else self.contact.lean()
 
 
 def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
-    """Return the contacts that have friction and the rows that hold up to a force, in the order of their modes."""
+    """Return the contacts with friction and the constraints that hold up to a force, in the order of their
+    modes.
+    """
     contacts = contacts_of(scene, motion.pose())
     found = {name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction}
     rows = held_rows_of(scene, motion).items()
@@ -62,21 +64,21 @@ def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
 
 
 def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
-    """Return the gaps of contacts that switch, in m. Rows that hold up to a force have zero gaps."""
+    """Return the gaps of switching contacts, in m; zero for constraints that hold up to a force."""
     contacts = contacts_of(scene, pose)
     names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
     return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
 
 
 def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
-    """Return the rates of the gaps, and the slip along both tangents, of all contacts that switch, in m/s."""
+    """Return the rates of the gaps, and the slip along both tangents, of all switching contacts, in m/s."""
     rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
     slips = [row.slip for row in switching_rows(scene, motion).values()]
     return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
 
 
 def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
-    """Return the rows at the state of a motion."""
+    """Return gaps, speeds, A and drift of the switching contacts at the state of a motion."""
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
 
     def speeds(t, q, u):
@@ -92,7 +94,7 @@ def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
     """Return the forces of the ground on the bodies as loads: normal forces, and forces along both tangents.
-    Those of rows that hold up to a force act on the speeds, as A' L.
+    Constraints that hold up to a force give forces on the speeds, A' L.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

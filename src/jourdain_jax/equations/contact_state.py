@@ -1,4 +1,4 @@
-"""The contacts that switch at one state: their modes, and how they respond to their forces."""
+"""The switching contacts at one state: their modes and their response to forces."""
 
 from typing import NamedTuple
 
@@ -17,14 +17,14 @@ from jourdain_jax.equations.virtual_power import (
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
-FLAT_BELOW = 1e-8  # the squared sine of the lean of a disc that counts as flat
+FLAT_BELOW = 1e-8  # squared sine of the lean below which a disc counts as flat
 
 
 class At:
     """The switching contacts at the state of a motion, and their response to forces.
 
-    `found`: the response, if it is already known. `responses`: all responses that were computed so far, each
-    stored with its coordinates, speeds and inputs.
+    `found`: the response, if already known. `responses`: all responses computed so far, with their
+    coordinates, speeds and inputs.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class At:
 
     @property
     def forces(self) -> Float[Array, "contacts 3"]:
-        """Normal forces, and those along both tangents, N."""
+        """Return the normal and the two tangential forces, N."""
         return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
 
     def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
-        """Return the response of contact i while the others are in `modes` (default: the present ones)."""
+        """Return the response of contact i while the others stay in `modes` (default: the present ones)."""
         modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
         others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
         right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
@@ -66,14 +66,14 @@ class At:
 
 
 class Alone(NamedTuple):
-    """The response of one contact while the others are in their modes."""
+    """The response of one contact while the others stay in their modes."""
 
     G: Float[Array, "3 3"]
     b: Float[Array, "3"]
-    borne: Float[Array, "rows 4"]  # forces of all for those of this one, and without
+    borne: Float[Array, "rows 4"]  # forces of all contacts per unit force of this one, and without it
 
     def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "contacts 3"]:
-        """Return the forces of all contacts where contact i has its `own`."""
+        """Return the forces of all contacts if contact i has the force `own`."""
         return (self.borne[:, :3] @ own + self.borne[:, 3]).reshape(-1, 3).at[i].set(own)
 
 

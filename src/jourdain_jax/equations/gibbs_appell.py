@@ -2,9 +2,9 @@
 
     G = sum m a.a / 2 + alpha.I alpha / 2 + alpha.(omega x I omega),     dG/d(yddot_k) = Q_k          (12)-(17)
 
-G is evaluated from the bodies' accelerations; its gradient and Hessian over the accelerations are taken by autodiff, so that this is an
-independent way to the same equations: the Hessian of G over all speeds is M, its gradient at `udot = 0` is h.
-Source: Wang and Pao (2003), section II.
+G is evaluated from the bodies' accelerations, and automatic differentiation gives its gradient and Hessian.
+So this is an independent way to the same equations: the Hessian of G in udot is M, its gradient at `udot = 0`
+is h. Source: Wang and Pao (2003), section II.
 """
 
 import equinox as eqx
@@ -26,7 +26,7 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
     """Return the Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4,
     up to terms without accelerations; (12)-(14).
 
-    `udot`: accelerations of all speeds; they need not satisfy the rows.
+    `udot`: accelerations of all speeds; they need not satisfy the constraints.
     """
     q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     velocity, bias = bias_accelerations(scene, t, q, u)
@@ -56,14 +56,15 @@ def _gradient_and_hessian(f, x):
 class GibbsAppell(eqx.Module):
     """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
 
-    `independent`: indices of the privileged speeds. It does not apply where they do not determine the others.
+    `independent`: indices of the privileged speeds. It does not apply where these do not determine the other
+    speeds.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)
     name = "Gibbs-Appell"
 
     def accelerations(self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
-        """Return accelerations on the `rows`; of `equations`, only Q is used for them."""
+        """Return accelerations that satisfy the constraint `rows`; of `equations`, they use only Q."""
         problem = scaled(equations, rows)
         split = Partition(problem.A, self.independent)
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()

@@ -2,9 +2,9 @@
 
     u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
 
-Contacts that close at one instant strike together; closed ones take part with restitution 0
-(`coulomb` in `contact_laws.py`). Of one contact that strikes, `impulse` may follow the slip along its
-impulse. Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications (1988).
+Contacts that close at one instant strike together; closed contacts take part with restitution 0 (`coulomb` in
+`contact_laws.py`). If a single contact strikes, `impulse` may follow its slip along the impulse instead.
+Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications (1988).
 """
 
 from typing import NamedTuple
@@ -29,19 +29,19 @@ from jourdain_jax.equations.contact_laws import (
 from jourdain_jax.equations.contact_state import At, switched
 from jourdain_jax.scene.switching import CREEPS, FLAT, FLIES, GAINS_ENERGY, PAINLEVE, ROLLS, SLIPS, UNDECIDED
 
-LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
+LEAST_REBOUND = 1e-6  # m/s: below this speed of rebound a contact closes
 
 
 class Changes(NamedTuple):
-    """What each contact does at an instant."""
+    """Transitions of each contact at an instant."""
 
     strikes: Bool[Array, "contacts"]
-    stops: Bool[Array, "contacts"]  # its slip
-    begins: Bool[Array, "contacts"]  # to slip
+    stops: Bool[Array, "contacts"]  # stops slipping
+    begins: Bool[Array, "contacts"]  # starts to slip
 
 
 class Struck(NamedTuple):
-    """Impulses at all contacts, their modes meanwhile, and whether these are right."""
+    """Impulses at all contacts, their modes during the impact, and whether the result is valid."""
 
     P: Float[Array, "contacts 3"]
     modes: Modes
@@ -50,8 +50,8 @@ class Struck(NamedTuple):
 
 
 def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "contacts"], i: int) -> Struck:
-    """Return the impulses of an impact, by the law of contact i along its impulse, or by the law for all
-    contacts at once.
+    """Return the impulses of an impact, by the law of contact i along its impulse, or by the simultaneous law
+    for all contacts.
     """
     e_n = jnp.where(strikes & (-at.restitution * at.w[:, 0] > LEAST_REBOUND), at.restitution, 0.0)
     no, w = jnp.zeros_like(touches), at.found.rows.w
@@ -70,11 +70,11 @@ def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "cont
 
 
 class After:
-    """Speeds, modes and directions of slip after the changes of an event of contact i.
+    """Speeds, modes and directions of slip after an event of contact i.
 
-    Impulses either stop the slip of contacts or, if a contact strikes, are those of the impact. Then the law
-    at rest decides whether contacts without slip open, stick or begin to slip. If there is no solution, or an
-    impact would gain energy, the mode of contact i is a negative number that gives the reason.
+    The impulses either stop the slip of contacts or, if a contact strikes, are those of the impact. Then the
+    law at rest decides whether contacts without slip open, stick or start to slip. If there is no solution,
+    or an impact would gain energy, the mode of contact i is a negative number that encodes the reason.
     """
 
     def __init__(self, at: At, i: int, changes: Changes):

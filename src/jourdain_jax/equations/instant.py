@@ -5,7 +5,7 @@ motion, computed together.
     beta, gamma, A             their derivatives in u             (for rows affine in u they do not depend on u)
     a_0, alpha_0, drift        their rates at udot = 0
 
-Poses are the costly part of a scene, and all of these come from the same ones.
+Poses are the costly part of a scene, and all these quantities share one evaluation of them.
 """
 
 import equinox as eqx
@@ -24,14 +24,14 @@ from jourdain_jax.scene.scene import Scene
 
 
 class VelocityLevel(eqx.Module):
-    """Velocities of the bodies and residuals of the rows, or a derivative of both."""
+    """Velocities of the bodies and residuals of the constraints, or a derivative of both."""
 
     bodies: Velocities
     rows: Float[Array, "rows *directions"]
 
 
 class Instant(eqx.Module):
-    """A scene at (t, q, u), ready for the equations of motion."""
+    """Kinematic quantities of a scene at (t, q, u) for the equations of motion."""
 
     motion: Motion
     weights: Inertias
@@ -41,7 +41,7 @@ class Instant(eqx.Module):
 
 
 def instant_at(scene: Scene, t, q, u, inputs=None) -> Instant:
-    """Everything the equations of motion need of a scene at (t, q, u)."""
+    """Return the kinematic quantities of a scene at (t, q, u) for the equations of motion."""
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     by_speeds, _, _ = derivatives_in_speeds(scene, t, q, u, inputs)
     value, rate, motion = rates_along_motion(scene, t, q, u, inputs)
@@ -49,7 +49,7 @@ def instant_at(scene: Scene, t, q, u, inputs=None) -> Instant:
 
 
 def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
-    """Return the rows of an instant."""
+    """Return the constraint rows of an instant."""
     return ConstraintRows(instant.value.rows, instant.by_speeds.rows, instant.rate.rows, names_of_rows(scene))
 
 
@@ -58,15 +58,14 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
     """Return phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all constraint rows, with their
     names: `A udot = -drift`; eqs. (5)-(9), (25).
 
-    `inputs`: values of the scene's inputs (default: zero). Geometric rows enter by their rate and come first.
+    `inputs`: values of the scene's inputs (default: zero). Geometric constraints enter by their rate and come
+    first.
     """
     return rows_of(scene, instant_at(scene, t, q, u, inputs))
 
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
-    """Return `beta`, `gamma` and `A`, the velocities and residuals themselves, and the motion to which they
-    belong.
-    """
+    """Return `beta`, `gamma` and `A`, the velocities and residuals, and the motion that they belong to."""
     t, q, u = as_time(t), as_real(q), as_real(u)
 
     def level(u):
@@ -86,7 +85,7 @@ def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLeve
     return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
 
 
-@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+@eqx.filter_jit  # one trace serves all its derivatives
 def _velocity_level(scene: Scene, t: Scalar, q, u, inputs) -> tuple[VelocityLevel, Motion]:
     motion = motion_at(scene, t, q, u, inputs)
     return VelocityLevel(velocities_of(motion), flatten_rows(velocity_rows(scene, motion), q.dtype)), motion

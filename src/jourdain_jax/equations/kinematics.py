@@ -46,9 +46,7 @@ def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "c
 
 
 def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coordinates"]:
-    """Return `N'` of `qdot = N u + nu`, one row for each of the scene's own speeds; none where speeds are
-    rates of coordinates or of quaternions.
-    """
+    """Return `N'` of `qdot = N u + nu`, one row for each user-defined speed; no rows for default speeds."""
     if scene.speeds is None:
         return jnp.zeros((0, len(scene.coordinate_names)))
     return jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(jnp.zeros(len(scene.speed_names))).T
@@ -63,7 +61,7 @@ def pose_at(scene: Scene, t, q: Numbers) -> Pose:
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
     """Return poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the
-    scene's inputs (default: zero), or how they change.
+    scene's inputs (default: zero), or `ChangingInputs`.
     """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs(t) if isinstance(inputs, ChangingInputs) else inputs, q.dtype)
@@ -76,8 +74,8 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
-    """Return the shapes of the values of `look(scene, motion)`. Only a trace is made, since JAX would compile
-    each operation for numbers.
+    """Return the shapes of the values of `look(scene, motion)` by a trace only; with numbers, JAX would
+    compile each operation.
     """
     numbers = [jax.ShapeDtypeStruct(shape, real_type()) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))]
     return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
@@ -90,11 +88,11 @@ def _space_angular_velocity(body, rate) -> Vector3:
 
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
-    """Velocities of the mass centres and body angular velocities, affine in u."""
+    """Return velocities of the mass centres and body angular velocities, affine in u."""
     return _velocities(scene, as_time(t), as_real(q), as_real(u))
 
 
-@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+@eqx.filter_jit  # one trace serves all its derivatives
 def _velocities(scene: Scene, t: Scalar, q, u) -> Velocities:
     return velocities_of(motion_at(scene, t, q, u))
 
@@ -105,7 +103,7 @@ def of_bodies(motion: Motion, what: str) -> Float[Array, "bodies *shape"]:
 
 
 def velocities_of(motion: Motion) -> Velocities:
-    """Velocities of the mass centres and body angular velocities, from a known motion."""
+    """Return velocities of the mass centres and body angular velocities, from a known motion."""
     return Velocities(of_bodies(motion, "velocity"), of_bodies(motion, "angular_velocity_body"))
 
 
@@ -127,13 +125,13 @@ def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
 
 
 def inertias(scene: Scene, t, q) -> Inertias:
-    """Masses and inertias of all bodies."""
+    """Return masses and inertias of all bodies."""
     return inertias_of(pose_at(scene, t, q))
 
 
 def inertias_of(pose: Pose | Motion) -> Inertias:
     """Return masses and inertias of all bodies, from known poses. Inertias are symmetrised, since `w . I w`
-    depends on the symmetric part only.
+    depends only on the symmetric part.
     """
     bodies = [body.body for body in pose.bodies.values()]
     zero = jnp.zeros((3, 3), pose.q.array.dtype)

@@ -2,8 +2,8 @@
 
     d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
 
-An independent way to M, h and Q: `M = d2T/dqdot2`, `h = d/dt(dT/dqdot) at qddot = 0 - dT/dq`.
-Source: Wang and Pao (2003), eq. (11).
+It gives M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, `h = d/dt(dT/dqdot) at qddot = 0
+- dT/dq`. Source: Wang and Pao (2003), eq. (11).
 """
 
 import jax
@@ -20,7 +20,8 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
     """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq =
     Q`; eq. (11).
 
-    `inputs`: values of the scene's inputs (default: zero). ValueError where the speeds are not the coordinate rates.
+    `inputs`: values of the scene's inputs (default: zero). Raises ValueError if the speeds are not the
+    coordinate rates.
     """
     if not speeds_are_rates(as_scene(scene)):
         raise ValueError(

@@ -3,8 +3,9 @@
     x = K r:   |D (A x - r)| least, and among such x' M x least          K = C L'^-1 (D A C L'^-1)+ D,   C M C = L L'
     dx = K (dr - dA x) + K D^-2 K' dA' D^2 (r - A x) + (1 - K A) M^-1 (dA' mu - dM x),   M x = A' mu
 
-C, D: diagonal scales of what moves, and of the rows, which are constants to differentiation; A, M, x: of what is free. The second term counts where rows
-contradict each other. Source: as of `calculus/matrices.py`, in the metric M.
+C, D: diagonal scales of the unknowns and of the rows, constant under differentiation; A, M, x: of the free
+unknowns. The second term counts if constraints contradict each other. Source: as in `calculus/matrices.py`,
+in the metric M.
 """
 
 from typing import NamedTuple
@@ -37,13 +38,13 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """Return the map that satisfies rows by the least change of the `free` entries in the metric `M`. Without
-    `M` the metric is that of the coordinates; if `M` is singular, it is the identity.
+    """Return the least change of the `free` entries, in the metric `M`, that removes the residual r. Without
+    `M` the metric is Euclidean in the coordinates; a singular `M` is replaced by the identity.
 
     `typical`: lengths of the rows, in scaled speeds if there is a metric, relative to which a row counts as
     vanishing (default: only zero rows do). Rows count as dependent below `cutoff` (default: `rank_cutoff`).
-    Differentiable in any mode where the rank does not change. `determined`: the rows can be satisfied and
-    determine all that is free, so that the derivative has its first term only.
+    Differentiable in any mode at constant rank. `determined`: the constraints can be satisfied and determine
+    all free entries, so that only the first term of the derivative remains.
     """
     x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined)
     return Change(x, jax.lax.stop_gradient(K))
@@ -53,7 +54,7 @@ class _Solved(NamedTuple):
     change: Change
     mu: Float[Array, "rows"]
     d: Float[Array, "rows"]
-    c: Float[Array, "moving"]  # zero for what is held
+    c: Float[Array, "moving"]  # zero for fixed entries
     L: Float[Array, "moving moving"] | None
     definite: Flag | None
 

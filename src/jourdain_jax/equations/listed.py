@@ -1,4 +1,4 @@
-"""The parts of a scene by name, found by tracing it once, without evaluation at a state."""
+"""Names of the parts of a scene, found by tracing it once, without evaluation at a state."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class _Listed(NamedTuple):
     rows: tuple[str, ...]
     position_rows: tuple[str, ...]
     events: tuple[str, ...]
-    stops: tuple[bool, ...]  # whether each of them does
+    stops: tuple[bool, ...]  # whether each event stops the motion
     has_load_without_potential: bool
 
 
@@ -25,12 +25,12 @@ def names_of_bodies(scene: Scene) -> tuple[str, ...]:
 
 
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
-    """Return names of all rows, in order."""
+    """Return names of all constraint rows, in order."""
     return _listed(scene).rows
 
 
 def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
-    """Return names of the geometric rows, in order; they come first among all rows."""
+    """Return names of the geometric constraint rows, in order; they come first."""
     return _listed(scene).position_rows
 
 
@@ -45,21 +45,23 @@ def stops(scene: Scene) -> tuple[bool, ...]:
 
 
 def has_load_without_potential(scene: Scene) -> bool:
-    """Return whether some load is given by forces alone."""
+    """Return whether some load has no potential."""
     return _listed(scene).has_load_without_potential
 
 
 @once_per_class
 def names_of_invariants(scene: Scene) -> tuple[str, ...]:
-    """Return the sorted names of the invariants that the scene states. A motion needs none of them, so errors
-    in them are raised only when they are read.
+    """Return the sorted names of the scene's invariants. A motion needs none of them, so errors in
+    `invariants` are raised only when their names are read.
     """
     return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
 
 
 @once_per_class
 def _listed(scene: Scene) -> _Listed:
-    """They are noted inside, because JAX returns arrays only, in dictionaries sorted by name."""
+    """Return the names, recorded during the trace because JAX returns only arrays, in dictionaries sorted by
+    name.
+    """
     noted: list[_Listed] = []
 
     def look(scene: Scene, motion: Motion) -> None:

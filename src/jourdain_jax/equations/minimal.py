@@ -5,10 +5,9 @@ in the speeds.
     udot = C ydot + c'                 from their rates
     C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
 
-A, C and the partial velocities do not depend on u: they are computed once, at `u = (y, 0)`, and serve both
-levels. A holds the rows that are requested:
-without those that follow from the others A_z is square, and its determinant changes its sign where it is singular.
-Source: Wang and Pao (2003), sections III and IV.
+A, C and the partial velocities do not depend on u. They are computed once, at `u = (y, 0)`, and serve both
+levels. A holds only the requested rows: without rows that follow from the others A_z is square, and its
+determinant changes sign where it is singular. Source: Wang and Pao (2003), sections III and IV.
 """
 
 import equinox as eqx
@@ -35,11 +34,11 @@ class MinimalKinematics(eqx.Module):
     split: Partition  # of the scaled rows d A c
     c: Speeds
     d: Float[Array, "rows"]
-    rows: tuple[int, ...] = eqx.field(static=True)  # which of the scene's
+    rows: tuple[int, ...] = eqx.field(static=True)  # indices among the scene's rows
 
 
 def minimal_kinematics(scene: Scene, independent: tuple[int, ...], rows: tuple[int, ...], t, q, y, inputs=None) -> MinimalKinematics:
-    """`u = C y + c`, by the `rows` of these numbers."""
+    """Return `u = C y + c`, from the constraint `rows` with these indices."""
     at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
     partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
     weights = inertias_of(motion)
@@ -52,11 +51,11 @@ def minimal_kinematics(scene: Scene, independent: tuple[int, ...], rows: tuple[i
 
 
 def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) -> tuple[Motion, Reduced]:
-    """Return the motion and the accelerations that go with known speeds."""
+    """Return the motion and the accelerations at the given speeds."""
     value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)
     equations = equations_of(scene, Instant(motion, known.weights, value, known.partial, rate))
     c = known.c
-    # in scaled speeds, where definiteness has no units
+    # in scaled speeds, where definiteness is independent of units
     M, f = c[:, None] * equations.M * c, c * (equations.Q - equations.h)
     w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows[np.array(known.rows, int)]), known.split.pivot())
     return motion, reduced(c * w, pivot, applicable, equations)

@@ -2,8 +2,9 @@
 
     q <- q - G+ g(q),  G = dg/dq               u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-Each is iterated until nothing changes any more, in a way that can be differentiated in any mode; the iteration converges quadratically, and its
-derivative with it. Rows affine in the speeds are met by one step. Unit norms of quaternions count as position rows here.
+Each iterates to a fixed point and is differentiable in any mode; the iteration and its derivative converge
+quadratically. One step suffices for constraints affine in the speeds. Unit norms of quaternions count as
+geometric constraints here.
 """
 
 from collections.abc import Callable
@@ -31,15 +32,15 @@ class RowFunctions(NamedTuple):
     closures: Callable  # (scene, t, q) -> g, G
     rows: Callable  # (scene, t, q, u, inputs) -> phi, A
     masses: Callable  # (scene, t, q) -> M
-    parameters: Callable | None = None  # scene -> what the first two may be given in its place
+    parameters: Callable | None = None  # scene -> argument of the first two functions in its place
 
     def given(self, scene: Scene):
-        """Return the arguments of the first two functions, from a scene."""
+        """Return the first argument of `closures` and `rows`, from a scene."""
         return scene if self.parameters is None else self.parameters(scene)
 
 
 def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
-    """Geometric rows, and `(|quaternion|^2 - 1)/2` of every quaternion."""
+    """Return the geometric residuals, and `(|quaternion|^2 - 1)/2` of every quaternion."""
     norms = [(q[i : i + 4] @ q[i : i + 4] - 1)[None] / 2 for i, _ in scene.coordinates.quaternions]
     return jnp.concatenate([position_residual(scene, t, q), *norms])
 
@@ -49,7 +50,7 @@ def _closures(scene: Scene, t, q):
 
 
 def linearised_rows(scene: Scene, t, q, u, inputs) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
-    """phi and A = d phi/du."""
+    """Return phi and A = d phi/du."""
     return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
 
 
@@ -66,11 +67,11 @@ def project_positions(
     typical=None,
     by: RowFunctions = BY_AUTODIFF,
 ) -> Float[Array, "coordinates"]:
-    """Return coordinates on the geometric constraints, near q, after at most `iterations` corrections; only
+    """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
     `typical`: lengths of the rows relative to which a row counts as vanishing, from `closure_lengths`
-    (default: only zero rows do). `by`: the evaluation of the rows.
+    (default: only zero rows do). `by`: the evaluation of the constraints.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
@@ -88,11 +89,12 @@ def project_positions(
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
-    """Return the result for unit norms only, which needs no iteration: `q / |q|` for every quaternion."""
+    """Return `q / |q|` for every quaternion, the result for unit norms only, without iteration."""
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
         squared = wxyz @ wxyz
-        q = q.at[first : first + 4].set(wxyz / jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))  # zero has no direction and stays
+        # zero has no direction and stays zero
+        q = q.at[first : first + 4].set(wxyz / jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
     return q
 
 
@@ -111,14 +113,17 @@ def project_speeds(
     determined: bool = False,
     by: RowFunctions = BY_AUTODIFF,
 ) -> Speeds:
-    """Return speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are
-    `free` move.
+    """Return the speeds that satisfy the velocity constraints, nearest to u in the metric of the mass matrix;
+    only `free` speeds change.
 
-    Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled
-    speeds relative to which a row counts as vanishing, from `usual_rows` (default: only zero rows do).
-    `affine`: rows are affine in the speeds, so that one step is exact and `iterations` does not matter.
-    `determined`: rows are affine and determine all `free` speeds, so that no metric is needed; `typical` is
-    then in plain speeds. `by`: the evaluation of rows and mass matrix.
+    - Rows count as dependent below `cutoff` (default: `rank_cutoff`).
+    - `typical`: lengths of the rows in scaled speeds relative to which a row counts as vanishing, from
+      `usual_rows` (default: only zero rows do).
+    - `affine`: the constraints are affine in the speeds, so that one step is exact and `iterations` has no
+      effect.
+    - `determined`: they are affine and determine all `free` speeds, so that no metric is needed; `typical` is
+      then in plain speeds.
+    - `by`: the evaluation of constraints and mass matrix.
     """
     if not names_of_rows(scene):
         return u
@@ -136,4 +141,5 @@ def project_speeds(
         return fixed_point(lambda given, u: u - change(given, u).x, given, u, iterations)
     found = change(given, u)
     u = u - found.x
-    return u - found.K @ by.rows(*jax.lax.stop_gradient((parameters, t, q, u, inputs)))[0]  # round-off, of which no derivative is wanted
+    # removes round-off, which has no derivative
+    return u - found.K @ by.rows(*jax.lax.stop_gradient((parameters, t, q, u, inputs)))[0]

@@ -1,4 +1,4 @@
-"""Reductions: interchangeable ways from virtual power and rows to accelerations.
+"""Reductions: interchangeable ways from virtual power and constraints to accelerations.
 
     M udot + h = Q + A' lambda,   A udot = -drift
 
@@ -8,9 +8,9 @@
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
 - `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
 
-All agree to round-off where they apply; `applicable` says whether one does. Where accelerations are not determined (no inertia along a direction
-that the rows leave free) they are NaN, but for `Multipliers`, whose own test is too coarse near a loss of rank to act on. Dependent rows are
-allowed everywhere: the rank is found at every state, the multipliers are those of minimum norm.
+All agree to round-off where they apply; `applicable` is the test. Undetermined accelerations (no inertia
+along a free direction) are NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All
+allow dependent constraints: the rank is found at every state, and the multipliers have minimum norm.
 """
 
 import abc
@@ -27,19 +27,22 @@ from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
-# Of the scaled A_z. Round-off grows as the inverse square of the pivot: at the first, accelerations agree to 1e-12 with the other reductions.
+# Of the scaled A_z. Round-off grows as the inverse square of the pivot: at 1e-2, accelerations agree to 1e-12
+# with the other reductions.
 APPLICABLE_PIVOT = 1e-2
-SMALLEST_PIVOT = 1e-3  # below it, privileged speeds do not serve as the state of a simulation either
+SMALLEST_PIVOT = 1e-3  # below it, privileged speeds are not used as the state of a simulation either
 
 
 class Reduction(eqx.Module):
-    """A way from the equations and rows of one state to its accelerations."""
+    """A method that solves the equations and constraints of one state for accelerations."""
 
     name: eqx.AbstractClassVar[str]
 
     @abc.abstractmethod
     def solve(self, problem: ScaledProblem) -> tuple[Speeds, Scalar, Flag]:
-        """Scaled accelerations of the scaled `problem`, the reduction's smallest pivot, and whether it applies."""
+        """Return scaled accelerations of the scaled `problem`, the smallest pivot of the reduction, and
+        whether it applies.
+        """
 
 
 class Reduced(eqx.Module):
@@ -52,23 +55,21 @@ class Reduced(eqx.Module):
 
 
 def reduce(reduction: Reduction, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
-    """Return accelerations by the given reduction."""
+    """Return accelerations and constraint force by the given reduction."""
     problem = scaled(equations, rows)
     w, pivot, applicable = reduction.solve(problem)
     return reduced(problem.c * w, pivot, applicable, equations)
 
 
 def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduced:
-    """Known accelerations with the constraint force that goes with them."""
+    """Return known accelerations with their constraint force."""
     # A' lambda = M udot + h - Q
     return Reduced(udot, equations.M @ udot + equations.h - equations.Q, pivot, applicable)
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
-    """Return the last singular value of the usual rank, which vanishes at a loss of rank. If that rank is
-    unknown, return the smallest value above the cut-off.
-
-    If there is no such value, return 1.
+    """Return the last singular value within the usual rank, which vanishes at a loss of rank. If that rank is
+    unknown, return the smallest value above the cut-off; 1 if there is none.
     """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
@@ -83,23 +84,21 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
     identity.
     """
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
-    # a pivot at round-off means a singular matrix, whatever its sign came out as
+    # a pivot at round-off, of either sign, means a singular matrix
     definite = jnp.all(jnp.isfinite(factor)) & (jnp.min(jnp.diagonal(factor), initial=1.0) ** 2 > 16 * M.shape[0] * jnp.finfo(M.dtype).eps)
-    usable = definite | ~jnp.all(jnp.isfinite(M))  # NaN in M must show, not vanish
+    usable = definite | ~jnp.all(jnp.isfinite(M))  # keep NaN in M visible
     return jnp.linalg.cholesky(jnp.where(usable, M, jnp.eye(M.shape[0], dtype=M.dtype))), definite
 
 
 def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Flag]:
-    """Return `M^-1 f` by Cholesky, and whether M is positive definite. If it is not, the result is NaN, so
-    that no invented number passes for a solution.
-    """
+    """Return `M^-1 f` by Cholesky, and whether M is positive definite. If it is not, the result is NaN."""
     factor, definite = cholesky(M)
     return jnp.where(definite, jax.scipy.linalg.cho_solve((factor, True), f), jnp.nan), definite
 
 
 class Privileged(Reduction):
-    """Appell's equations in privileged velocities: the speeds `independent` are free, and the rows determine
-    the others.
+    """Appell's equations in privileged velocities: the speeds `independent` are free, and the constraints
+    determine the others.
 
     `zdot = B ydot + b` with `B = -A_z^-1 A_y`. With C from `udot = C yddot + c`, `C' (M (C yddot + c) + h -
     Q) = 0`. Rows may be redundant if they are so at every state; A_z is then tall, with full column rank. The
@@ -115,17 +114,18 @@ class Privileged(Reduction):
 
 
 def appell(M, f, C, c, pivot):
-    """Return `udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether both are valid
-    (eq. (41)).
+    """Return `udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether the result is
+    valid (eq. (41)).
     """
     yddot, definite = solve_definite(C.T @ M @ C, C.T @ (f - M @ c))
     return C @ yddot + c, pivot, definite & (pivot > APPLICABLE_PIVOT)
 
 
 class Partition(eqx.Module):
-    """Independent and dependent speeds, y and z: `A u = b` solved as `u = C y + c` (eqs. (25)-(31)).
+    """The partition into independent and dependent speeds, y and z: `A u = b` solved as `u = C y + c` (eqs.
+    (25)-(31)).
 
-    `B = -A_z^-1 A_y`. A_z is tall where rows are redundant at every state.
+    `B = -A_z^-1 A_y`. A_z is tall if rows are redundant at every state.
     """
 
     A: Float[Array, "rows speeds"]
@@ -133,7 +133,7 @@ class Partition(eqx.Module):
 
     @property
     def dependent(self) -> tuple[int, ...]:
-        """Indices of the dependent speeds."""
+        """Return indices of the dependent speeds."""
         return tuple(i for i in range(self.A.shape[1]) if i not in self.independent)
 
     def all_from(self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]) -> Float[Array, "speeds *k"]:
@@ -143,16 +143,16 @@ class Partition(eqx.Module):
 
     @property
     def C(self) -> Float[Array, "speeds freedoms"]:
-        """All speeds per independent one."""
+        """Return the matrix of all speeds per independent one."""
         B = self._solved(-self.A[:, np.array(self.independent, int)])
         return self.all_from(jnp.eye(len(self.independent), dtype=B.dtype), B)
 
     def particular(self, b: Float[Array, "rows"]) -> Speeds:
-        """`c`: the solution of `A c = b` with all independent speeds zero."""
+        """Return `c`, the solution of `A c = b` with zero independent speeds."""
         return self.all_from(jnp.zeros(len(self.independent), b.dtype), self._solved(b[:, None])[:, 0])
 
     def pivot(self) -> Scalar:
-        """Smallest singular value of A_z; 1 without rows."""
+        """Return the smallest singular value of A_z; 1 without rows."""
         A_z = self._A_z
         if not self.dependent:
             return jnp.ones((), A_z.dtype)
@@ -165,7 +165,7 @@ class Partition(eqx.Module):
         return self.pivot() * self.orientation()
 
     def orientation(self) -> Scalar:
-        """Return the sign of det A_z, or 1 where A_z is not square; it has no derivative."""
+        """Return the sign of det A_z, or 1 if A_z is not square; it has no derivative."""
         square = self.A.shape[0] == len(self.dependent) > 0
         return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
 
@@ -174,7 +174,7 @@ class Partition(eqx.Module):
         return self.A[:, np.array(self.dependent, int)]
 
     def _solved(self, right: Float[Array, "rows k"]) -> Float[Array, "rank k"]:
-        """`A_z^-1 right`."""
+        """Return `A_z^-1 right`."""
         A_z = self._A_z
         if not self.dependent:
             return jnp.zeros((0, right.shape[1]), right.dtype)
@@ -216,15 +216,16 @@ class NullSpaceSVD(Reduction):
 
 
 def _refined(inverse, A, b):
-    """Return `A+ b` after one step of iterative refinement, which gains the two digits that an explicit
-    inverse loses.
+    """Return `A+ b` after one step of iterative refinement, which recovers the two digits lost by an explicit
+    inverse.
     """
     x = inverse @ b
     return x + inverse @ (b - A @ x)
 
 
 class Multipliers(Reduction):
-    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated where rows are dependent; (68)-(70).
+    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated
+    for dependent rows; (68)-(70).
 
     With `f = Q - h`, `b = -drift`. M may be singular if every admissible velocity has inertia.
     """
@@ -252,7 +253,7 @@ class UdwadiaKalaba(Reduction):
         L, definite = cholesky(problem.M)
         free = jax.scipy.linalg.solve_triangular(L, problem.f, lower=True)  # L' a
         weighted = jax.scipy.linalg.solve_triangular(L, problem.A.T, lower=True).T  # A L'^-1
-        # to their lengths in A, so that a row that vanishes stays as small as it is
+        # rescale to the lengths in A, so that a vanishing row stays small
         lengths, by_mass = (jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, axis=1)) for rows in (problem.A, weighted))
         d = jnp.where(by_mass > 0, lengths / jnp.where(by_mass > 0, by_mass, 1.0), 1.0)
         weighted = d[:, None] * weighted

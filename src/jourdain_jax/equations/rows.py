@@ -2,9 +2,9 @@
 
     phi(t, q, u) = 0,   A = d phi/du,   A udot = -drift,   drift = d phi/dt at udot = 0
 
-Geometric rows `g(t, q) = 0` enter as `phi = dg/dt`, and keep their position residual `g`. Order: prescribed coordinates, geometric
-rows, contact heights (these have a position residual), then contact no-slip rows and velocity rows.
-Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
+Geometric constraints `g(t, q) = 0` enter as `phi = dg/dt`, and keep their position residual `g`. Order:
+prescribed coordinates, geometric constraints and contact heights, which have a position residual; then
+no-slip and velocity constraints. Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
 """
 
 from collections.abc import Callable
@@ -25,14 +25,14 @@ from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, 
 
 
 class UsualRows(eqx.Module):
-    """Typical constraint rows of a scene, by which rows at one state are judged."""
+    """Typical constraint rows of a scene, the reference for rows at one state."""
 
     lengths: Float[Array | np.ndarray, "rows"]  # of `A` in scaled speeds
     rank: Int[Array | np.ndarray, ""]
 
 
 class ConstraintRows(eqx.Module):
-    """The rows at one state, linearised: `A udot = -drift`."""
+    """The constraints at one state, linearised: `A udot = -drift`."""
 
     phi: Float[Array, "rows"]  # velocity residual
     A: Float[Array, "rows speeds"]
@@ -41,13 +41,13 @@ class ConstraintRows(eqx.Module):
     usual: UsualRows | None = None  # None: each row is judged by its length at this state
 
     def judged_by(self, usual: UsualRows | None) -> "ConstraintRows":
-        """Return these rows, judged by their typical values (`structure.usual_rows`)."""
+        """Return these rows with the reference `usual` (`structure.usual_rows`)."""
         return ConstraintRows(self.phi, self.A, self.drift, self.names, usual)
 
 
 def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
-    """Return values of all geometric rows by name: prescribed coordinates, geometric constraints, contact
-    heights.
+    """Return values of all geometric constraints by name: prescribed coordinates, geometric constraints,
+    contact heights.
     """
     rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in prescribed_of(scene, pose.t).items()}
     rows |= geometric_constraints_of(scene, pose)
@@ -56,7 +56,7 @@ def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of all rows at the level of velocities, by name."""
+    """Return values of all constraints at velocity level, by name."""
     rows = rates_along(scene, motion, lambda pose: position_rows(scene, pose))
     for name, contact in contacts_of(scene, motion.pose()).items():
         if contact.friction is not None:  # it may slip (`equations/switching.py`)
@@ -64,8 +64,10 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
         rows[f"{name} slip"] = slip_of(contact, motion)
     for name, value in velocity_constraints_of(scene, motion).items():
         if name in rows:
-            raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every "
-                "constraint a name of its own")
+            raise ValueError(
+                f"constraint name `{name}` of `{type(scene).__name__}` is used twice; give every constraint "
+                "its own name"
+            )
         rows[name] = value
     return rows
 
@@ -77,15 +79,15 @@ def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
-    """Return rates of named `values` of a pose along the velocities of the motion. They can be differentiated
-    with respect to the velocity of a single body.
+    """Return rates of named `values` of a pose along the velocities of the motion, differentiable with
+    respect to the velocity of a single body.
     """
 
     names: list[str] = []
 
     def g(t, q, bodies):
         rows = values(Pose(t, scene.coordinate_names.view(q), bodies))
-        names[:] = rows  # in their order: JAX returns dictionaries sorted by name
+        names[:] = rows  # in original order; JAX sorts returned dictionaries by name
         return tuple(rows.values())
 
     pose = motion.pose()
@@ -100,8 +102,7 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """Return one name per scalar row: that of its constraint, with an index if the constraint has several
-    rows.
+    """Return one name per scalar row: the name of its constraint, indexed if the constraint has several rows.
     """
     names: list[str] = []
     for name, value in rows.items():
@@ -121,7 +122,7 @@ def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     return _position_residual(scene, as_time(t), as_coordinates(scene, q))
 
 
-@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+@eqx.filter_jit  # one trace serves all its derivatives
 def _position_residual(scene: Scene, t: Scalar, q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 

@@ -2,8 +2,9 @@
 
     M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/max(|A_s c|, l_s)
 
-l_s: the typical length of the row (`structure_of`), so that a row that vanishes at a configuration is not blown up to a direction of round-off.
-The scales are constants to differentiation: the accelerations do not depend on them.
+l_s: the typical length of the row (`structure_of`), so that round-off of a row that vanishes at a
+configuration is not scaled up. The scales are constant under differentiation: the accelerations do not depend
+on them.
 """
 
 import equinox as eqx
@@ -30,18 +31,18 @@ class ScaledProblem(eqx.Module):
 
 
 def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
-    """`M_ii^(-1/2)`, and 1 for a speed without inertia of its own."""
+    """Return `M_ii^(-1/2)`, and 1 for a speed without inertia."""
     diagonal = jax.lax.stop_gradient(jnp.diagonal(M))
     heavy = diagonal > 0
     return jnp.where(heavy, 1 / jnp.sqrt(jnp.where(heavy, diagonal, 1)), 1)
 
 
 def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
-    """Return one over the length of each row, or over its `typical` length if it is shorter; 1 for a
+    """Return one over the length of each row, or over its `typical` length if that is longer; 1 for a
     vanishing row without a typical length.
 
-    A row that shrinks along a motion therefore counts less and less. It does not count at all once it is only
-    round-off relative to its typical length.
+    A row that shrinks along a motion therefore counts less and less, and not at all once it is round-off
+    relative to its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
     if typical is not None:

@@ -13,10 +13,11 @@
     slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
     creeps      L_n             e.w_t                        2 s - e.w_t
 
-The event of speed also ends the motion of a disc or wheel that rolls or slips until it is flat.
+The event `speed` also ends the motion of a disc or wheel that falls flat.
 
-The direction of slip is a number of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e (`slip_turns`):
-errors of w_t across it do not turn it. It has no limit at rest: below the speed s, s replaces e.w_t.
+The direction of slip e is part of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e (`slip_turns`), so
+that errors of w_t across e do not turn it. The rate has no limit at rest: below the speed s, s replaces
+e.w_t.
 
 Impacts: `impacts.py`.
 """
@@ -36,14 +37,14 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.switching import CREEPS, FLAT, FLIES, PAINLEVE, ROLLS, SLIPS
 
-NEARLY = 1e-4  # of the response of the ground that is left near Painleve's paradox
-STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
-SAME = 1e-12  # m: a contact that closes within it strikes together with another
-TOUCHES = 1e-8  # m: a gap that counts as none at the start
+NEARLY = 1e-4  # share of the ground's response left near Painleve's paradox
+STOPS = 1e-13  # m/s: slip against its direction by this much ends it, beyond the round-off at its start
+SAME = 1e-12  # m: a contact that closes within this gap strikes together with another
+TOUCHES = 1e-8  # m: a gap below this counts as closed at the start
 
 
 def contact_events(at: At) -> dict[str, Scalar]:
-    """Return values of the events of all contacts that switch."""
+    """Return values of the events of all switching contacts."""
     events, forces, one = {}, at.forces, jnp.ones_like(at.motion.t)
     for i, name in enumerate(at.scene.switching.contacts):
         number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]
@@ -58,7 +59,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
         bears, stands = _bearing(at, i) - NEARLY, one
         if (above := at.above_flat[i]) is not None:
             stands = jnp.where(number == ROLLS, above, one)
-            bears = bears * above / jnp.sqrt(bears**2 + above**2)  # zero with either
+            bears = bears * above / jnp.sqrt(bears**2 + above**2)  # zero with either factor
         while_slips = jnp.where(number == SLIPS, bears, stands)
         events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, while_slips)
     return events
@@ -74,7 +75,8 @@ def contact_changes(at: At) -> dict[str, Event]:
         flying = strikes & (at.number == FLIES) & together
         after = After(at, i, Changes(flying, own & stops, own & (number == ROLLS)))
         events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
-        # where slip begins, the law at rest has its direction, also if round-off would let the contact stick
+        # when slip starts, take the direction from the law at rest, even if round-off would let the contact
+        # stick
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
         ends = jnp.asarray(float(PAINLEVE))
@@ -108,9 +110,10 @@ def _event(
 
 
 def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
-    """Return coordinates on the ground, by one Gauss-Newton step, and speeds on the rows of closed contacts.
+    """Return coordinates on the ground, by one Gauss-Newton step, and speeds that satisfy the laws of closed
+    contacts.
 
-    q - D' (D D')^-1 gap,  D = d gap/dq;       e/|e|;       u by `_speeds_on_rows`
+        q - D' (D D')^-1 gap,  D = d gap/dq;       e/|e|;       u by `_speeds_on_rows`
     """
     scene, motion, modes = at.scene, at.motion, at.modes
     q, closed = motion.q.array, modes.closed
@@ -128,7 +131,7 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
     """Return `u + M^-1 A' T P`, `(T G T + 1 - T) P = -T w`, for contacts in these modes.
 
-    T projects w onto the part that must vanish: the normal part of closed contacts, all slip of rolling ones,
+    T projects w onto its part that must vanish: the normal part of closed contacts, all slip of rolling ones,
     and slip across e of slipping ones.
     """
     found, blocks = at.found, []
@@ -143,14 +146,14 @@ def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
 class Begun(NamedTuple):
     """Contacts at the start of a motion."""
 
-    numbers: Float[Array, "contacts"]  # of their modes
-    below: Scalar  # m, how far a body is below its ground; infinite where contacts have no answer
-    q: Float[Array, "coordinates"]  # on the ground where they touch it
-    u: Speeds  # after an impact where they strike it
+    numbers: Float[Array, "contacts"]  # of the modes
+    below: Scalar  # m, depth of a body below its ground; infinite if the contacts have no solution
+    q: Float[Array, "coordinates"]  # on the ground for contacts that touch
+    u: Speeds  # after an impact, if contacts strike
 
 
 def contacts_at_start(at: At) -> Begun:
-    """Return in which modes contacts begin, and the state then."""
+    """Return the modes in which contacts start, and the state then."""
     scene, motion, gap, w = at.scene, at.motion, at.found.rows.gap, at.w
     touches = gap < TOUCHES
     strikes = touches & (w[:, 0] < -LEAST_REBOUND)

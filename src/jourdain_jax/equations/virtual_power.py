@@ -60,10 +60,10 @@ class Resultants(eqx.Module):
 def resultants(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
 ) -> Resultants:
-    """Return the sum of the loads per body and per speed, for loads with a potential (`conservative=True`),
-    without one (`False`), or with the indices `among`.
+    """Return the sum of the loads per body and per speed, restricted to loads with a potential
+    (`conservative=True`), without one (`False`), or with the indices `among`.
 
-    `loads`: those of the scene at this motion, if they are already known.
+    `loads`: the scene's loads at this motion, if already known.
     """
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
@@ -120,7 +120,7 @@ def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> Unconstrained
 
 
 def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[UnconstrainedEquations, ConstraintRows]:
-    """M, h, Q and the rows, from the same poses."""
+    """Return M, h, Q and the constraint rows, from one evaluation of the poses."""
     instant = instant_at(scene, t, q, u, inputs)
     return equations_of(scene, instant), rows_of(scene, instant)
 
@@ -142,25 +142,27 @@ def mass_matrix(
     beta: Float[Entries, "*states bodies 3 speeds"],
     gamma: Float[Entries, "*states bodies 3 speeds"],
 ) -> Float[Entries, "*states speeds speeds"]:
-    """Return `M = sum m beta' beta + gamma' I gamma` for arrays of JAX or NumPy, also at many states."""
+    """Return `M = sum m beta' beta + gamma' I gamma` for arrays of JAX or NumPy, with any leading axes of
+    states.
+    """
     return _summed(beta, mass[..., None, None] * beta) + _summed(gamma, inertia @ gamma)
 
 
 def _summed(x, y):
-    """`sum x' y` over the bodies."""
+    """Return `sum x' y` over the bodies."""
     x, y = (z.reshape(*z.shape[:-3], -1, z.shape[-1]) for z in (x, y))
     return x.mT @ y
 
 
 def mass_matrix_at(scene: Scene, t, q) -> Float[Array, "speeds speeds"]:
-    """M at (t, q); it does not depend on u."""
+    """Return M at (t, q), which does not depend on u."""
     rest = jnp.zeros(len(scene.speed_names), q.dtype)
     weights, partial = inertias(scene, t, q), partial_velocities(scene, t, q, rest)
     return mass_matrix(weights.mass, weights.inertia, partial.linear, partial.angular)
 
 
 def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
-    """`m a` and `I alpha + omega x I omega` per body."""
+    """Return `m a` and `I alpha + omega x I omega` per body."""
     momentum = jnp.einsum("bij,bj->bi", weights.inertia, velocity.angular)
     torque = jnp.einsum("bij,bj->bi", weights.inertia, acceleration.angular) + jnp.cross(velocity.angular, momentum)
     return weights.mass[:, None] * acceleration.linear, torque
@@ -182,12 +184,12 @@ def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities, loads
 
 
 class ContactResponse(eqx.Module):
-    """Switching contacts at one state, with the effect of their forces L: `du/dt = free + impulses L`, `dw/dt
-    = G L + b`.
+    """Response of switching contacts to their forces L at one state: `du/dt = free + impulses L`, `dw/dt = G
+    L + b`.
     """
 
     rows: ContactRows
-    impulses: Float[Array, "speeds rows"]  # M^-1 A', along the rows that always hold
+    impulses: Float[Array, "speeds rows"]  # M^-1 A', with the permanent constraints satisfied
     G: Float[Array, "rows rows"]
     b: Float[Array, "rows"]
 
@@ -202,21 +204,22 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     equations, held, rows = equations_of(scene, instant, loads_of(scene, motion)), rows_of(scene, instant), contact_rows(scene, motion)
     count, kept = len(motion.u.array), len(held.phi)
     right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
-    # the last speeds first: they belong to the leaves of a tree, whose elimination fills nothing
+    # the last speeds first: they belong to the leaves of a tree, and elimination from there creates no
+    # fill-in
     moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]
     if kept:
         by_rows, drift = moved[:, len(moved[0]) - kept :], jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1)
         moved = moved[:, : len(moved[0]) - kept]
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
-    # rows that hold up to a force have the normal force one, the solution of L_n - 1 = 0
+    # a constraint that holds up to a force has unit normal force, the solution of L_n - 1 = 0
     one = jnp.array([[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()], free.dtype).ravel()
     return ContactResponse(rows, impulses, rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one)
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
-    """Return the modes of the switching contacts and their directions of slip, which belong to the state. A
-    direction is zero where a contact neither slips nor creeps.
+    """Return the modes of the switching contacts and their directions of slip, which are part of the state;
+    zero unless a contact slips or creeps.
     """
     names = scene.switching.contacts
     number = jnp.stack([motion.modes[name] for name in names])
@@ -226,9 +229,9 @@ def contact_modes(scene: Scene, motion: Motion) -> Modes:
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
-    """Return rates of the directions of slip, 1/s; zero where a contact does not slip.
+    """Return rates of the directions of slip, 1/s; zero unless a contact slips or creeps.
 
-    de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, and `SLOW` where it creeps
+        de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
     """
     e = contact_modes(scene, motion).direction
     slips = jnp.stack([motion.modes[name] for name in scene.switching.contacts]) == SLIPS
@@ -254,8 +257,8 @@ def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Fl
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:
-    """Return the loads of a scene, including the forces of switching contacts, which depend on the others;
-    `found`: the contacts' response, if already known.
+    """Return the loads of a scene, including the forces of switching contacts, which depend on the other
+    loads; `found`: the contacts' response, if already known.
     """
     own = loads_of(scene, motion)
     if not scene.switching.contacts:
@@ -275,7 +278,7 @@ def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = Non
 
 
 def _potential_gradient(scene: Scene, motion: Motion) -> Speeds:
-    """`N' dV/dq` of the scene's own potential."""
+    """Return `N' dV/dq` of the scene's own potential."""
     t, q, u = motion.t, motion.q.array, motion.u.array
     if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(u)

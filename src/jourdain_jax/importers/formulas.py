@@ -30,13 +30,12 @@ def sympy_package() -> Any:
 
 
 class Formulas:
-    """Several named lists of expressions that are evaluated together, as a function of the values of their
-    symbols.
+    """Named lists of expressions that are evaluated together, as a function of the values of their symbols.
     """
 
     def __init__(self, lists: Mapping[Any, Any], leaves: Sequence[Any]):
         """Prepare the `lists` (or matrices) of expressions in the symbols `leaves`. Raises ValueError for a
-        function that JAX does not have.
+        function that JAX lacks.
         """
         sympy = sympy_package()
         self._lengths = {name: len(expressions) for name, expressions in lists.items()}
@@ -63,8 +62,8 @@ class Formulas:
 
 
 def check_functions(expression, leaves) -> None:
-    """Raise ValueError with the name of a function in the expression that JAX lacks or that is not real. The
-    `leaves` are not examined.
+    """Raise ValueError for a function in the expression that JAX lacks, and for a number that is not real.
+    The `leaves` are not examined.
     """
     if expression.is_Atom and expression.is_number and not expression.is_extended_real:
         raise ValueError(f"`{expression}` is not a real number; check the expressions that contain it")

@@ -21,12 +21,13 @@ from jourdain_jax.scene.names import Labels, as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 Place = tuple[Vector, Matrix]  # position and rotation
-Geom = tuple[Part, str, Place]  # its attributes, its type, and its frame in that of the body
+Geom = tuple[Part, str, Place]  # attributes, type, and frame relative to the body
 HERE = np.zeros(3), np.eye(3)
 _TYPES = ("free", "ball", "slide", "hinge")
 _ATTITUDE = tuple(f"attitude_{part}" for part in "wxyz")
-_TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}  # numbers
-_LOOKS: dict = {"sphere": ("ball", 1), "ellipsoid": ("ellipsoid", 1), "box": ("box", 2)}  # how a geom is drawn, and factors of its sizes
+_TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}  # attribute -> count of numbers
+# shape for drawing, and factors of the sizes
+_LOOKS: dict = {"sphere": ("ball", 1), "ellipsoid": ("ellipsoid", 1), "box": ("box", 2)}
 _LOOKS |= {kind: (kind, [1, 2]) for kind in ("capsule", "cylinder")}
 
 
@@ -37,28 +38,29 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
         jj.simulate(Arm(), {"elbow": 0.3}, t1=1.0)
 
     - `path`: of the file, or its text.
-    - `free`: names of bodies whose position in the frame of their parent becomes a parameter.
-    - `ignore`: names of elements and attributes that may be omitted although they change the motion, such as
-      "armature" or "equality". With "inertia", impossible moments of inertia are accepted.
+    - `free`: names of bodies whose position in the parent's frame becomes a parameter.
+    - `ignore`: names of elements and attributes to omit although they change the motion, such as "armature"
+      or "equality". With "inertia", impossible moments of inertia are accepted.
 
     **Returns** a class. Hinges and slides are coordinates with their names, a ball joint is a quaternion with
     its name, and a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints
     without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo.
-    Motors of joints and of sites are inputs; `ctrlrange` limits the input and `forcerange` its force, as in
-    MuJoCo. Values of the file that are not zero are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in
-    the body's frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`,
-    `<joint>_stiffness` and `gravity` (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms
-    come from their mass or density. The pose of the file is the `example`.
+    Motors of joints and of sites are inputs; as in MuJoCo, `ctrlrange` limits the input and `forcerange` its
+    force. Nonzero values of the file are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's
+    frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`, `<joint>_stiffness` and
+    `gravity` (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms come from their mass or
+    density. The pose of the file is the `example`.
 
-    `connect`, `weld` and `joint` of `equality` are geometric rows, which hold exactly: loops are closed as they are in the stated pose.
+    `connect`, `weld` and `joint` of `equality` become exact geometric constraints: loops are closed as in the
+    stated pose.
 
     Geoms are drawn, but their contacts are not read: state rolling in `contacts` of a subclass. Limits of
     joints do not stop a motion; they become the `domain`.
 
-    **Raises** ValueError, with the name, for a file that cannot be read, a moving body without mass,
-    impossible moments of inertia, repeated statements, and everything that changes the motion or does not
-    belong to the format and is not read, such as `tendon`, `armature`, `frictionloss` or a misspelt
-    attribute, unless `ignore` names it. A warning lists other omitted elements.
+    **Raises** ValueError, with the name, for an unreadable file, a moving body without mass, impossible
+    moments of inertia and repeated statements. Contents that change the motion and are not supported also
+    raise it, as do unknown ones, such as `tendon`, `armature`, `frictionloss` or a misspelt attribute, unless
+    `ignore` names them. A warning lists other omitted elements.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_labels(free))
@@ -67,7 +69,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
 
 class _Reader:
-    """Reads the elements of one file."""
+    """Reader of one file."""
 
     def __init__(self, file: XmlFile):
         self.file, self.defaults, self.compiler = file, Defaults(file), all_of(file, "compiler")
@@ -78,12 +80,13 @@ class _Reader:
                 "out of x, y, z, X, Y, Z")
         self.meshes = {mesh.get("name") or Path(mesh.get("file", "")).stem: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
-        self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}  # the body that each is on, and its place there
+        # site -> its body, and its position and rotation there
+        self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}
         self.moving: set[str | None] = set()  # names of links
         self.start: dict[str, float] = {}
 
     def tree(self, free: Labels) -> Tree:
-        """Return the whole mechanism."""
+        """Return the mechanism."""
         for section in self.file.root.findall("worldbody"):
             name = "world" if not self.links else f"world {len(self.links) + 1}"
             looks = self._looks(self._geoms(section, None, "the world"))
@@ -97,7 +100,7 @@ class _Reader:
         return Tree(name, tuple(self.links), gravity, motors, ties, free, self.start)
 
     def _ties(self, joints: list[str]) -> Iterable[Follower | Closure]:
-        """Return the ties of `equality`, as exact constraints."""
+        """Yield the exact constraints that `equality` states."""
         stated = () if "equality" in self.file.ignore else self.file.root.findall("equality/*")
         for k, element in enumerate(stated):
             tie, follows = Part(self.file, f"{element.tag} {k + 1} of `equality`", element), element.tag == "joint"
@@ -105,7 +108,7 @@ class _Reader:
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
                 self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is not a "
-                    f"{'hinge or slide' if follows else 'body'}")
+                                                      f"{'hinge or slide' if follows else 'body'}")
             if element.get("active") == "false":
                 continue
             if follows:
@@ -122,8 +125,8 @@ class _Reader:
             self._body(element, parent, given, frame)
 
     def _held(self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE) -> Iterable[tuple[Element, str | None, Place]]:
-        """Yield the elements of a kind in a body and in its nested frames. Each comes with the class that
-        applies to it and its frame relative to the body.
+        """Yield the elements of a kind in a body and in its nested frames, each with its default class and
+        its frame relative to the body.
         """
         for child in holder:
             if child.tag == kind:
@@ -149,7 +152,7 @@ class _Reader:
         if moves:
             self.moving.add(name)
         geoms = self._geoms(body, childclass, what)
-        mass = self._mass(part, geoms) if moves else None  # what never moves needs none
+        mass = self._mass(part, geoms) if moves else None  # parts that never move need no mass
         self.links.append(Link(name, parent, position, turn, joints, mass, self._looks(geoms)))
         self._children(body, name, childclass)
 
@@ -198,7 +201,7 @@ class _Reader:
 
     def _mass_of_geom(self, given: Part, kind: str, frame: Place) -> Mass | None:
         word = "mass" if "mass" in given else "density"
-        number = given.number(word, 1000.0)  # kg/m^3, of geoms that state neither
+        number = given.number(word, 1000.0)  # kg/m^3, for geoms that state neither
         if number < 0:
             raise given.fault(word, f"{number:g}, expected a number that is not negative")
         if number == 0:
@@ -212,7 +215,7 @@ class _Reader:
         return Mass(mass, position, turn @ np.diag(mass * moments(kind, size)) @ turn.T)
 
     def _solid(self, given: Part, kind: str, frame: Place) -> tuple[Vector, Matrix, np.ndarray]:
-        """Middle, axes and size of a geom."""
+        """Return centre, axes and size of a geom."""
         position, turn = self._place(given)
         size = given.numbers("size", None)
         if "fromto" in given and kind != "sphere":
@@ -223,7 +226,7 @@ class _Reader:
             size = np.array([size[0], half] if kind in ("capsule", "cylinder") else [size[0], size[0], half])
         if len(size) < SIZES[kind] or np.any(size[: SIZES[kind]] <= 0):
             raise given.fault("size", f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above "
-                f"zero for the type `{kind}`")
+                                      f"zero for the type `{kind}`")
         return *_within(frame, (position, turn)), size[: SIZES[kind]]
 
     def _looks(self, geoms: list[Geom]) -> tuple[Look, ...]:
@@ -254,8 +257,10 @@ class _Reader:
         if not stated:
             return position, np.eye(3)
         if len(stated) > 1:
-            raise self.file.fault(f"{given.what} is turned by "
-                f"{' and by '.join(f'`{word}`' for word in stated)}; expected one of them")
+            raise self.file.fault(
+                f"{given.what} is rotated by {' and by '.join(f'`{word}`' for word in stated)}; expected one "
+                "of them"
+            )
         (word,) = stated
         with np.errstate(invalid="ignore"):
             turn = self._turn(word, given.numbers(word, _TURNS[word]))
@@ -264,7 +269,7 @@ class _Reader:
         return position, turn
 
     def _turn(self, word: str, x: np.ndarray) -> Matrix:
-        """Return the rotation that these numbers of an attribute define; NaN if they define none."""
+        """Return the rotation that the numbers of an attribute define; NaN if they define none."""
         if word == "quat":
             return by_quaternion(x)
         if word == "axisangle":
@@ -287,12 +292,14 @@ class _Reader:
             motor.what = f"motor `{name}`"
             if site is not None:
                 self.file.check_name(
-                    site, self.sites, f"{motor.what} pushes the site `{site}`, which is none"
+                    site, self.sites, f"{motor.what} pushes the unknown site `{site}`"
                 )
                 link, position, turn = self.sites[site]
                 if link not in heavy:
-                    raise self.file.fault(f"{motor.what} pushes the site `{site}` of "
-                        f"{f'body `{link}`' if link else 'the world'}, which has no mass that moves")
+                    raise self.file.fault(
+                        f"{motor.what} pushes the site `{site}` of "
+                        f"{f'body `{link}`' if link else 'the world'}, which has no moving mass"
+                    )
                 force, moment = np.pad(gear, (0, 6 - len(gear))).reshape(2, 3) @ turn.T
                 gear, push = np.ones(1), Push(link, position, force, moment)
             elif joint not in names:
@@ -301,8 +308,8 @@ class _Reader:
             yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
-        """Return the range that limits a motor's control or force; None if it has none or its limits are
-        switched off.
+        """Return the range that limits a motor's control or force; None if there is none or it is switched
+        off.
         """
         low, high = motor.numbers(f"{what}range", 2, [0.0, 0.0])
         limited, inferred = motor.given.get(f"{what}limited", "auto"), self.settings["autolimits"] == "true"
@@ -313,5 +320,5 @@ class _Reader:
 
 
 def _within(frame: Place, inner: Place) -> Place:
-    """Return a place in a frame, in that which the frame is in."""
+    """Return a place in a frame as a place in the frame's parent."""
     return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]

@@ -7,13 +7,13 @@ from jourdain_jax.importers.xml_file import Element, Holds, Part, XmlFile
 
 _PLACE = "pos quat axisangle xyaxes zaxis euler"
 _CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
-# actuators that share their defaults with `motor`, as far as it has the attribute
+# actuators that share their defaults with `motor`, for the attributes that it has
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
 _IDLE = "camera light visual statistic size sensor keyframe custom contact texture material hfield skin"
 _SOFT = "class solref solimp"
 _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
-# What elements may hold, the attributes of their classes included; all else is refused by name. Idle is what has to do with contacts, limits, drawing, and how
-# the other engine computes.
+# Supported contents of elements, and attributes of their classes; all others raise an error. `idle` are
+# contents on contacts, limits, drawing, and the other engine's computation.
 TABLE = {
     "mujoco": Holds("model", many="compiler option default worldbody asset actuator equality "
         "include", listed=_IDLE),
@@ -94,16 +94,18 @@ TABLE = {
 
 
 class Defaults:
-    """Attributes that classes of MJCF give to elements that do not state them."""
+    """Attributes that MJCF default classes give to elements that omit them."""
 
     def __init__(self, file: XmlFile):
-        """Reads all `default` sections of the file."""
+        """Read all `default` sections of the file."""
         self._file = file
         self._classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for section in file.root.findall("default"):
             if section.get("class", "main") != "main":
-                raise file.fault(f"the outermost `default` is of the class `{section.get('class')}`, "
-                    "expected `main`: put a `default` of that class into it")
+                raise file.fault(
+                    f"the outermost `default` is of the class `{section.get('class')}`, expected `main`: put "
+                    "a `default` of that class into it"
+                )
             self._read(section, "main", {})
 
     def _read(self, section: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
@@ -125,13 +127,12 @@ class Defaults:
             if not inner:
                 raise self._file.fault(f"a `default` inside the class `{name}` has no `class`; give it one")
             if inner in self._classes:
-                raise self._file.fault(f"two `default` are of the class `{inner}`; give each a class of its "
-                    "own")
+                raise self._file.fault(f"two `default` are of the class `{inner}`; give each its own class")
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> Part:
         """Return the checked element. Missing attributes come from its class, or else from the class of the
-        bodies around it.
+        enclosing bodies.
         """
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
@@ -142,5 +143,5 @@ class Defaults:
 
 
 def all_of(file: XmlFile, path: str) -> Part:
-    """Merge all sections at a path into one. If several state an attribute, the last one counts."""
+    """Return all sections at a path merged into one. If several state an attribute, the last one counts."""
     return Part(file, f"`{path.rpartition('/')[2]}`", None, {name: value for section in file.root.findall(path) for name, value in section.attrib.items()})

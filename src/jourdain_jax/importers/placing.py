@@ -1,5 +1,6 @@
-"""Constant rotation matrices from angles, quaternions and axes; the combination of masses; volumes and moments of inertia of
-uniform solids, with MJCF's sizes: radii and half lengths."""
+"""Constant rotation matrices from angles, quaternions and axes; combined masses; volumes and moments of
+inertia of uniform solids, with sizes as in MJCF: radii and half lengths.
+"""
 
 import math
 
@@ -11,13 +12,13 @@ from jourdain_jax.importers.tree import Mass, Matrix, Vector
 
 
 def about(axis: Vector, angle: float) -> Matrix:
-    """Rotation by `angle` (rad) about a unit vector."""
+    """Return the rotation by `angle` (rad) about a unit vector."""
     return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
     """Return the rotation of MJCF's `euler`, about successive axes (rad). Lower-case letters are axes of the
-    rotated frame, upper-case letters axes of the fixed one.
+    rotated frame, upper-case letters axes of the fixed frame.
     """
     turn = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
@@ -27,14 +28,14 @@ def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
 
 
 def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
-    """Return a quaternion (w, x, y, z) of any norm; NaN for zero."""
+    """Return the rotation of a quaternion (w, x, y, z) of any norm; NaN for zero."""
     return Rotation.from_quat(np.roll(q, -1)).as_matrix() if np.any(q) else np.full((3, 3), np.nan)
 
 
 def combined(masses: list[Mass]) -> Mass:
-    """Combine several masses in one frame: mass centre, and inertia by the parallel-axis theorem,
+    """Return several masses in one frame combined, with the inertia by the parallel-axis theorem,
 
-    I = sum I_i + m_i (d_i.d_i - d_i d_i').
+        I = sum I_i + m_i (d_i.d_i - d_i d_i').
     """
     total = sum(one.mass for one in masses)
     centre = sum(one.mass * one.centre for one in masses) / total if total else masses[0].centre
@@ -45,11 +46,11 @@ def combined(masses: list[Mass]) -> Mass:
     return Mass(total, centre, inertia)
 
 
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # numbers that say a size
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # count of numbers in a size
 
 
 def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
-    """Volume of a solid, m^3."""
+    """Return the volume of a solid, m^3."""
     if kind in ("sphere", "ellipsoid"):
         return 4 / 3 * math.pi * math.prod(np.broadcast_to(size, 3))
     if kind == "box":
@@ -68,7 +69,7 @@ def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
     straight = np.array([(3 * radius**2 + 4 * half**2) / 12] * 2 + [radius**2 / 2])
     if kind == "cylinder":
         return straight
-    # two half balls, whose mass centres are 3 r/8 from their flat sides: 2 r^2/5 + h^2 + 3 h r/4
+    # two half balls, with mass centres 3 r/8 from their flat sides: 2 r^2/5 + h^2 + 3 h r/4
     ends = np.array([0.4 * radius**2 + half**2 + 0.75 * half * radius] * 2 + [0.4 * radius**2])
     share = volume("cylinder", size) / volume("capsule", size)
     return share * straight + (1 - share) * ends

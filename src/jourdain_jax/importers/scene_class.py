@@ -1,6 +1,6 @@
 """Scene classes made from a description: parameters become fields with defaults, as in handwritten classes.
 
-Names of other tools become names of Python, for fields, coordinates, speeds and inputs.
+Names of other tools are converted to Python identifiers for fields, coordinates, speeds and inputs.
 """
 
 import keyword
@@ -10,7 +10,7 @@ from typing import Any
 
 from jourdain_jax.scene.scene import Scene
 
-_TAKEN = ("t", "array", "slots", "keys")  # by the time and by the container of named values
+_TAKEN = ("t", "array", "slots", "keys")  # used for the time and by the container of named values
 
 
 def identifier(name: str) -> str:
@@ -23,8 +23,8 @@ def identifier(name: str) -> str:
 
 
 def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
-    """Return name -> its identifier, with a trailing underscore if it is `taken`. Raises ValueError if two
-    are or become equal.
+    """Return name -> its identifier, with a trailing underscore if it is `taken`. Raises ValueError for names
+    that are or become equal.
     """
     found: dict[str, str] = {}
     taken = set(taken)
@@ -33,7 +33,7 @@ def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> d
         new = f"{new}_" if new in taken else new
         twin = next((other for other, known in found.items() if known == new), None)
         if twin == name:
-            raise ValueError(f"two {kind}s are called `{name}`; give each a name of its own")
+            raise ValueError(f"two {kind}s are called `{name}`; give each its own name")
         if twin is not None:
             raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of "
                 "them")

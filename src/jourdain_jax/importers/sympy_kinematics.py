@@ -1,12 +1,14 @@
 """Poses of SymPy's bodies, and the additional coordinates that they need.
 
-SymPy lets velocities be stated apart from positions: a rolling disc whose contact point rests, a wheel that turns at a speed without having an angle. Here
-velocities are the rates of poses. Where both disagree, coordinates are added whose rates make up the difference,
+SymPy allows velocities that are unrelated to positions: a rolling disc with a contact point at rest, or a
+wheel with a rate of rotation but no angle. Here velocities are the rates of poses. If both disagree,
+coordinates d are added whose rates are the difference,
 
     r = r(q) + d,   ddot = v(q, u) - dr/dt,
 
-one for each axis of the inertial frame along which there is one while the rows are met, shared by the bodies that it moves
-alike; and an angle for a frame that has an angular velocity about an axis of another frame, but no orientation.
+one for each inertial axis with a difference at states that satisfy the constraints, shared by the bodies with
+the same difference. A frame that has an angular velocity about an axis of another frame, but no orientation,
+gets an angle.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +21,7 @@ from jourdain_jax.importers.formulas import sympy_package
 from jourdain_jax.importers.sympy_samples import sampled
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
-_SAME = 1e-6  # of two velocities, relative
+_SAME = 1e-6  # relative tolerance of equal velocities
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,15 @@ class Pose:
 
 
 def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
-    """Return the bodies, and the system with the coordinates that were added."""
+    """Return the system with added coordinates, and the poses of its bodies."""
     poses: list[Pose] = []
-    angles: dict[Any, tuple] = {}  # frame -> its orientation, the frame that it turns in, its turn there
+    angles: dict[Any, tuple] = {}  # frame -> orientation, base frame, rotation relative to it
     for body in system.bodies:
         system, pose = _pose(system, body, angles)
         if pose is None:
             continue
         if pose.name in (known.name for known in poses):
-            raise ValueError(f"two bodies are called `{pose.name}`; give each a name of its own")
+            raise ValueError(f"two bodies are called `{pose.name}`; give each its own name")
         _check_angular_velocity(system, pose)
         poses.append(pose)
     if not poses:
@@ -58,8 +60,10 @@ def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[Mec
     """
     sympy = sympy_package()
     name = str(getattr(body, "name", body))  # a `Particle` of SymPy 1.12 has its name as its text
-    rigid = isinstance(body, sympy.physics.mechanics.RigidBody) and getattr(body, "is_rigidbody", True)  # its `Body` may be a particle
-    if body.mass == 0 and not (rigid and body.central_inertia != 0):  # SymPy's joints of several axes put such bodies in between
+    # its `Body` may be a particle
+    rigid = isinstance(body, sympy.physics.mechanics.RigidBody) and getattr(body, "is_rigidbody", True)
+    # SymPy inserts such bodies into joints with several axes
+    if body.mass == 0 and not (rigid and body.central_inertia != 0):
         return system, None
     orientation = inertia = frame = None
     if rigid:
@@ -91,16 +95,19 @@ def _in_own_frame(body, name: str, angle: tuple | None):
     for frame, turn in ways:
         try:
             matrix = body.central_inertia.to_matrix(frame)
-        except ValueError:  # SymPy knows no orientation between the frames
+        except ValueError:  # the frames have no known relative orientation
             continue
         return matrix if turn is None else turn.T * matrix * turn
-    stated = f"the inertia of body `{name}` is stated in a frame that has no orientation in its own frame `{body.frame}`"
+    stated = (
+        f"the inertia of body `{name}` is stated in a frame without orientation in its own frame "
+        f"`{body.frame}`"
+    )
     raise ValueError(f"{stated}; orient that frame, or state the inertia in `{body.frame}`")
 
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
-    """Return an angle for a frame without orientation, together with its orientation, the frame in which it
-    turns, and its rotation there.
+    """Return the system with an angle for a frame without orientation, and the frame's orientation, base
+    frame and rotation relative to the base.
     """
     sympy = sympy_package()
     for parent, velocity in frame._ang_vel_dict.items():
@@ -131,13 +138,14 @@ def _constant(system: MechanicalSystem, matrix, what: str):
     for sample in sampled(system, {what: matrix, f"{what}, at zero": still}):
         moving, zero = (sample.values[name] for name in (what, f"{what}, at zero"))
         if largest(moving - zero) > _SAME * largest(zero):
-            raise ValueError(f"the {what} changes in time, so the body is not rigid; state it in the frame "
-                "of the body")
+            raise ValueError(
+                f"the {what} changes in time, so the body is not rigid; state it in the frame of the body"
+            )
     return still
 
 
 def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
-    """Raise ValueError where the stated angular velocity is not the rate of the orientation."""
+    """Raise ValueError if the stated angular velocity is not the rate of the orientation."""
     if pose.frame is None:
         return
     name, stated = f"orientation of body `{pose.name}`", f"angular velocity of body `{pose.name}`"
@@ -154,13 +162,15 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
 
 
 def _moved(system: MechanicalSystem, poses: list[Pose]) -> tuple[MechanicalSystem, list[Pose]]:
-    """Return positions whose rates are the given velocities, with further coordinates if necessary."""
+    """Return the poses with positions whose rates are the given velocities, with added coordinates if
+    necessary, and the system.
+    """
     sympy = sympy_package()
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]
     places, speeds = ([f"{what} of body `{pose.name}`" for pose in poses] for what in ("position", "velocity"))
     lists = dict(zip(places, [pose.position for pose in poses], strict=True)) | dict(zip(speeds, stated, strict=True))
     samples = sampled(system, lists, (*system.velocity, *system.rates_of_configuration()))
-    missing = []  # of each body: stated velocity less rate of the position, at all samples
+    missing = []  # by body: stated velocity minus rate of the position, at all samples
     for place, speed in zip(places, speeds, strict=True):
         velocities = np.array([sample.values[speed] for sample in samples])
         difference = velocities - np.array([sample.rates[place] for sample in samples])

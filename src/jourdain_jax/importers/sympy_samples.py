@@ -1,4 +1,4 @@
-"""Values of SymPy expressions at random states, which show constants, rates of coordinates, and repeated
+"""Values of SymPy expressions at random states, used to detect constants, rates of coordinates, and repeated
 constraints.
 """
 
@@ -13,13 +13,13 @@ from jourdain_jax.calculus.reals import all_finite
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
-_STATES, _TRIES = 3, 40  # random states that are compared, and how many are tried for them
-_STEP = 1e-6  # of differences
+_STATES, _TRIES = 3, 40  # number of random states compared, and of states tried
+_STEP = 1e-6  # of finite differences
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One state, with the values and rates of expressions by the names of their lists."""
+    """One state, with the values and rates of expressions by name of their list."""
 
     leaves: dict[Any, float]
     values: dict[str, Float[np.ndarray, "_"]]
@@ -27,7 +27,7 @@ class Sample:
 
 
 def symbols_in(expressions: Iterable[Any]) -> set[Any]:
-    """Return functions of time, rates of these, and symbols in some expressions."""
+    """Return functions of time, their rates, and symbols in the expressions."""
     sympy = sympy_package()
     time = sympy.physics.mechanics.dynamicsymbols._t
     found: set[Any] = set()
@@ -37,8 +37,8 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
 
 
 def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()) -> list[Sample]:
-    """Return the first random states at which all expressions are finite. Their speeds are those nearest to
-    random ones at which the `rows`, which are affine in the speeds, vanish.
+    """Return the first random states at which all expressions are finite. Their speeds are the nearest to
+    random ones that satisfy the constraints `rows`, which are affine in the speeds.
 
     Constants with given numbers keep them. Raises ValueError, with the name of a list, if there are too few
     such states.
@@ -81,8 +81,8 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
 
 
 def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]) -> Float[np.ndarray, "rows columns"]:
-    """Return `[A b]` of rows A u + b from their `values` at given leaves: the values at rest, and their
-    increments for each speed.
+    """Return `[A b]` of A u + b from the `values` at given leaves: the values at rest, and their increments
+    for each speed.
     """
     rest = leaves | dict.fromkeys(speeds, 0.0)
     b = values(rest)
@@ -90,7 +90,7 @@ def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speed
 
 
 def _meeting(both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]) -> dict[Any, float]:
-    """Return the nearest speeds at which the rows vanish; NaN where the rows are not numbers."""
+    """Return the nearest speeds that satisfy the constraints `both`; NaN if these are NaN."""
     u = np.array([leaves[speed] for speed in speeds])
     u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if all_finite(both) else u * np.nan
     return dict(zip(speeds, map(float, u), strict=True))

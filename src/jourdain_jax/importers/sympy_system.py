@@ -1,5 +1,5 @@
 """Parts imported from SymPy's mechanics: coordinates, speeds, kinematic equations, bodies, loads and
-constraints, but no equation of motion.
+constraints, but no equations of motion.
 """
 
 from collections.abc import Mapping
@@ -15,8 +15,8 @@ class MechanicalSystem:
     """A system as SymPy describes it; expressions in q(t), u(t), t and constants."""
 
     given: Mapping[str, float]  # numbers of constants, by name
-    origin: Any  # a point; positions count from it
-    frame: Any  # the inertial one
+    origin: Any  # the point from which positions are measured
+    frame: Any  # inertial
     coordinates: tuple[Any, ...]
     speeds: tuple[Any, ...]
     rates: dict[Any, Any]  # qdot -> expression in q, u, t
@@ -24,7 +24,7 @@ class MechanicalSystem:
     loads: tuple[tuple[Any, Any], ...]  # a point and a force, or a frame and a torque
     configuration: tuple[Any, ...]  # expressions that vanish
     velocity: tuple[Any, ...]  # the same, affine in u
-    auxiliary: tuple[Any, ...]  # speeds that are zero
+    auxiliary: tuple[Any, ...]  # speeds fixed at zero
 
     def resolved(self, expression):
         """Return the expression (or matrix) without rates of coordinates and auxiliary speeds."""
@@ -36,17 +36,17 @@ class MechanicalSystem:
         return tuple(sympy_package().sympify(row).diff(self.time) for row in self.configuration)
 
     def with_coordinates(self, rates: dict[Any, Any]) -> "MechanicalSystem":
-        """Return the system with further coordinates, whose rates are given."""
+        """Return the system with further coordinates, whose `rates` are given."""
         new = {coordinate.diff(self.time): self.resolved(rate) for coordinate, rate in rates.items()}
         return replace(self, coordinates=(*self.coordinates, *rates), rates=self.rates | new)
 
     @property
     def time(self):
-        """The symbol of the time."""
+        """Return the symbol of the time."""
         return sympy_package().physics.mechanics.dynamicsymbols._t
 
     def is_constant(self, expression) -> bool:
-        """Return whether it depends on constants only."""
+        """Return whether it depends only on constants."""
         return not expression.has(self.time) and not expression.atoms(sympy_package().core.function.AppliedUndef)
 
 
@@ -67,7 +67,7 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
         )
     check_kind(
         origin, mechanics.Point, "`origin`",
-        "the point of SymPy that is the origin of positions, such as Point('O')"
+        "SymPy's point of origin for positions, such as Point('O')"
     )
     frame, rates, loads, *several = read(system)
     q, u, bodies, configuration, velocity, auxiliary = map(tuple, several)

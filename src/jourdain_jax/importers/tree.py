@@ -1,6 +1,7 @@
 """Links and joints of robot files: a tree of frames, each placed in its parent and moved by its joints.
 
-All numbers are known ones, in SI units and radians; rotation matrices take components in the link's frame to those in its parent's.
+All numbers are known, in SI units and radians; rotation matrices convert components from the link's frame to
+its parent's.
 """
 
 from dataclasses import dataclass, field
@@ -14,16 +15,18 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True)
 class Joint:
-    """The motion of a link from its place; `name` "" for the base."""
+    """The motion of a link relative to its place; the base has `name` ""."""
 
     name: str
     kind: str  # "hinge", "slide", "ball", "free" or "planar"
-    axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # unit vector; of a planar joint the normal
-    anchor: Vector = field(default_factory=lambda: np.zeros(3))  # m, the point of the link that a hinge or ball holds
-    reference: float = 0.0  # the coordinate where the link is as it is placed
+    # unit vector; the normal for a planar joint
+    axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    # m, the fixed point of the link for a hinge or ball
+    anchor: Vector = field(default_factory=lambda: np.zeros(3))
+    reference: float = 0.0  # the coordinate at the link's stated place
     damping: float = 0.0  # N s/m or N m s
     stiffness: float = 0.0  # N/m or N m
-    rest: float = 0.0  # the coordinate where the spring is free
+    rest: float = 0.0  # the coordinate of the unloaded spring
     limits: tuple[float, float] | None = None
 
 
@@ -41,12 +44,12 @@ class Look:
     """A shape of a link, for pictures."""
 
     kind: str  # "ball", "box", "cylinder", "capsule", "ellipsoid" or "mesh"
-    size: tuple[float, ...]  # m, as `jj.Visual` takes it; of a mesh its factors
+    size: tuple[float, ...]  # m, as for `jj.Visual`; scale factors for a mesh
     position: Vector  # m, in the link's frame
     turn: Matrix
     colour: str | None = None
     opacity: float = 1.0
-    path: str | None = None  # of the file of a mesh
+    path: str | None = None  # of the mesh file
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Link:
 
     name: str
     parent: str | None  # None: the inertial frame
-    position: Vector  # m, of its frame in that of the parent
+    position: Vector  # m, of its frame in the parent's frame
     turn: Matrix
     joints: tuple[Joint, ...] = ()
     mass: Mass | None = None
@@ -75,7 +78,7 @@ class Follower:
 
 @dataclass(frozen=True)
 class Closure:
-    """A point of a link that is held at a point of another link, as in the stated pose. With `turn`, the
+    """A point of a link that coincides with a point of another link, as in the stated pose. With `turn`, the
     links do not rotate relative to each other either.
     """
 
@@ -103,11 +106,11 @@ class Motor:
     """
 
     name: str
-    joint: str  # "" where it pushes none
+    joint: str  # "" if it drives none
     gear: float = 1.0
     control: tuple[float, float] | None = None
     force: tuple[float, float] | None = None  # before the gear
-    push: Push | None = None  # what it does for a value of 1, where it pushes no joint
+    push: Push | None = None  # force for an input of 1, instead of a joint
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,9 @@ class Tree:
     links: tuple[Link, ...]
     gravity: Vector  # m/s^2
     motors: tuple[Motor, ...] = ()
-    ties: tuple[Follower | Closure, ...] = ()  # geometric rows
-    free: tuple[str, ...] = ()  # links whose places are parameters
-    start: dict[str, float] = field(default_factory=dict)  # coordinate -> value that the file states
+    ties: tuple[Follower | Closure, ...] = ()  # geometric constraints
+    free: tuple[str, ...] = ()  # links whose positions are parameters
+    start: dict[str, float] = field(default_factory=dict)  # coordinate -> value stated in the file
 
     def moving(self) -> set[str]:
         """Return names of the links that any joint moves."""

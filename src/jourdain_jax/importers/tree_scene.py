@@ -21,19 +21,19 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
 ROUNDED = 0.05  # of the largest moment of inertia: some are published with two digits
-POINT = 1e-6**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
+POINT = 1e-6**2  # m^2: with a smaller radius of gyration, moments are round-off
 
 Frame = tuple[Matrix3, Vector3]  # orientation and origin in the inertial frame
 
 
 class TreeScene(Scene):
-    """Base of the scenes that `from_urdf` and `from_mjcf` make."""
+    """Base of the scenes made by `from_urdf` and `from_mjcf`."""
 
     _tree: ClassVar[Tree]
     _names: ClassVar[dict[str, str]]  # of links and joints -> identifiers
 
     def bodies(self, t, q):
-        """Links that move and have a mass."""
+        """Return the links that move and have a mass."""
         moving = self._tree.moving()
         frames = self._frames(q)
         found = {}
@@ -46,7 +46,7 @@ class TreeScene(Scene):
         return found
 
     def loads(self, motion):
-        """Gravity, and the springs, dampers and motors of the joints."""
+        """Return gravity, and the springs, dampers and motors of the joints."""
         size = float(np.linalg.norm(self._tree.gravity))
         found = [gravity(motion, self.gravity, self._tree.gravity / size)] if size else []
         for link in self._tree.links:
@@ -63,7 +63,7 @@ class TreeScene(Scene):
         return tuple(found)
 
     def geometric_constraints(self, pose):
-        """Joints that follow others, and loops that are closed."""
+        """Return the constraints of joints that follow others, and of closed loops."""
         if not self._tree.ties:
             return {}
         q, found = self.coordinates.reference(), {}
@@ -78,7 +78,7 @@ class TreeScene(Scene):
                 continue
             (R, r), (other_R, other_r), (S, s), (other_S, other_s) = now[one.link], now[one.other], stated[one.link], stated[one.other]
             found[one.name] = r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
-            if one.turn:  # the vector part of the turn since the stated pose
+            if one.turn:  # the vector part of the rotation since the stated pose
                 turned = R.T @ other_R @ other_S.T @ S
                 found[f"{one.name}, attitude"] = jnp.stack([turned[k - 1, k - 2] - turned[k - 2, k - 1] for k in range(3)])
         return found
@@ -97,7 +97,7 @@ class TreeScene(Scene):
         return found
 
     def _frames(self, q) -> dict[str | None, Frame]:
-        """Orientation and origin of every link."""
+        """Return orientation and origin of every link."""
         found: dict[str | None, Frame] = {None: (np.eye(3), np.zeros(3))}
         for link in self._tree.links:
             R, origin = found[link.parent]
@@ -109,7 +109,7 @@ class TreeScene(Scene):
         return found
 
     def _centre(self, link: Link):
-        """Mass centre in the frame of the link, m."""
+        """Return the mass centre in the frame of the link, m."""
         return getattr(self, f"{self._names[link.name]}_mass_centre", np.zeros(3))
 
     def _of_push(self, motion, push: Push, size):
@@ -134,9 +134,7 @@ def _array(x) -> Float[Array, "*shape"]:
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
-    """Return the coordinates of a joint, in the form that `coordinates` accepts; those of the base have no
-    prefix.
-    """
+    """Return the coordinates of a joint, as arguments of `coordinates`; the base's have no prefix."""
     label = f"{name}_" if joint.name else ""
     if joint.kind == "ball":
         return (quaternion(name),)
@@ -165,15 +163,13 @@ def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
 
 
 def _about(axis, angle) -> Matrix3:
-    """Rotation by an angle that JAX may trace about a known axis."""
+    """Return the rotation by an angle, which may be traced, about a known axis."""
     along = np.outer(axis, axis)
     return along + jnp.cos(angle) * (np.eye(3) - along) + jnp.sin(angle) * np.cross(np.eye(3), axis)
 
 
 def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
-    """Return two unit vectors in a plane. They are x and y if its normal is z, y and z if it is x, z and x if
-    it is y.
-    """
+    """Return two unit vectors in a plane: x and y for the normal z, y and z for x, z and x for y."""
     k = int(np.argmax(np.abs(normal)))
     if np.isclose(normal[k], 1.0):
         return np.eye(3)[[(k + 1) % 3, (k + 2) % 3]]
@@ -202,8 +198,10 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     """
     moving = tree.moving()
     if not moving:
-        raise ValueError(f'{source}: no joint moves a body; expected at least one moving joint, or a moving '
-            'base, such as base="free"')
+        raise ValueError(
+            f'{source}: no joint moves a body; expected at least one moving joint, or a moving base, such as '
+            'base="free"'
+        )
     _check_masses(tree, source, ignore)
     check_names(tree.free, [link.name for link in tree.links], "`free` names `{}`, which is not a link")
     joints = [joint for link in tree.links for joint in link.joints]
@@ -254,8 +252,8 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
 
 
 def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
-    """Raise ValueError for a joint that carries no mass, and for impossible moments of inertia. Links that
-    are fixed to each other count together.
+    """Raise ValueError for a joint that moves no mass, and for impossible moments of inertia. Links fixed to
+    each other count together.
     """
     heavy: set[str] = set()
     fixed: dict[str | None, list[Mass]] = {link.name: [] if link.mass is None else [link.mass] for link in tree.links} | {None: []}
@@ -270,12 +268,14 @@ def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
             heavy.add(link.parent)
         if link.joints and link.mass is None and link.name not in heavy:
             joint = link.joints[0].name or "the base"
-            raise ValueError(f"{source}: link `{link.name}`, which `{joint}` moves, has no mass, and neither "
-                "has any link that it carries; give it an `inertial`")
+            raise ValueError(
+                f"{source}: link `{link.name}`, moved by `{joint}`, has no mass, and neither has any link "
+                "that it carries; give it an `inertial`"
+            )
 
 
 def _check_moments(mass: Mass, what: str) -> None:
-    """0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2."""
+    """Raise ValueError unless 0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2."""
     least, middle, largest = np.linalg.eigvalsh(mass.inertia)
     if max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * mass.mass):
         raise ValueError(

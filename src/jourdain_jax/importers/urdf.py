@@ -1,6 +1,6 @@
 """Scenes from URDF files: links, joints, inertias, shapes.
 
-Source: the format as the ROS wiki describes it, wiki.ros.org/urdf/XML.
+Source: the format as in the ROS wiki, wiki.ros.org/urdf/XML.
 """
 
 import os
@@ -21,7 +21,8 @@ from jourdain_jax.scene.scene import Scene
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
 _BASES = ("fixed", "planar", "free")
 _SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")}
-# What elements may hold; all else is refused by name. Elements that are read are idle, or listed, where they move nothing.
+# Supported contents of elements; all others raise an error. Contents without effect on the motion are idle,
+# or listed in a warning.
 _TABLE = {
     "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor "
         "ros2_control mujoco"),
@@ -77,29 +78,29 @@ def from_urdf(
       "free", with `x`, `y`, `z` and the quaternion `attitude`.
     - `motors`: names of revolute, continuous or prismatic joints that get an input, `<joint>_motor` in N m or
       N.
-    - `free`: names of links whose position in the frame of their parent becomes a parameter.
-    - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held:
-      `locked={"thumb": 0.0}`.
+    - `free`: names of links whose position in the parent's frame becomes a parameter.
+    - `locked`: revolute, continuous or prismatic joint -> the fixed coordinate (rad or m): `locked={"thumb":
+      0.0}`.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the
       file).
-    - `ignore`: names of elements and attributes that may be omitted without a warning, "friction", or "text"
-      between elements. With "inertia", impossible moments of inertia are accepted.
+    - `ignore`: names of elements and attributes to omit without a warning, "friction", or "text" between
+      elements. With "inertia", impossible moments of inertia are accepted.
 
     **Returns** a class. A joint is a coordinate with its name; a floating one is `<joint>_x`, `_y`, `_z` and
     the quaternion `<joint>_attitude`, a planar one `<joint>_x`, `_y`, `_heading`. A joint with the name of a
-    coordinate of the base, such as `x`, becomes `x_`. Values of the file that are not zero are fields:
-    `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the
-    mass centre), `<joint>_damping` and `gravity` (m/s^2), and `<link>_origin` (m) of links in `free`. Limits
-    of joints do not stop a motion; they become the `domain`. `mimic` is a geometric row, without effect on
+    coordinate of the base, such as `x`, becomes `x_`. Nonzero values of the file are fields: `<link>_mass`
+    (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the mass centre),
+    `<joint>_damping` and `gravity` (m/s^2), and `<link>_origin` (m) of links in `free`. Limits of joints do
+    not stop a motion; they become the `domain`. `mimic` becomes a geometric constraint, without effect on
     fixed or locked joints. Shapes of `visual` are drawn; `collision` is not read: state rolling in `contacts`
     of a subclass.
 
-    **Raises** ValueError, with the name of the link or joint, for a file that cannot be read, an unknown type
-    of joint, a parent or child that does not exist, a loop, a mass without inertia, impossible moments of
+    **Raises** ValueError, with the name of the link or joint, for an unreadable file, an unknown type of
+    joint, a parent or child that does not exist, a loop, a mass without inertia, impossible moments of
     inertia (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a joint
-    with friction, and repeated statements; and, with its name, for everything that does not belong to a URDF:
-    a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A warning lists
-    elements without effect on the motion that are omitted, such as `gazebo` and `transmission`.
+    with friction, and repeated statements. Contents that do not belong to a URDF also raise it, with their
+    name: a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A warning
+    lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
@@ -110,7 +111,7 @@ def from_urdf(
 
 
 class _Reader:
-    """Reads the elements of one file."""
+    """Reader of one file."""
 
     def __init__(self, file: XmlFile, packages: Mapping[str, str], locked: Mapping[str, float]):
         self.file, self.packages = file, packages
@@ -125,7 +126,7 @@ class _Reader:
                     f"{nearest(name, self.joints)}")
 
     def tree(self, base: str, motors: Labels, free: Labels) -> Tree:
-        """Return the whole mechanism."""
+        """Return the mechanism."""
         above: dict[str, tuple[str, str]] = {}  # link -> its joint and its parent
         for name, joint in self.joints.items():
             child, parent = (self._end(joint, which) for which in ("child", "parent"))
@@ -139,12 +140,14 @@ class _Reader:
             raise self.file.fault(f"expected one link without a parent, the root; {found}")
         at_root = () if base == "fixed" else (Joint("", base),)
         links = [Link(roots[0], None, np.zeros(3), np.eye(3), at_root, *self._content(self.links[roots[0]], base != "fixed"))]
-        for link in links:  # it grows
+        for link in links:  # the list grows during the loop
             links += [self._link(name, joint, parent) for name, (joint, parent) in above.items() if parent == link.name]
         if len(links) < len(self.links):
             lost = next(name for name in self.links if name not in {link.name for link in links})
-            raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops "
-                "by `geometric_constraints` in a subclass")
+            raise self.file.fault(
+                f"link `{lost}` is part of a loop of joints; a URDF is a tree, so close loops by "
+                "`geometric_constraints` in a subclass"
+            )
         joints = [joint for link in links for joint in link.joints]
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
         check_names(motors, names, "`motors` names `{}`, which is not a joint with one coordinate")
@@ -191,7 +194,7 @@ class _Reader:
         return Follower(name, leader, (mimic.number("offset", 0.0), mimic.number("multiplier", 1.0)))
 
     def _content(self, link: Part, moved: bool) -> tuple[Mass | None, tuple[Look, ...]]:
-        """Mass and shapes of a link."""
+        """Return mass and shapes of a link."""
         looks = [self._look(Part(self.file, f"visual of {link.what}", visual)) for visual in link.children("visual")]
         return self._mass(link, moved), tuple(look for look in looks if look is not None)
 
@@ -232,7 +235,7 @@ class _Reader:
         return Look(look, size, *_origin(visual), colour, opacity, path)
 
     def _mesh_path(self, name: str | None) -> str | None:
-        """Return the file of a mesh, if it is there."""
+        """Return the path of a mesh file, or None if it does not exist."""
         if not name:
             return None
         here = self.file.folder
@@ -246,5 +249,6 @@ class _Reader:
 
 def _origin(part: Part) -> tuple[Vector, Matrix]:
     origin = part.child("origin")
-    turn = Rotation.from_euler("xyz", origin.numbers("rpy", 3, np.zeros(3)))  # about the fixed axes in turn
+    # about the fixed axes, in this order
+    turn = Rotation.from_euler("xyz", origin.numbers("rpy", 3, np.zeros(3)))
     return origin.numbers("xyz", 3, np.zeros(3)), turn.as_matrix()

@@ -1,4 +1,6 @@
-"""Reading XML: files, contents of elements, numbers in attributes. Omitted contents are refused or listed."""
+"""Reading XML: files, contents of elements, numbers in attributes. Unsupported contents raise an error or are
+listed in a warning.
+"""
 
 import difflib
 import re
@@ -23,15 +25,16 @@ LARGEST = 100_000_000  # bytes of a file
 
 @dataclass(frozen=True)
 class Holds:
-    """Supported contents of an element, by name: names are separated by spaces."""
+    """Supported contents of an element, by name, separated by spaces."""
 
     read: str = ""  # attributes
     one: str = ""  # children, each at most once
     many: str = ""  # children, any number of each
-    idle: str = ""  # attributes and children that move nothing here, and are passed over
-    listed: str = ""  # children that move nothing here, and are listed in a warning
-    off: Mapping[str, str] = field(default_factory=dict)  # attributes that would move something -> values with which they do not
-    words: Mapping[str, Labels] = field(default_factory=dict)  # attributes -> the values that they may have
+    idle: str = ""  # attributes and children without effect on the motion, skipped silently
+    listed: str = ""  # children without effect on the motion, listed in a warning
+    # attributes with effect on the motion -> values without effect
+    off: Mapping[str, str] = field(default_factory=dict)
+    words: Mapping[str, Labels] = field(default_factory=dict)  # attributes -> their permitted values
 
 
 class XmlFile:
@@ -39,7 +42,7 @@ class XmlFile:
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
         """Read the file at `path`, or the text itself. `table`: the permitted content of each element, the
-        root first. Raises ValueError for a file that cannot be read or has other content.
+        root first. Raises ValueError for an unreadable file or other content.
         """
         check_kind(path, FilePath, "`path`", f"the path of a {format_name} file, or its text")
         self.ignore, self.table = as_labels(ignore), table
@@ -76,8 +79,8 @@ class XmlFile:
             holder[k : k + 1] = list(inner)
 
     def _check(self, element: Element, what: str, kind: str) -> None:
-        """Raise ValueError for anything in an element that the table does not contain, unless it is to be
-        ignored. `what`: the element, in words.
+        """Raise ValueError for contents of an element that are not in the table and not in `ignore`. `what`:
+        the element, for messages.
         """
         holds = self.table[kind]
         self.check_attributes(kind, element.attrib, what)
@@ -94,17 +97,18 @@ class XmlFile:
             elif child.tag in holds.listed.split():
                 self.leave_out(child.tag)
             elif child.tag not in holds.idle.split():
-                valid = f"{holds.one} {holds.many}" if tag == child.tag else ""  # one of a namespace is never what it is called
+                # names of another namespace have no valid neighbour
+                valid = f"{holds.one} {holds.many}" if tag == child.tag else ""
                 self.refuse(tag, f"`{child.tag}`{f' `{name}`' if name else ''} in {what}", valid=valid)
 
     def check_text(self, element: Element, what: str) -> None:
-        """A ValueError for text in an element, unless `text` is to be ignored."""
+        """Raise ValueError for text in an element, unless `ignore` contains "text"."""
         if text := "".join([element.text or "", *(child.tail or "" for child in element)]).strip():
             self.refuse("text", f"the text `{shortened(text)}` in {what}", "state numbers in attributes")
 
     def check_attributes(self, kind: str, attributes: Mapping[str, str], what: str) -> None:
-        """Raise ValueError for an attribute that elements of a kind do not have (unless it is to be ignored),
-        and for one with an unknown value.
+        """Raise ValueError for an unknown attribute of this kind of element (unless ignored), and for an
+        unknown value of a known one.
         """
         holds = self.table[kind]
         for name, value in attributes.items():
@@ -115,12 +119,12 @@ class XmlFile:
                 self.refuse(name.rpartition("}")[2], f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}', valid=holds.read)
 
     def leave_out(self, what: str) -> None:
-        """Record an omitted element that moves nothing, or that the user ignores."""
+        """Record an omitted element without effect on the motion, or ignored by the user."""
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
-        """Raise ValueError for something that is not read, unless `ignore` contains its `key`. `valid`: names
-        to suggest.
+        """Raise ValueError for unsupported content, unless `ignore` contains its `key`. `valid`: names to
+        suggest.
         """
         if key not in self.ignore:
             meant = "".join(f"did you mean `{name}`? Otherwise " for name in difflib.get_close_matches(key, valid.split(), 1, 0.7))
@@ -128,14 +132,14 @@ class XmlFile:
                 f'ignore=("{shortened(key)}",) to read the file without it')
 
     def warn(self) -> None:
-        """Warn of omitted elements, apart from those that `ignore` names."""
+        """Issue a warning that lists omitted elements, except those in `ignore`."""
         counted = {what: count for what, count in sorted(self._left_out.items()) if what not in self.ignore}
         listed = [f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()]
         if listed:
             warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this")
 
     def fault(self, what: str) -> ValueError:
-        """Return the error of this file."""
+        """Return an error of this file."""
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
@@ -143,8 +147,8 @@ class XmlFile:
         check_name(name, valid, f"{self.source}: {what}")
 
     def named(self, kind: str) -> "dict[str, Part]":
-        """Return the elements of a kind in the root by name. Raises ValueError where one has no name, or two
-        have the same.
+        """Return the elements of a kind in the root by name. Raises ValueError for a missing or repeated
+        name.
         """
         found: dict[str, Part] = {}
         for element in self.root.findall(kind):
@@ -152,7 +156,7 @@ class XmlFile:
             if not name:
                 raise self.fault(f"a {kind} has no `name`; give it one")
             if name in found:
-                raise self.fault(f"two {kind}s are called `{name}`; give each a name of its own")
+                raise self.fault(f"two {kind}s are called `{name}`; give each its own name")
             found[name] = Part(self, f"{kind} `{name}`", element)
         return found
 
@@ -164,12 +168,12 @@ def _parsed(content: str | bytes, source: str) -> Element:
 
 
 class Part:
-    """An element during reading: its attributes and children, and its name in messages; None for a missing
-    element.
+    """An element during reading: its attributes and children, and its name in messages; `element` is None if
+    it is missing.
     """
 
     def __init__(self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None):
-        """`attributes`: where they are not those of the element alone."""
+        """Store the element; `attributes` replaces its own attributes."""
         self.file, self.what, self.element = file, what, element
         self.given: Mapping[str, str] = attributes or ({} if element is None else element.attrib)
 
@@ -177,16 +181,16 @@ class Part:
         return word in self.given
 
     def children(self, *kinds: str) -> list[Element]:
-        """Return the elements of some kinds in it."""
+        """Return the child elements of some kinds."""
         return [] if self.element is None else [child for child in self.element if child.tag in kinds]
 
     def child(self, kind: str) -> "Part":
-        """Return the element of a kind in it."""
+        """Return the first child element of a kind."""
         return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
 
     def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
         """Return the numbers in an attribute, `count` of them (None: any number). If the attribute is
-        missing, return `default`; raise ValueError if there is none.
+        missing, return `default`, or raise ValueError without one.
         """
         text, what = self.given.get(word), f"{word} of {self.what}"
         if text is None:
@@ -200,23 +204,23 @@ class Part:
         return found
 
     def number(self, word: str, default: float | None = None) -> float:
-        """Return the one number in an attribute."""
+        """Return the single number in an attribute."""
         return float(self.numbers(word, 1, None if default is None else [default])[0])
 
     def direction(self, word: str, default) -> Float[np.ndarray, "3"]:
-        """Return the unit vector along three numbers. ValueError where these are zero."""
+        """Return the unit vector along three numbers. Raises ValueError for zeros."""
         along = self.numbers(word, 3, default)
         if not np.any(along):
             raise self.fault(word, "zero, expected a direction")
         return along / np.linalg.norm(along)
 
     def fault(self, word: str, what: str) -> ValueError:
-        """The error of an attribute that is not as it should be."""
+        """Return the error for an invalid attribute."""
         return self.file.fault(f"{word} of {self.what} is {what}")
 
     def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
-        """Return the mass properties of an element; None if they are zero. Raises ValueError for masses that
-        are not positive. A zero mass is accepted where no joint moves it.
+        """Return the mass properties of an element; None if they are zero. Raises ValueError for a mass that
+        is not positive; zero is allowed for a link that no joint moves.
         """
         if mass == 0 and not np.any(inertia):
             return None
@@ -225,7 +229,7 @@ class Part:
         return Mass(mass, centre, inertia)
 
     def colour(self) -> tuple[str | None, float]:
-        """Return colour and opacity for `jj.Visual`; the body's defaults if none is stated."""
+        """Return colour and opacity for `jj.Visual`; the body's defaults if none is given."""
         if "rgba" not in self:
             return None, 1.0
         *levels, opacity = np.clip(self.numbers("rgba", 4), 0.0, 1.0)

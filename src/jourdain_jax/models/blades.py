@@ -1,4 +1,4 @@
-"""Bodies on blades and wheels that do not slide sideways."""
+"""Bodies on blades and wheels that do not slip sideways."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,12 +16,13 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class Skate(Scene):
-    """A skate (knife edge) on an incline: the smallest nonholonomic system with a force, one row in three coordinates.
+    """A skate (knife edge) on an incline: the smallest nonholonomic system with a force, one constraint in
+    three coordinates.
 
         xdot sin(heading) - ydot cos(heading) = 0,      heading'' = 0,   forward speed  v' = g sin(slope) cos(heading)
 
-    Set turning, it drifts across the slope, not downhill. Neither xdot nor ydot can be privileged at every heading.
-    Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972), ch. III.
+    A turning skate drifts across the slope, not downhill. Neither xdot nor ydot can be privileged at every
+    heading. Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972), ch. III.
 
     x, y of the mass centre, heading of the blade.
     """
@@ -56,13 +57,15 @@ class Skate(Scene):
 
 
 class ChaplyginSleigh(Scene):
-    """The Chaplygin sleigh: a body on smooth ice with one blade, its mass centre a distance a ahead of the blade.
+    """The Chaplygin sleigh: a body on smooth ice with one blade, its mass centre a distance a ahead of the
+    blade.
 
         -xdot sin(heading) + ydot cos(heading) - a headingdot = 0        (x, y of the mass centre)
         v' = a w^2,   w' = -(a/k^2) v w,   k^2 = I/m + a^2               (v forward speed, w turn rate)
 
-    Energy is conserved, yet every motion ends in straight forward sliding. Motions show (I + m a^2)/m and a, but not m and I apart.
-    Source: S. A. Chaplygin (1911); A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.7.
+    Energy is conserved, yet every motion ends in straight forward sliding. Motions determine (I + m a^2)/m
+    and a, but not m and I separately. Source: S. A. Chaplygin (1911); A. M. Bloch, Nonholonomic Mechanics and
+    Control (2003), section 1.7.
 
     x, y of the mass centre, heading of the blade; the blade touches the ice at body point (-offset, 0, 0).
     """
@@ -102,17 +105,17 @@ class ChaplyginSleigh(Scene):
 
 
 def _level(mass, inertia, x, y, orientation) -> RigidBody:
-    """Return a body that stays level. Of its moments of inertia only the one about z matters."""
+    """Return a body that stays level; only its moment of inertia about z matters."""
     return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
 
 
 def _edge(body, point=None) -> Scalar:
-    """Return the row of a blade along body x at a point of the body (default: its mass centre)."""
+    """Return the constraint of a blade along body x at a point of the body (default: its mass centre)."""
     return knife_edge(body, body.position if point is None else body.place(point), body.orientation[:, 1])
 
 
 def _forward(motion) -> Scalar:
-    """Speed of the mass centre along the blade, m/s."""
+    """Return the speed of the mass centre along the blade, m/s."""
     return motion.u.x_rate * jnp.cos(motion.q.heading) + motion.u.y_rate * jnp.sin(motion.q.heading)
 
 
@@ -121,12 +124,14 @@ class Snakeboard(Scene):
 
         -sin(heading +- steer) xdot + cos(heading +- steer) ydot +- l cos(steer) headingdot = 0        (front +, back -)
 
-    Two rows, three degrees of freedom. At steer = +-pi/2 the rows are parallel and the rank drops from 2 to 1. Motions pass through
-    smoothly: without torques the forward speed is c l cos(steer)/D and the turn rate c sin(steer)/D, with a constant c and
-    D^2 = m l^2 cos^2(steer) + (J + 2 Jw) sin^2(steer).
-    Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. Robotics and Automation (1994) 2391.
+    Two constraints, three degrees of freedom. At steer = +-pi/2 the constraints are parallel and the rank
+    drops from 2 to 1. Motions pass smoothly: without torques the forward speed is c l cos(steer)/D and the
+    turn rate c sin(steer)/D, with a constant c and D^2 = m l^2 cos^2(steer) + (J + 2 Jw) sin^2(steer).
+    Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. Robotics and Automation
+    (1994) 2391.
 
-    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels, the back ones by -steer.
+    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels, the
+    back ones by -steer.
 
     Inputs (N m): `rotor_torque` between rotor and board, `steer_torque` that opens both wheel pairs.
     """
@@ -148,7 +153,7 @@ class Snakeboard(Scene):
     def bodies(self, t, q):
         board = rot_z(q.heading)
         x, y, _ = self.half_length * board[:, 0]
-        nothing = jnp.zeros_like(self.mass)  # the masses of rotor and wheels count in the board's
+        nothing = jnp.zeros_like(self.mass)  # the masses of rotor and wheels are part of the board's
         return {
             "board": _level(self.mass, self.board_inertia, q.x, q.y, board),
             "rotor": _level(nothing, self.rotor_inertia, q.x, q.y, board @ rot_z(q.rotor)),
@@ -171,18 +176,21 @@ class Snakeboard(Scene):
 
 
 class TrailerChain(Scene):
-    """A car (or skate) pulling a chain of trailers on on-axle hitches: n + 1 knife edges, 2 n pin rows, two degrees of freedom.
+    """A car (or skate) pulling a chain of trailers on on-axle hitches: n + 1 knife edges, 2 n pin
+    constraints, two degrees of freedom.
 
         gamma_i' = w_{i-1} - (v_{i-1}/L) sin(gamma_i),   gamma_i = heading_{i-1} - heading_i
         v_i = v_{i-1} cos(gamma_i),   w_i = (v_{i-1}/L) sin(gamma_i)
 
-    Coordinates are maximal: x, y of the axle and heading of every body. Each row then holds two neighbours only and the rows are
-    banded; in the minimal coordinates (x, y, n + 1 headings) every trailer's row would hold all headings ahead of it. The speeds are
-    each body's own forward, sideways and turning velocity, so that the car's forward speed and turn rate are privileged at any
-    heading. The hitch pulls at the car's mass centre: without torque the car's turn rate is constant.
-    Source: J.-P. Laumond, Proc. IEEE Int. Conf. Intelligent Robots and Systems (1993) 1033; O. J. Sordalen, ICRA (1993) 1983.
+    Coordinates are maximal: x, y of the axle and heading of every body. Each constraint then couples only two
+    neighbours, and A is banded; in minimal coordinates (x, y, n + 1 headings) every trailer's constraint
+    would contain all headings ahead of it. The speeds are each body's own forward, sideways and turning
+    velocity, so that the car's forward speed and turn rate are privileged at any heading. The hitch pulls at
+    the car's mass centre: without torque the car's turn rate is constant. Source: J.-P. Laumond, Proc. IEEE
+    Int. Conf. Intelligent Robots and Systems (1993) 1033; O. J. Sordalen, ICRA (1993) 1983.
 
-    Body 0 is the car, bodies 1 to n the trailers; mass centres on the axles. Trailer parameters: one number or one each.
+    Body 0 is the car, bodies 1 to n the trailers; mass centres on the axles. Trailer parameters: one number
+    or one each.
 
     Inputs: `drive` forward on the car (N), `turn` torque on the car (N m).
     """
@@ -203,23 +211,23 @@ class TrailerChain(Scene):
 
     @property
     def coordinates(self):
-        """x, y of the axle and heading of every body."""
+        """Return names of x, y of the axle and heading of every body."""
         return coordinates(*(f"x{i} y{i} heading{i}" for i in range(self.trailers + 1)))
 
     @property
     def speeds(self):
-        """Velocity of every axle along and across its body, and turn rate."""
+        """Return names of the velocity of every axle along and across its body, and of its turn rate."""
         return speeds(" ".join(f"forward{i} sideways{i} turn{i}" for i in range(self.trailers + 1)))
 
     @property
     def domain(self):
-        """The bodies one behind the other, at any heading."""
+        """Return the domain: bodies in a line, at any heading."""
         behind = {f"x{i}": (-1.0 - 0.7 * i, 1.0 - 0.7 * i) for i in range(self.trailers + 1)}
         return behind | {f"heading{i}": (-3.2, 3.2) for i in range(self.trailers + 1)}
 
     @property
     def example(self):
-        """The car turns left, the trailers start straight behind it."""
+        """Return a start: the car turns left, with the trailers straight behind it."""
         return self.towing([0.0] * (self.trailers + 1), forward=1.2, turn=0.4)
 
     def towing(self, headings, *, forward=0.0, turn=0.0) -> dict[str, Scalar]:
@@ -267,7 +275,7 @@ class TrailerChain(Scene):
         return {f"axle {i}": _edge(motion[_name(i)]) for i in range(self.trailers + 1)}
 
     def invariants(self, motion):
-        """Return the car's turn rate, where no torque drives it."""
+        """Return the car's turn rate, constant without a torque."""
         return {"turn rate of the car": motion.u.turn0}
 
     def _per_trailer(self, value) -> Float[Array, "trailers"]:

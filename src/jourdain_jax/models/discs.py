@@ -55,7 +55,7 @@ class VerticalDisc(Heavy):
 
 
 class _ThinDisc(Heavy):
-    """A uniform thin disc on a level plane; the axle is body y."""
+    """A uniform thin disc on a level plane; the axle is body axis y."""
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
     radius: Parameter = parameter(0.5, unit="m", positive=True)
@@ -70,8 +70,8 @@ class _ThinDisc(Heavy):
 class TiltingDisc(_ThinDisc):
     """A thin disc rolling without slip on a level plane, in angles: the classic of Appell and Korteweg.
 
-    Contact and height are built into the coordinates (x, y: contact point). Two no-slip rows, three degrees
-    of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
+    Contact and height are built into the coordinates (x, y: contact point). Two no-slip constraints, three
+    degrees of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
     `TiltingDiscQuaternion` near that position. Source: Wang and Pao (2003), section V; J. I. Neimark and N.
     A. Fufaev, Dynamics of Nonholonomic Systems (1972).
 
@@ -99,14 +99,16 @@ _TILTED = TiltingDisc.example
 
 
 class TiltingDiscQuaternion(_ThinDisc):
-    """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the contact as rows.
+    """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the
+    contact as constraints.
 
-    One height row and two no-slip rows on six speeds leave three degrees of freedom, with the motion of
-    `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc lies
-    flat, where the contact point itself is undefined. Source: Wang and Pao (2003), section V; R. Cushman and
-    J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
+    One height constraint and two no-slip constraints on six speeds leave three degrees of freedom, with the
+    motion of `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc
+    lies flat, where the contact point itself is undefined. Source: Wang and Pao (2003), section V; R. Cushman
+    and J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
 
-    Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y.
+    Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is
+    body axis y.
     """
 
     coordinates = coordinates("x y z", quaternion("attitude"))
@@ -129,5 +131,6 @@ class TiltingDiscQuaternion(_ThinDisc):
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        # 45 units of round-off of the squared angle to the ground (1e-7 rad in double precision): nearer the contact point is undefined
+        # 45 units of round-off of the squared angle to the ground (1e-7 rad in double precision): below, the
+        # contact point is undefined
         return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45.0 * jnp.finfo(axle.dtype).eps}

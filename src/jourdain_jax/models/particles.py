@@ -15,7 +15,7 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class _OnSheets(Scene):
-    """A free particle whose row allows the velocities in one plane through each point."""
+    """A free particle whose constraint restricts velocities to a plane through each point."""
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
 
@@ -26,24 +26,26 @@ class _OnSheets(Scene):
         return {"particle": Particle(self.mass, jnp.stack([q.x, q.y, q.z]))}
 
     def _with_plane(self, normal) -> dict:
-        """Return the particle and the plane of the velocities that the row allows, drawn by its normal."""
+        """Return shapes of the particle and of the plane of allowed velocities, given by its normal."""
         normal = normal / jnp.sqrt(normal @ normal)
         turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
         return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}
 
 
 class RosenbergParticle(_OnSheets):
-    """Rosenberg's particle: free except for the row `zdot = y xdot`. It is the smallest nonholonomic system
-    whose free motion is not straight.
+    """Rosenberg's particle: free except for the constraint `zdot = y xdot`. It is the smallest nonholonomic
+    system whose free motion is not straight.
 
         ydot = const,   xdot sqrt(1 + y^2) = const
 
     Source: R. M. Rosenberg, Analytical Dynamics of Discrete Systems (1977), ch. 15.
 
-    The unit of length is chosen so that the row has no factor.
+    The unit of length is chosen so that the constraint has no factor.
     """
 
-    conventions = "Right-handed inertial frame without gravity; y counts in metres in the row zdot = y xdot."
+    conventions = (
+        "Right-handed inertial frame without gravity; y is in metres in the constraint zdot = y xdot."
+    )
     example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
 
     def velocity_constraints(self, motion):
@@ -57,15 +59,20 @@ class RosenbergParticle(_OnSheets):
 
 
 class HeisenbergParticle(_OnSheets):
-    """The Heisenberg system: a free particle under the row `zdot = y xdot - x ydot` moves in straight lines, free of force.
+    """The Heisenberg system: a free particle under the constraint `zdot = y xdot - x ydot` moves in straight
+    lines, free of force.
 
-    The variational ("vakonomic") reading of the same row would give helices: the sharpest test of which principle an engine follows.
-    Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.8.
+    The variational ("vakonomic") reading of the same constraint would give helices: the sharpest test of the
+    principle that an engine follows. Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section
+    1.8.
 
-    The unit of length is chosen so that the row has no factor.
+    The unit of length is chosen so that the constraint has no factor.
     """
 
-    conventions = "Right-handed inertial frame without gravity; x, y count in metres in the row zdot = y xdot - x ydot."
+    conventions = (
+        "Right-handed inertial frame without gravity; x, y are in metres in the constraint zdot = y xdot - x "
+        "ydot."
+    )
     example = {"x": 0.3, "y": -0.2, "x_rate": 0.7, "y_rate": 0.4}
     example_span = 10.0
 
@@ -81,19 +88,20 @@ class HeisenbergParticle(_OnSheets):
 
 
 class IsokineticParticle(Heavy):
-    """A particle kept at constant speed c under gravity: a row *nonlinear* in the velocities.
+    """A particle kept at constant speed c under gravity: a constraint *nonlinear* in the velocities.
 
         (v.v - c^2)/(2 c) = 0,     A = v/c,     virtual velocities obey v.dv = 0
 
-    The multiplier is the force along the velocity, in N; it does no virtual power but real power: energy is not conserved.
-    With `tau = g t/c` from level flight: sin(theta) = -tanh(tau), x = (c^2/g) gd(tau), z = -(c^2/g) ln cosh(tau).
-    Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983) 1016 (the Gaussian isokinetic thermostat).
+    The multiplier is the force along the velocity, in N. It does no virtual power, but real power: energy is
+    not conserved. With `tau = g t/c` from level flight: sin(theta) = -tanh(tau), x = (c^2/g) gd(tau), z =
+    -(c^2/g) ln cosh(tau). Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983) 1016 (the
+    Gaussian isokinetic thermostat).
 
     Motion in a vertical plane, x horizontal and z up.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
-    speed: Parameter = parameter(1.7, unit="m/s", positive=True, about="c, which the row keeps")
+    speed: Parameter = parameter(1.7, unit="m/s", positive=True, about="c, kept by the constraint")
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x z")
@@ -103,7 +111,7 @@ class IsokineticParticle(Heavy):
 
     @property
     def example(self):
-        """Level flight at the speed of the row."""
+        """Return level flight at the constrained speed."""
         return {"x_rate": self.speed}
 
     def bodies(self, t, q):

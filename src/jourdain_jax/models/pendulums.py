@@ -32,13 +32,14 @@ class _DoublePendulum(Heavy):
 
 
 class DoublePendulumAngles(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, in the angles of the rods: no rows, two degrees of freedom.
+    """Planar double pendulum of two particles on massless rods, in the angles of the rods: no constraints,
+    two degrees of freedom.
 
         (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2'' + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
         l2 th2'' + l1 cos(th1 - th2) th1'' - l1 sin(th1 - th2) th1'^2 + g sin(th2) = 0
 
-    The same system as `DoublePendulumRods`.
-    Source: L. D. Landau and E. M. Lifshitz, Mechanics, section 5, problem 1.
+    The same system as `DoublePendulumRods`. Source: L. D. Landau and E. M. Lifshitz, Mechanics, section 5,
+    problem 1.
 
     Angles of the upper and the lower rod from straight down; pivot at the origin.
     """
@@ -54,12 +55,13 @@ class DoublePendulumAngles(_DoublePendulum):
 
 
 def _along(angle) -> Vector3:
-    """Unit vector at `angle` from straight down, in the x-z plane."""
+    """Return the unit vector at `angle` from straight down, in the x-z plane."""
     return jnp.stack([jnp.sin(angle), jnp.zeros_like(angle), -jnp.cos(angle)])
 
 
 class DoublePendulumRods(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, in Cartesian coordinates with the rods as geometric rows.
+    """Planar double pendulum of two particles on massless rods, in Cartesian coordinates with the rods as
+    geometric constraints.
 
         |r1|^2 = l1^2,   |r2 - r1|^2 = l2^2
 
@@ -90,7 +92,8 @@ def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Partic
 
 
 class SpringAndRod(Scene):
-    """Two particles in a vertical plane: a spring holds the first to the origin, a rod holds the second to the first.
+    """Two particles in a vertical plane: a spring ties the first to the origin, and a rod the second to the
+    first.
 
     The spring is an impressed force, known from the positions. The rod is a constraint, whose force follows
     from its condition `|r2 - r1| = l`. The rod's multiplier is its thrust (negative: tension), in N. Source:
@@ -113,7 +116,7 @@ class SpringAndRod(Scene):
 
     @property
     def example(self):
-        """The rod level and turning."""
+        """Return a start with the rod level and turning."""
         places = {"x1": 0.3, "z1": -0.6, "x2": 0.3 + self.rod_length, "z2": -0.6}
         return places | {"x1_rate": 0.4, "z1_rate": 0.1, "x2_rate": 0.4, "z2_rate": 0.7}
 
@@ -137,14 +140,17 @@ class SpringAndRod(Scene):
 
 
 class PendulumChain(Heavy):
-    """A chain of particles joined by massless rods, hanging from a pivot in a vertical plane: n particles, n geometric rows.
+    """A chain of particles joined by massless rods, hanging from a pivot in a vertical plane: n particles, n
+    geometric constraints.
 
         |r_i - r_{i-1}|^2 = l_i^2,   r_0 = 0
 
-    In Cartesian coordinates each row holds two neighbours only: `A M^-1 A'` is tridiagonal, where the mass matrix in angles would be
-    dense. n = 2 is the double pendulum. Multipliers are the thrusts in the rods, N (negative: tension).
+    In Cartesian coordinates each constraint couples only two neighbours: `A M^-1 A'` is tridiagonal, while
+    the mass matrix in angles would be dense. n = 2 is the double pendulum. Multipliers are the thrusts in the
+    rods, N (negative: tension).
 
-    Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per link.
+    Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per
+    link.
     """
 
     links: int = eqx.field(static=True, default=5)
@@ -160,17 +166,17 @@ class PendulumChain(Heavy):
 
     @property
     def coordinates(self):
-        """x and z of every particle."""
+        """Return names of x and z of every particle."""
         return coordinates(*(f"x{i} z{i}" for i in range(1, self.links + 1)))
 
     @property
     def domain(self):
-        """Within the reach of the chain."""
+        """Return the domain: within the reach of the chain."""
         return {f"{axis}{i}": (-0.3 * i, 0.3 * i) for i in range(1, self.links + 1) for axis in "xz"}
 
     @property
     def example(self):
-        """Straight, 60 degrees from hanging, at rest."""
+        """Return a straight chain at 60 degrees from hanging, at rest."""
         return self.hanging([jnp.pi / 3] * self.links)
 
     def hanging(self, angles) -> dict[str, Scalar]:

@@ -7,7 +7,7 @@ from importlib import import_module
 from jourdain_jax.scene.names import Labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
-PLACES = {  # models by the module of this package that holds their classes, which is imported on first use
+PLACES = {  # module -> names of its models; modules are imported on first use
     "two_wheel_axle": ("two-wheel-axle-free", "two-wheel-axle-coordinates", "two-wheel-axle-quasi", "two-wheel-axle-redundant"),
     "blades": ("skate", "chaplygin-sleigh", "snakeboard", "trailer-chain"),
     "discs": ("vertical-disc", "tilting-disc", "tilting-disc-quaternion"),
@@ -22,7 +22,7 @@ _CLASS_OF = dict(zip((name for names in PLACES.values() for name in names), CLAS
 
 
 class _Models(Mapping[str, type[Scene]]):
-    """The classes by the names of the models; read-only."""
+    """A read-only mapping from the names of models to their classes."""
 
     def __getitem__(self, name: str) -> type[Scene]:
         kind = _CLASS_OF[name]
@@ -39,8 +39,8 @@ MODELS = _Models()
 
 
 def model(name: str, **parameters) -> Scene:
-    """Return a model by name, with some parameters changed. Raises ValueError with the valid names for an
-    unknown one.
+    """Return a model by name, with the given parameters changed. Raises ValueError, with the valid names, for
+    an unknown name.
     """
     kind = known_model(name)
     valid = [field.name for field in fields(kind) if field.init]
@@ -57,6 +57,5 @@ def known_model(name: str) -> type[Scene]:
 
 
 def counts_of(kind: type[Scene]) -> Labels:
-    """Return names of the whole numbers that determine the structure of a scene, such as a number of links.
-    """
+    """Return names of the integers that determine the structure of a scene, such as a number of links."""
     return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))

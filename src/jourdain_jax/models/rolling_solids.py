@@ -16,17 +16,19 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class BallOnTurntable(Heavy):
-    """A ball that rolls on a turntable, flat or tilted: affine rows, because the ground moves.
+    """A ball that rolls on a turntable, flat or tilted: affine constraints, because the ground moves.
 
-    Its centre moves like a charge in a magnetic field: in a circle on the flat table, drifting *along* the slope of the tilted one.
+    Its centre moves like a charge in a magnetic field: in a circle on the flat table, drifting *along* the
+    slope of the tilted one.
 
         R'' = n z x R' + g sin(tilt) x / (1 + kappa),    n = Om kappa / (1 + kappa)        (2/7 Om for a solid ball)
 
-    The speeds are quasi-velocities: the rates of the centre and the angular velocity in the axes of the table. In these the rows are
-    constant, and the attitude, a quaternion that a drawing needs, never enters them.
-    Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
+    The speeds are quasi-velocities: the rates of the centre and the angular velocity in the axes of the
+    table. In these the constraints are constant, and independent of the attitude, a quaternion needed only
+    for drawing. Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
 
-    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the table's axes.
+    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the
+    table's axes.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -74,25 +76,28 @@ class BallOnTurntable(Heavy):
         return {"spin": u.spin, "guiding centre along x": guide_x, "guiding centre along y": guide_y}
 
     def _axes(self) -> Matrix3:
-        """Downhill, level and normal unit vectors of the table, in rows."""
+        """Return downhill, level and normal unit vectors of the table, as rows."""
         table = Plane(tilt=self.tilt)
         return jnp.concatenate([table.tangents, table.normal[None]])
 
 
 class Rattleback(Heavy):
-    """The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned against its own axes.
+    """The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned
+    against its own axes.
 
-    Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the body is turned by gamma
-    about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward vertical in body axes. The contact point, from
-    the mass centre, is where the outward normal is mu (h: depth of the mass centre below the ellipsoid's centre):
+    Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the
+    body is turned by gamma about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward
+    vertical in body axes. At the contact point the outward normal is mu. Its vector from the mass centre is
+    (h: depth of the mass centre below the ellipsoid's centre)
 
         rho = S mu / sqrt(mu . S mu) - h e3,   S = diag(a^2, b^2, c^2)
 
-    The height of the mass centre, rho . mu, is built into the coordinates; no slip makes two rows. The speeds are the mass centre's
-    level velocities and the body angular velocity (w1, w2, w3): three degrees of freedom.
-    Source: T. R. Kane and D. A. Levinson, Int. J. Non-Linear Mech. 17 (1982) 175.
+    The height of the mass centre, rho . mu, is built into the coordinates; no slip gives two constraints. The
+    speeds are the mass centre's level velocities and the body angular velocity (w1, w2, w3): three degrees of
+    freedom. Source: T. R. Kane and D. A. Levinson, Int. J. Non-Linear Mech. 17 (1982) 175.
 
-    x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha = +-pi/2.
+    x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha =
+    +-pi/2.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)

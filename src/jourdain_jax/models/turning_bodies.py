@@ -11,14 +11,16 @@ from jourdain_jax.scene.scene import Scene
 
 
 class FreeRigidBody(Scene):
-    """A rigid body that nothing acts on: Euler's equations, solved by Jacobi's elliptic functions.
+    """A free rigid body: Euler's equations, solved by Jacobi's elliptic functions.
 
         I1 w1' = (I2 - I3) w2 w3   and cyclically;   r'' = 0
 
-    Energy, momentum and angular momentum about the mass centre (in space) are conserved; turning about the middle axis is unstable.
-    Source: L. Euler (1758); L. D. Landau and E. M. Lifshitz, Mechanics, section 37; Wang and Pao (2003), eq. (48).
+    Energy, momentum and angular momentum about the mass centre (in space) are conserved; rotation about the
+    middle axis is unstable. Source: L. Euler (1758); L. D. Landau and E. M. Lifshitz, Mechanics, section 37;
+    Wang and Pao (2003), eq. (48).
 
-    Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are principal.
+    Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are
+    principal.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -44,15 +46,17 @@ class FreeRigidBody(Scene):
 
 
 class Suslov(Scene):
-    """Suslov's problem: a body about a fixed point that cannot turn about its own third axis.
+    """Suslov's problem: a body with a fixed point that cannot turn about its third body axis.
 
         w3 = 0 (body axes):   I11 w1' = -I13 w1 w2,   I22 w2' = I13 w1^2          (I12 = I23 = 0)
 
-    With 2E = I11 w1^2 + I22 w2^2 every motion ends in a steady turn about the second axis, w2 = sqrt(2E/I22) tanh(k (t - t0)). The
-    row's multiplier is the torque (N m) that the constraint exerts about the third axis.
-    Source: G. K. Suslov, Theoretical Mechanics (1902); V. V. Kozlov, Regular and Chaotic Dynamics 7 (2002) 161.
+    With 2E = I11 w1^2 + I22 w2^2 every motion ends in steady rotation about the second axis, w2 =
+    sqrt(2E/I22) tanh(k (t - t0)). The multiplier is the torque (N m) of the constraint about the third axis.
+    Source: G. K. Suslov, Theoretical Mechanics (1902); V. V. Kozlov, Regular and Chaotic Dynamics 7 (2002)
+    161.
 
-    Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the mass centre.
+    Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the
+    mass centre.
     """
 
     i11: Parameter = parameter(1.0, unit="kg m^2", positive=True)
@@ -70,7 +74,7 @@ class Suslov(Scene):
         o = jnp.zeros_like(self.i11)
         inertia = [[self.i11, o, self.i13], [o, self.i22, o], [self.i13, o, self.i33]]
         attitude = quaternion_to_matrix(q.attitude)
-        mass = 1.0 + o  # of no account: the mass centre is fixed
+        mass = 1.0 + o  # irrelevant: the mass centre is fixed
         return {"body": RigidBody(mass, jnp.stack([jnp.stack(row) for row in inertia]), jnp.zeros(3), attitude)}
 
     def velocity_constraints(self, motion):

@@ -1,17 +1,17 @@
 """Two wheels on a rigid axle that roll down an incline: one system, four scenes, one per method of the paper.
 
-    Method I    `TwoWheelAxleFree`         two free bodies, 12 coordinates, ten rows: five geometric, four of rolling, (61)
-    Method II   `TwoWheelAxleCoordinates`  seven coordinates, the five rows (65)
-    Method III  `TwoWheelAxleQuasi`        seven coordinates, two quasi-velocities (67), no rows
-    the trap    `TwoWheelAxleRedundant`    Method I with (60a) and (60b) for the axle: eleven rows of rank 10, none of them spare
+    Method I    `TwoWheelAxleFree`         two free bodies, 12 coordinates, ten constraints (61)
+    Method II   `TwoWheelAxleCoordinates`  seven coordinates, the five constraints (65)
+    Method III  `TwoWheelAxleQuasi`        seven coordinates, two quasi-velocities (67), no constraints
+    the trap    `TwoWheelAxleRedundant`    Method I with (60a) and (60b): eleven rows of rank 10, none redundant
 
 All have two degrees of freedom and Appell's equations (64):
 
     2 a (M + m') psi1'' -      l (M + m') phi''                = 2 M g sin(alpha) cos(phi)
     a l (M + m') psi1'' - (M l^2 + m' l^2 + m' a^2) phi''      = M g l sin(alpha) cos(phi)
 
-hence `phi'' = 0` and `psi1'' = M g sin(alpha) cos(phi) / (a (M + m'))`.
-Source: Wang and Pao, Am. J. Phys. 71 (2003) 72, section VI, eqs. (57)-(67).
+hence `phi'' = 0` and `psi1'' = M g sin(alpha) cos(phi) / (a (M + m'))`. Source: Wang and Pao, Am. J. Phys. 71
+(2003) 72, section VI, eqs. (57)-(67).
 """
 
 import jax.numpy as jnp
@@ -64,7 +64,8 @@ class _TwoWheelAxle(Scene):
         )
 
     def _rolling(self, pose, height: str):
-        """Return the rolling contacts of both wheels. Each wheel carries itself: the axle transmits no load.
+        """Return the rolling contacts of both wheels. Each wheel carries its own weight, since the axle
+        transmits no load.
         """
         return {wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,)) for wheel in ("wheel1", "wheel2")}
 
@@ -84,7 +85,7 @@ class _TwoWheelAxle(Scene):
 
 
 class _FreeWheels(_TwoWheelAxle):
-    """Two wheels as free bodies, upright, with one heading and rolling; the axle's own row is missing."""
+    """Two upright wheels as free bodies, rolling with one heading, still without the axle's constraint."""
 
     coordinates = coordinates("x1 y1 z1 phi1 theta1 psi1 x2 y2 z2 phi2 theta2 psi2")
     privileged = ("psi1_rate", "phi1_rate")
@@ -108,16 +109,18 @@ class _FreeWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleFree(_FreeWheels):
-    """Two wheels on an axle down an incline, Method I: Jourdain's equation (50) for two free bodies, ten rows."""
+    """Two wheels on an axle down an incline, Method I: Jourdain's equation (50) for two free bodies, ten
+    constraints.
+    """
 
     def velocity_constraints(self, motion):
         return {"rigid axle": self._axle_row(motion.u.psi1_rate, motion.u.psi2_rate, motion.u.phi1_rate)}
 
 
 class TwoWheelAxleRedundant(_FreeWheels):
-    """Two wheels on an axle down an incline, Method I with both rows (60a) and (60b).
+    """Two wheels on an axle down an incline, Method I with both constraints (60a) and (60b).
 
-    Either row alone loses the axle where its factor, cos phi or sin phi, passes zero.
+    Each alone fails to describe the axle where its factor, cos phi or sin phi, passes zero.
     """
 
     def velocity_constraints(self, motion):
@@ -129,7 +132,7 @@ class TwoWheelAxleRedundant(_FreeWheels):
 
 
 class _UprightWheels(_TwoWheelAxle):
-    """Two upright wheels of one heading in the seven coordinates of Methods II and III."""
+    """Two upright wheels with one heading in the seven coordinates of Methods II and III."""
 
     coordinates = coordinates("x1 y1 psi1 x2 y2 psi2 phi")
 
@@ -142,7 +145,9 @@ class _UprightWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleCoordinates(_UprightWheels):
-    """Two wheels on an axle down an incline, Method II: Appell's equations (52) in seven coordinates with the five rows (65)."""
+    """Two wheels on an axle down an incline, Method II: Appell's equations (52) in seven coordinates with the
+    five constraints (65).
+    """
 
     privileged = ("psi1_rate", "phi_rate")
     example = {"y2": 0.8, "psi1_rate": 0.7 / 0.3, "phi_rate": 1.1}
@@ -160,7 +165,7 @@ class TwoWheelAxleCoordinates(_UprightWheels):
 class TwoWheelAxleQuasi(_UprightWheels):
     """Two wheels on an axle down an incline, Method III: quasi-velocities (67).
 
-    Five of the seven are zero by the rows; the rolling of wheel 1 and the turning remain.
+    The constraints make five of the seven zero; the rolling of wheel 1 and the turning remain.
     """
 
     speeds = speeds("rolling turning")

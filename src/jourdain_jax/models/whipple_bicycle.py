@@ -1,13 +1,15 @@
 """The full nonlinear Whipple bicycle: four rigid bodies on two knife-edge wheels that roll without slip.
 
-Rear wheel R, rear frame with rider B, front frame (handlebar and fork) H, front wheel F. The rear contact and its height are
-built into the coordinates; the front contact is the lowest point of the front wheel: a height row and two no-slip rows, valid at
-any lean and steer. Five rows, three degrees of freedom: lean, steer, forward motion.
+Rear wheel R, rear frame with rider B, front frame (handlebar and fork) H, front wheel F. The rear contact and
+its height are built into the coordinates; the front contact is the lowest point of the front wheel, with a
+height constraint and two no-slip constraints, valid at any lean and steer. Five constraints, three degrees of
+freedom: lean, steer, forward motion.
 
-Parameters have the names and the frame of the source: origin at the rear contact, x forward, y to the right, z DOWN. The
-engine's frame has y to the left and z up, half a turn about x away: `(x, y, z) -> (x, -y, -z)`, so products of inertia change
-sign, `Ixz -> -Ixz`. Lean is a turn about x in both. Steer is a turn about the steer axis `(sin lam, 0, -cos lam)`, downwards.
-Source: J. P. Meijaard, J. M. Papadopoulos, A. Ruina and A. L. Schwab, Proc. R. Soc. A 463 (2007) 1955; defaults: its benchmark.
+Parameters have the source's names and frame: origin at the rear contact, x forward, y to the right, z DOWN.
+The engine's frame has y to the left and z up, rotated by half a turn about x: `(x, y, z) -> (x, -y, -z)`, so
+products of inertia change sign, `Ixz -> -Ixz`. Lean is a rotation about x in both. Steer is a rotation about
+the steer axis `(sin lam, 0, -cos lam)`, downwards. Source: J. P. Meijaard, J. M. Papadopoulos, A. Ruina and
+A. L. Schwab, Proc. R. Soc. A 463 (2007) 1955; defaults: its benchmark.
 """
 
 import math
@@ -88,7 +90,8 @@ class WhippleBicycle(Scene):
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")
-    privileged = ("lean_rate", "steer_rate", "front_spin_rate")  # regular at any steer; the rear wheel stands still at a right angle
+    # regular at any steer; the rear wheel stops at a right angle
+    privileged = ("lean_rate", "steer_rate", "front_spin_rate")
     domain = {"lean": (-0.8, 0.8), "pitch": (-0.1, 0.1), "steer": (-1.0, 1.0)}
     conventions = (
         "z up, x forward, y to the left at yaw = 0; parameters in the z-down frame of Meijaard et al. "
@@ -101,7 +104,7 @@ class WhippleBicycle(Scene):
     def from_values(cls, values: Mapping[str, float | Array]) -> "WhippleBicycle":
         """Return the bicycle with these 26 parameters by name, as read from a parameter file.
 
-        Raises ValueError with the names of parameters that are missing or unknown.
+        Raises ValueError with the names of missing or unknown parameters.
         """
         names = [name for name, _, _ in parameters_of(cls())]
         for name in values:
@@ -113,8 +116,8 @@ class WhippleBicycle(Scene):
         return cls(**values)
 
     def upright(self, speed) -> dict[str, Scalar]:
-        """Return the speeds of running straight and upright at `speed` (m/s), the steady motion of the linear
-        model. All else is zero.
+        """Return the speeds of upright straight running at `speed` (m/s), the steady motion of the linear
+        model; all other values are zero.
         """
         speed = jnp.asarray(speed, real_type())
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
@@ -126,7 +129,8 @@ class WhippleBicycle(Scene):
         # about the steer axis (sin lam, 0, -cos lam) by +steer: about its opposite, the z axis tilted back, by -steer
         front = rear @ rot_y(-self.lam) @ rot_z(-q.steer) @ rot_y(self.lam)
         rear_centre = contact + self.rR * wheel_plane[:, 2]
-        on_steer_axis = rear_centre + rear @ _vector(self.w + self.c, self.rR)  # where the axis meets the ground when upright
+        # intersection of the axis and the ground when upright
+        on_steer_axis = rear_centre + rear @ _vector(self.w + self.c, self.rR)
         front_centre = on_steer_axis + front @ _vector(-self.c, -self.rF)
         frame_centre = rear_centre + rear @ _vector(self.xB, self.zB + self.rR)
         fork_centre = on_steer_axis + front @ _vector(self.xH - self.w - self.c, self.zH)
@@ -163,10 +167,11 @@ class WhippleBicycle(Scene):
         }
 
     def mode_names(self, eigenvalues: np.ndarray) -> Labels:
-        """Return names of the four modes. Weave is the complex pair; if all eigenvalues are real, weave
-        consists of the two with equal sign that meet at a higher speed (when riding forward, the two that
-        grow). Of the other two, castering is the faster mode and capsize the slower. Another number of modes
-        has no names.
+        """Return names of the four modes; another number of modes has no names.
+
+        Weave is the complex pair. If all eigenvalues are real, it is the two with equal sign that merge at a
+        higher speed (when riding forward, the two that grow). Of the other two, castering is the faster mode
+        and capsize the slower.
         """
         if len(eigenvalues) != 4:
             return ()
@@ -175,7 +180,7 @@ class WhippleBicycle(Scene):
         return tuple("castering" if k == fast else "capsize" if k == slow else "weave" for k in range(4))
 
     def events(self, motion):
-        # leant over too far, or the handlebar past a right angle, where a real one meets the frame
+        # leaning too far, or the handlebar beyond a right angle, where a real one hits the frame
         return {"fallen": jnp.minimum(1.2 - jnp.abs(motion.q.lean), jnp.pi / 2 - jnp.abs(motion.q.steer))}
 
 
@@ -187,7 +192,8 @@ def _vector(x, z) -> Vector3:
 
 
 def _inertia(xx, yy, zz, xz) -> Matrix3:
-    """Return inertia in the engine's axes. The product of inertia changes its sign by the half turn about x.
+    """Return the inertia in the engine's axes; half a turn about x changes the sign of the product of
+    inertia.
     """
     zero = jnp.zeros_like(xx)
     return jnp.stack([xx, zero, -xz, zero, yy, zero, -xz, zero, zz]).reshape(3, 3)

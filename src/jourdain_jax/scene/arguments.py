@@ -1,10 +1,10 @@
 """Checks of arguments of public functions: the scene, vectors of q and u, inputs.
 
-Kinds and shapes are known while a function is traced: no compiled program contains these checks.
+The checks read kinds and shapes, which are known during tracing, so compiled programs contain none of them.
 
-Errors in a user's own methods: the traceback shows their lines, and omits lines of this package and of JAX
-between them. As with JAX's own filtering,
-JAX_TRACEBACK_FILTERING=off shows all of them. Errors on whose way no user's method was keep their whole traceback.
+Tracebacks of errors in a user's methods show the user's lines and omit those of this package and of JAX. With
+JAX_TRACEBACK_FILTERING=off, as for JAX's own filtering, they show all lines. Errors that pass through no
+user's method keep their whole traceback.
 """
 
 import sys
@@ -41,8 +41,8 @@ F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
-    """A scene with its choices (`motion/model.py: Model`); functions that call `as_scene` accept it in place
-    of the scene.
+    """A scene with its choices (`motion/model.py: Model`), accepted in place of a scene by functions that
+    call `as_scene`.
     """
 
     scene: Scene
@@ -57,37 +57,41 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """Return the scene itself. Raises ValueError if it is no scene, or a class in place of an instance."""
+    """Return the scene itself. Raises ValueError for anything but a scene, such as the class in place of an
+    instance.
+    """
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, BuiltFor):
         return scene.scene
     if isinstance(scene, type) and issubclass(scene, Scene):
-        raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write "
-            f"`{scene.__name__}()`, with parameters in the parentheses")
+        raise ValueError(
+            f"`scene` is the class `{scene.__name__}`, expected an instance; write `{scene.__name__}()`, "
+            "with parameters in the parentheses"
+        )
     raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of "
         "`jj.Scene`")
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """Return the scene. Raises ValueError if a contact or row may slip, which the function `what` does not
-    support.
+    """Return the scene. Raises ValueError if a contact or a velocity constraint may slip, which the function
+    `what` does not support.
     """
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
         raise ValueError(
-            f"`{what}` needs contacts that roll and rows that hold, but {named} of `{type(scene).__name__}` "
-            "may slip; omit the friction there"
+            f"`{what}` needs contacts that roll and constraints that hold, but {named} of "
+            f"`{type(scene).__name__}` may slip; omit the friction there"
         )
     return scene
 
 
 def of_known_numbers(function: F) -> F:
-    """Return a wrapper of a function of a scene or motion that runs it on numbers, also inside `jit`, `vmap`
-    and derivatives.
+    """Return a wrapper of a function of a scene or motion. It runs the function on numbers, also inside
+    `jit`, `vmap` and derivatives.
 
-    Raises DifferentiationModeError with its name where an argument is traced.
+    Raises DifferentiationModeError with the function's name for a traced argument.
     """
 
     @wraps(function)
@@ -95,8 +99,8 @@ def of_known_numbers(function: F) -> F:
         known = known.scene if isinstance(known, BuiltFor) else known
         if is_traced(known, args, kwargs):
             raise DifferentiationModeError(
-                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are "
-                "unknown there; call it outside"
+                f"`{function.__name__}` was called inside jit, vmap or a derivative with traced numbers; "
+                "call it outside"
             )
         with at_once():
             return function(known, *args, **kwargs)
@@ -111,8 +115,8 @@ def as_time(t) -> Scalar:
 
 
 def one_time(t, name: str = "t"):
-    """Return a time on NumPy, unless it is traced; None stays None. Raises ValueError with its name if it is
-    not a number.
+    """Return a time on NumPy unless it is traced; None stays None. Raises ValueError with its name unless it
+    is one number.
     """
     return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use "
         "`jax.vmap` for many")
@@ -129,7 +133,7 @@ def vector_of_times(ts) -> Float[Entries, "times"]:
 
 
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
-    """q as a vector of the scene's coordinates."""
+    """Return q as a vector of the scene's coordinates."""
     return _as_vector(scene, "q", q, as_scene(scene).coordinate_names.entries)
 
 
@@ -140,7 +144,7 @@ def as_speeds(scene: Scene, u, what: str = "u") -> Speeds:
 
 def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
     if isinstance(x, jax.Array) and x.shape == (len(names),) and x.dtype == real_type() and not x.weak_type:
-        return x  # as it should be, in a twentieth of the time of what follows
+        return x  # the usual case, twenty times faster than the checks below
     listed = ", ".join(names)
     if isinstance(x, Mapping):
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of "
@@ -150,19 +154,19 @@ def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
 
 
 class ChangingInputs(eqx.Module):
-    """Inputs near one time: where rows depend on them, accelerations depend on their rates."""
+    """Inputs near one time. Accelerations depend on the rates of inputs that occur in constraints."""
 
     t: Scalar  # s
     values: Float[Array, "inputs"]
     rates: Float[Array, "inputs"]  # per s
 
     def __call__(self, t) -> Float[Array, "inputs"]:
-        """Return the values near that time."""
+        """Return the values at a time near `t`."""
         return self.values + self.rates * (t - self.t)
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
-    """Return values of the scene's inputs at one instant, from a vector, a dictionary (omitted ones are
+    """Return the scene's inputs at one instant as a vector, from a vector, a dictionary (omitted ones are
     zero), or None for all zero.
     """
     names = scene.inputs.entries
@@ -185,8 +189,8 @@ _NOTE = "Lines of jourdain_jax between yours are omitted from this traceback; JA
 
 
 def shown_from_users_lines(function: F) -> F:
-    """Return a wrapper of the function. If a user's line is in the traceback of an error (in a method of a
-    scene, an input or an event), the error shows that line. JAX's usual modes of promotion apply.
+    """Return a wrapper of the function that shortens the traceback of an error to the user's lines, if there
+    are any (in a method of a scene, an input or an event). Inside, JAX promotes types as usual.
     """
 
     @wraps(function)
@@ -204,7 +208,7 @@ def shown_from_users_lines(function: F) -> F:
 
 
 def warn(text: str, kind: type[Warning] = UserWarning) -> None:
-    """Issue a warning that shows the user's line which led here."""
+    """Issue a warning that points to the user's line."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and not _is_users(frame):
         frame, level = frame.f_back, level + 1
@@ -212,8 +216,7 @@ def warn(text: str, kind: type[Warning] = UserWarning) -> None:
 
 
 def _is_shortened(error: BaseException) -> bool:
-    """Return whether the error comes from a user's line that was called from here. If so, add the note to it.
-    """
+    """Return whether the traceback contains a user's line. If so, add the note to the error."""
     if jax.config.jax_traceback_filtering == "off":
         return False
     if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):
@@ -232,8 +235,7 @@ def _frames(traceback: TracebackType | None) -> list[TracebackType]:
 
 
 def _is_users(frame: FrameType) -> bool:
-    """Return whether a line is neither in this package nor in an installed package or Python's own library.
-    """
+    """Return whether a frame is outside this package, installed packages and Python's library."""
     return not frame.f_code.co_filename.startswith((_OURS, *_INSTALLED, "<frozen"))
 
 

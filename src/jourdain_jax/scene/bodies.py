@@ -1,7 +1,7 @@
 """Particles and rigid bodies: mass, inertia and pose as functions of the coordinates. Velocities follow by
 automatic differentiation.
 
-A body states its pose in the inertial frame; `outline` is a line in its own frame, for drawing only.
+A body states its pose in the inertial frame; `outline` is a line in the body frame, for drawing only.
 """
 
 from typing import Any
@@ -19,8 +19,8 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
-    Raises ValueError for other shapes. Its velocity is the derivative of the position. If the mass depends on
-    time or coordinates, `m a` has its momentary value; state the thrust of ejected mass as a load.
+    Raises ValueError for other shapes. Its velocity is the derivative of the position. A mass that depends on
+    time or coordinates enters `m a` with its momentary value; state the thrust of ejected mass as a load.
     """
 
     mass: Scalar  # kg
@@ -37,16 +37,16 @@ class RigidBody(eqx.Module):
     - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body
       axes.
     - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to
-      space components. Its column `R[:, k]` is body axis k in the inertial frame. A row `R[k]` is not, and no
-      check can find such a confusion.
+      space components. The column `R[:, k]` is body axis k in the inertial frame. The row `R[k]` is not, and
+      no check can detect this mistake.
     - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only
-      (default: none). With `solid` "box", "ellipsoid" or "wheel", its only point is the corner of a box
-      around this solid.
+      (default: none). If `solid` is "box", "ellipsoid" or "wheel", the only point is the corner of the
+      solid's bounding box.
 
-    Raises ValueError for other shapes. Velocities come by differentiating the pose. If mass or inertia depend
-    on time or coordinates, their momentary values count in `m a` and `I alpha + omega x I omega`: mass that
-    leaves or joins carries its momentum, and its thrust must be stated as a load. A skater who draws in the
-    arms must be modelled by several bodies.
+    Raises ValueError for other shapes. Velocities are derivatives of the pose. A mass or inertia that depends
+    on time or coordinates enters `m a` and `I alpha + omega x I omega` with its momentary value. Mass that
+    leaves or joins carries its momentum away or in; state its thrust as a load. Model a skater who draws in
+    the arms by several bodies.
     """
 
     mass: Scalar  # kg
@@ -74,9 +74,9 @@ class RigidBody(eqx.Module):
     def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
         """Return a disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
 
-        Uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are given, in kg m^2.
-        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
-        ValueError for another axis.
+        Its moments are uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are
+        given, in kg m^2. `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
+        Raises ValueError for another axis.
         """
         mass, radius = checked_real(mass, "mass of a disc", ()), checked_real(radius, "radius of a disc", ())
         axial = mass * radius**2 / 2 if axial is None else axial

@@ -4,10 +4,11 @@ normal.
     P(n)    the lowest point of the body where the unit vector n points up
     x + gap n(x) = P(n(x)),   f(x) = 0
 
-On a plane n is known. A ball near a cylinder or sphere, and a wheel near a sphere, is a core (its centre, the circle within its tyre) and a distance
-from it, and the core's nearest point is known. For all others Newton's method solves for x and the gap, four unknowns, differentiable by the
-implicit function theorem; where it finds nothing, all is NaN.
-Source: P. Wriggers, Computational Contact Mechanics (2006), on closest points.
+On a plane n is known. A ball near a cylinder or sphere, or a wheel near a sphere, is a core with an offset:
+the core is the ball's centre or the circle within the tyre, and its nearest point is known. In all other
+cases Newton's method solves for x and the gap, four unknowns, with derivatives by the implicit function
+theorem. If it does not converge, the result is NaN. Source: P. Wriggers, Computational Contact Mechanics
+(2006), on closest points.
 """
 
 import equinox as eqx
@@ -27,7 +28,7 @@ class Ball(eqx.Module):
     radius: Scalar  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """The point farthest down where n is up: `c - a n`."""
+        """Return the lowest point where n points up: `c - a n`."""
         return self.centre - self.radius * n
 
 
@@ -61,8 +62,8 @@ class Ellipsoid(eqx.Module):
     semi_axes: Vector3  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point where n points up: `c - R S n'/sqrt(n'.S n')` with `n' = R' n` and S, the
-        squares of the semi-axes.
+        """Return the lowest point where n points up: `c - R S n'/sqrt(n'.S n')` with `n' = R' n` and the
+        squared semi-axes S.
         """
         local = n @ self.orientation
         weighted = self.semi_axes**2 * local
@@ -92,8 +93,8 @@ def touch(shape: Shape, ground: Ground) -> Touch:
 
 
 def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
-    """Return the point of the tyre's inner circle that is nearest to the sphere. It is nearest to the centre
-    of the sphere or, inside the sphere, farthest from it.
+    """Return the point of the tyre's centre circle nearest to the sphere's surface: the nearest to the
+    sphere's centre from outside, the farthest from inside.
     """
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle
@@ -102,8 +103,8 @@ def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
 
 
 def _of_core(core: Vector3, distance: Scalar, ground: Cylinder | Sphere) -> Touch:
-    """Return the point at `distance` (m) from the core towards the ground; NaN if the body does not fit into
-    a hollow ground.
+    """Return the contact of a body made of the points within `distance` (m) of a core point; NaN if the body
+    does not fit into a hollow ground.
     """
     if ground.side == "inside":
         distance = jnp.where(distance < ground.radius, distance, jnp.nan)
@@ -133,7 +134,7 @@ def _guess(shape: Shape, ground: Ground) -> Float[Array, "4"]:
     the surface, and the gap.
     """
     x = point = shape.lowest(normal_at(ground, shape.centre))
-    for _ in range(3):  # steps along the gradient before Newton's method for the contact itself
+    for _ in range(3):  # steps along the gradient
         value, slope = jax.value_and_grad(ground.value)(x)
         x = x - value * slope / (slope @ slope)
     return jax.lax.stop_gradient(jnp.append(x, normal_at(ground, x) @ (point - x)))

@@ -1,8 +1,10 @@
-"""Rolling contacts without slip, of balls, ellipsoids, discs and wheels, on planes, cylinders, spheres, surfaces and height maps.
+"""Rolling contacts without slip, of balls, ellipsoids, discs and wheels, on planes, cylinders, spheres,
+surfaces and height maps.
 
-A contact contributes two velocity rows (no slip along the two tangents of the ground) and, with `height="row"`, one geometric row (the gap
-is zero). With `height="coordinates"` the coordinates keep the contact point on the ground by construction; then the normal force is
-found from Newton's equations (row S1) instead of from a multiplier. Nothing hinders spin about the normal.
+A contact contributes two velocity constraints (no slip along the two tangents of the ground). With
+`height="row"` it also contributes one geometric constraint (zero gap). With `height="coordinates"` the
+coordinates keep the contact point on the ground, and the normal force follows from Newton's equations (row
+S1) instead of a multiplier. Spin about the normal is free.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,7 +39,7 @@ class Coulomb(eqx.Module):
 
 
 class Slipping(TypedDict, total=False):
-    """Statements of contacts that slip, fly and strike."""
+    """Options of contacts that slip, fly and strike."""
 
     friction: Parameter | Coulomb | None
     restitution: Parameter
@@ -51,28 +53,28 @@ class Contact(eqx.Module):
     - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point of contact.
     - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a
       ground z = 0 at rest).
-    - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`; pictures show it.
-    - `height`: "coordinates" if they keep the point on the ground, "row" for a geometric constraint.
-    - `carried`: names of the bodies that this contact holds up, together with all other contacts of these
+    - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`, shown in pictures.
+    - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a geometric
+      constraint.
+    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
       bodies (default: all of the scene), for the normal force with `height="coordinates"`.
-    - `distance` (m): the gap, if it is not the point's height above the plane.
+    - `distance` (m): the gap (default: the point's height above the plane).
     - `shape`: set by `ball_contact` and similar functions, for pictures; the scene's `visuals` override it.
     - `friction`, `restitution`: as in `ball_contact`.
 
-    If the coordinates determine the point, this avoids the search for it: `jj.Contact(pose["disc"], p,
-    ground=hill)`.
-    ValueError for an unknown height, or anything of another kind or shape.
+    If the coordinates determine the point, no search is needed: `jj.Contact(pose["disc"], p, ground=hill)`.
+    Raises ValueError for an unknown height, or anything of another kind or shape.
     """
 
     body: str = eqx.field(static=True)
     point: Vector3  # m, inertial frame
     plane: Plane
     height: str = eqx.field(static=True)  # "coordinates" or "row"
-    carried: Labels | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
+    carried: Labels | None = eqx.field(static=True)  # supported bodies; None: all of them
     distance: Scalar | None  # m; None: the point's height above the plane
-    shape: Shape | None  # what rolls, for pictures
-    ground: Ground | None  # what it rolls on, for pictures; None: the plane
-    friction: Coulomb | None  # None: it rolls, whatever friction that needs
+    shape: Shape | None  # of the rolling body, for pictures
+    ground: Ground | None  # for pictures; None: the plane
+    friction: Coulomb | None  # None: it rolls, with any friction force
     restitution: Scalar | None
     impact: str = eqx.field(static=True)
 
@@ -104,20 +106,19 @@ class Contact(eqx.Module):
         self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
 
     def gap(self) -> Scalar:
-        """Signed distance of the contact point from the ground, m."""
+        """Return the signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
     def lean(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, which is zero where it lies flat; None for
-        other shapes.
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for other shapes.
         """
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 
 
 class Rolling(Slipping, total=False):
-    """Statements of all rolling contacts."""
+    """Options of all rolling contacts."""
 
-    centre: Vector | None  # m, body frame, of what rolls
+    centre: Vector | None  # m, body frame, of the rolling shape
     ground: Ground | None
     height: str
     carried: Labels | None
@@ -129,21 +130,22 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
     - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" if they keep the body on the ground, "row" for a geometric constraint.
-    - `carried`: names of the bodies that this contact holds up, together with all other contacts of these
+    - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a geometric
+      constraint.
+    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
       bodies (default: all), for the normal force with `height="coordinates"`.
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
-      slips (`motion.phase`), and needs `height="row"`; None (default): it rolls, with any friction that it
-      needs. `restitution` e of impacts, from 0 (default) to 1.
+      slips (`motion.phase`), and needs `height="row"`; None (default): it rolls, with any friction force.
+      `restitution` e of impacts, from 0 (default) to 1.
     - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip afterwards. The others
       follow the impact along its normal impulse, with friction against the momentary slip: "newton", until
       w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic",
-      until its work is -e^2 times that of compression. They are for balls and for slip that keeps its
-      direction, as in a plane; where slip would turn there is a result code.
+      until its work is -e^2 times that of compression. They need a ball, or slip that keeps its direction, as
+      in a plane; a result code reports slip that would turn.
 
-    It has two velocity rows (m/s), along the ground's tangents. Raises ValueError for an unknown height and a
-    length that is not positive; for a ball that does not fit into the cylinder or sphere, when its scene is
-    built.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
+    height or a length that is not positive. A ball too large for its cylinder or sphere is refused when the
+    scene is built.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
@@ -152,9 +154,11 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
     """Return the rolling contact of an ellipsoid with a ground, without slip, at `c - R S n'/sqrt(n'.S n')`,
     `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
 
-    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in `ball_contact`.
+    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in
+      `ball_contact`.
 
-    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown height. On all but planes the point is found by Newton's method.
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown height.
+    Except on planes, Newton's method finds the point.
     """
 
     def ellipsoid(centre) -> Ellipsoid:
@@ -167,12 +171,14 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
 def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Return the rolling contact of the edge of a thin disc with a ground, without slip.
 
-    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's normal n and disc axis k. Undefined for
-    a disc lying flat.
+    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's
+    normal n and disc axis k. Undefined for a disc lying flat.
 
-    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in `ball_contact`.
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in
+      `ball_contact`.
 
-    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
+    height. The point is in closed form on a plane and a sphere.
     """
     return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None), **options)
 
@@ -181,13 +187,15 @@ def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **
     """Return the rolling contact of a wheel with a tyre of circular section (a torus) with a ground, without
     slip.
 
-    The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the ground's normal n, the axle k. R is
-    the wheel's outer radius, R - r that of the circle within the tyre; a tyre of r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
+    The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`,
+    with the ground's normal n and the axle k. R is the wheel's outer radius, R - r the radius of the centre
+    circle of the tyre; r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
 
-    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `options`: as in
-      `ball_contact`.
+    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or
+      "z". `options`: as in `ball_contact`.
 
-    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
+    height. The point is in closed form on a plane and a sphere.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
     return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre), **options)
@@ -200,8 +208,8 @@ def _radius(body: BodyPose, radius) -> Scalar:
 def rolling(
     body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
 ) -> Contact:
-    """Return the contact of a rolling shape, which is a function of its centre (m, inertial frame). Other
-    arguments: as in `ball_contact`.
+    """Return the contact of a rolling `shape`, a function of its centre (m, inertial frame). Other arguments:
+    as in `ball_contact`.
     """
     _checked_height(height)
     check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
@@ -233,7 +241,7 @@ def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="mo
     if height != "row":
         raise ValueError(
             f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
-            'ground; give the body coordinates of its own for its height, and write height="row"'
+            'ground; give the body a coordinate for its height, and write height="row"'
         )
     law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, "friction of the "
         f"contact of `{body}`", ()))
@@ -242,8 +250,10 @@ def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="mo
 
 def _checked_height(height: str) -> str:
     if height not in _HEIGHTS:
-        raise ValueError(f"contact height `{height}` is unknown; expected `coordinates` (kept by the "
-            "coordinates) or `row` (a geometric row)")
+        raise ValueError(
+            f"contact height `{height}` is unknown; expected `coordinates` (kept by the coordinates) or "
+            "`row` (a geometric constraint)"
+        )
     return height
 
 

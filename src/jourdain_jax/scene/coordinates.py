@@ -1,8 +1,8 @@
-"""Generalized coordinates `q` and generalized speeds `u`: their names, and the default correspondence between
-them.
+"""Names of generalized coordinates `q` and generalized speeds `u`, and their default correspondence.
 
-A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has as speeds the three body components of the
-angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0, omega)`.
+A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has the three body components of
+the angular velocity as speeds, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0,
+omega)`.
 """
 
 import keyword
@@ -28,7 +28,7 @@ class Quaternion:
 
 @dataclass(frozen=True)
 class Names:
-    """Names of the entries of a flat vector, and of runs of entries that can be read together."""
+    """Names of the entries of a flat vector, and of groups of adjacent entries."""
 
     entries: Labels
     groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
@@ -38,8 +38,8 @@ class Names:
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Return the position of `name`. Raises ValueError with the valid names, and the `kind` of name, if
-        there is none.
+        """Return the position of `name`. If there is none, raises ValueError with the valid names and the
+        `kind` of name.
         """
         check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
@@ -56,7 +56,7 @@ class Names:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The names of a scene's coordinates and of the speeds that belong to them by default."""
+    """The names of a scene's coordinates and of their default speeds."""
 
     names: Names
     default_speeds: Names
@@ -81,7 +81,7 @@ class Coordinates:
 
 def quaternion(name: str) -> Quaternion:
     """Return a quaternion coordinate called `name`, for `coordinates(...)`: four coordinates `name_w`, ...,
-    three speeds `name_omega_x`, ...
+    and three speeds `name_omega_x`, ...
 
     The speeds are the body components of the angular velocity (rad/s), `d name/dt = 1/2 name (0, omega)`.
     """
@@ -93,8 +93,9 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
     """Return the names of a scene's coordinates from `parts`: strings of names separated by spaces, and
     quaternions, in order.
 
-    Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds: `x_rate`, ..., `attitude_omega_z`.
-    ValueError for a name that is not an identifier, is used twice or is taken.
+    Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds: `x_rate`,
+    ..., `attitude_omega_z`. Raises ValueError for a name that is not an identifier, is used twice or is
+    reserved.
     """
     names: list[str] = []
     speeds: list[str] = []
@@ -121,14 +122,14 @@ def speeds(names: str) -> Names:
     """Return the names of user-defined generalized speeds (quasi-velocities), separated by spaces in `names`;
     eqs. (53)-(56).
 
-    The scene then states `coordinate_rates(t, q, u)`. ValueError as in `coordinates`.
+    The scene then states `coordinate_rates(t, q, u)`. Raises ValueError as in `coordinates`.
     """
     return _named(names, "speed")
 
 
 def inputs(names: str) -> Names:
     """Return the names of a scene's inputs (such as actuator torques), separated by spaces in `names`; their
-    unit is the scene's. ValueError as in `coordinates`.
+    unit is the scene's. Raises ValueError as in `coordinates`.
     """
     return _named(names, "input")
 
@@ -156,8 +157,10 @@ def _check_names(names: Sequence[str], kind: str) -> None:
             raise ValueError(f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; "
                 "choose another")
         if counts[name] > 1:
-            raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
+            raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs its own name")
         if name == "t" and kind != "input":
             raise ValueError(f'{kind} name `t` is reserved for time (`motion["t"]`); choose another')
         if name in ("array", "slots", "keys"):
-            raise ValueError(f"{kind} name `{name}` is an attribute of the container; choose another")
+            raise ValueError(
+                f"{kind} name `{name}` is reserved for an attribute of the container; choose another"
+            )

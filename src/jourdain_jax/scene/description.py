@@ -1,6 +1,6 @@
-"""Checks of a scene's class: spelling of methods, existing coordinate names, ordered bounds.
+"""Checks of a scene's class: spelling of methods, known coordinate names, ordered bounds.
 
-A method with a misspelt name would be omitted without a word, and with it a force or a row.
+A method with a misspelt name would be ignored silently, and with it a force or a constraint.
 """
 
 import difflib
@@ -44,7 +44,7 @@ _MEANT = {  # what other programs and textbooks call them
 
 
 def check_description(scene, base: Any) -> None:
-    """Raise ValueError with a mistake in the description of `scene`, a subclass of `base`; traced values are
+    """Raise ValueError for a mistake in the description of `scene`, a subclass of `base`. Traced values are
     not checked.
     """
     kind: Any = type(scene)
@@ -60,8 +60,8 @@ def check_description(scene, base: Any) -> None:
     check_kind(scene.modes, Modes, f"`modes` of `{kind.__name__}`", "jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
-            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but not the rates "
-            "of its coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
+            f"`{kind.__name__}` has its own speeds ({', '.join(scene.speeds.entries)}) but no rates of its "
+            "coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
             "coordinates"
         )
     _check_counts(scene)
@@ -77,7 +77,7 @@ def check_description(scene, base: Any) -> None:
 
 
 def checked_arguments(kind: type, given: dict) -> None:
-    """Raise ValueError with the nearest valid name where a scene is made with an unknown argument."""
+    """Raise ValueError, with the nearest valid name, for an unknown argument of a new scene."""
     known = {field.name for field in fields(kind) if field.init}
     unknown = [name for name in given if name not in known]
     if not unknown:
@@ -99,29 +99,30 @@ def _misspelt(kind: type, base: type) -> str:
         for name, member in vars(owner).items():
             if name in own and name not in annotated:
                 return (
-                    f"`{owner.__name__}` sets `{name}`, a field of a class that it extends, without an "
-                    f"annotation, which has no effect on scenes; write `{name}: float = jj.parameter(...)`, "
-                    f"or give the value when a scene is made: `{kind.__name__}({name}=...)`"
+                    f"`{owner.__name__}` sets `{name}`, a field of a base class, without an annotation, "
+                    f"which has no effect on scenes; write `{name}: float = jj.parameter(...)`, or pass the "
+                    f"value: `{kind.__name__}({name}=...)`"
                 )
             known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
             if known or name in read or isinstance(member, type | staticmethod | classmethod):
                 continue
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
-            # `load` and `loads` are as near as that, `contact_arm` and `contacts` are not
+            # the cutoff takes `load` for `loads`, but not `contact_arm` for `contacts`
             near = near or difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=0.85)
-            if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):  # beside the real one it is a helper
+            # beside the real one it is a helper
+            if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):
                 what = "a method" if callable_ else "an attribute"
                 return (
                     f"`{kind.__name__}` has {what} `{name}`, which nothing calls; did you mean `{near[0]}`? "
-                    f"Rename it, or begin its name with an underscore (`_{name}`) if it is your own"
+                    f"Rename it, or begin its name with an underscore (`_{name}`)"
                 )
     return ""
 
 
 def _check_counts(scene) -> None:
-    """Raise ValueError for a count that is not a static field: it would be traced, and loops and branches
-    over it could not run.
+    """Raise ValueError for a count that is no static field: it would be traced, and loops and branches over
+    it would fail.
     """
     for field in fields(scene):
         value = getattr(scene, field.name)
@@ -143,7 +144,7 @@ def _check_domain(scene) -> None:
 
 
 def _is_ordered(pair: np.ndarray) -> bool:
-    """Return whether numbers are finite and none falls below the one before."""
+    """Return whether the numbers are finite and do not decrease."""
     return pair.dtype.kind in "biuf" and bool(all_finite(pair) and np.all(np.diff(pair) >= 0))
 
 

@@ -1,9 +1,10 @@
-"""Digests that tell one study from another, the same in every process: of numbers, texts, containers, scenes, and of functions by what they do.
+"""Digests that identify studies, equal in every process: of numbers, texts, containers, scenes and functions.
 
-A function counts by its code (byte code, constants, names), default arguments, what it closes over, and the globals that its code names, also in modules of
-the user; functions and classes of installed packages and of this one by their name, since their versions are kept beside, and, where a function made them for
-the user (as `jax.grad` does), by what they close over. So a changed function makes another study. Other
-objects count by their pickled content.
+A user's function enters by its code (byte code, constants, names), default arguments, closed-over values, and
+the globals that its code names, also in the user's modules. A function or class of an installed package or of
+this one enters by its name, since the study stores their versions. If it was made by a wrapper (as by
+`jax.grad`), its closed-over values enter too. So a changed function makes another study. Other objects enter
+by their pickled content.
 """
 
 import copyreg
@@ -40,7 +41,7 @@ def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int
         return "array", array.dtype.str, array.shape, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
     if _is_formula(x):
         return "formula", type(x).__qualname__, str(x)
-    # functions and classes that name others
+    # functions and classes that refer to each other
     if depth > 20 or id(x) in within:
         return "deeper", type(x).__qualname__
     if (id(x), depth) not in known:
@@ -82,8 +83,8 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Return whether it is an expression of SymPy. Such an expression is identified by its text, since its
-    symbols are numbered differently in every process.
+    """Return whether it is a SymPy expression. These are identified by their text, since SymPy numbers
+    symbols differently in every process.
     """
     sympy = sys.modules.get("sympy")
     return sympy is not None and isinstance(x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction)
@@ -95,7 +96,7 @@ def _pickled(x: object) -> object:
         return x.tolist()
     try:
         kept = copyreg.dispatch_table[type(x)](x) if type(x) in copyreg.dispatch_table else x.__reduce_ex__(4)
-    except Exception:  # an object's own methods may raise anything
+    except Exception:  # the methods of any object may raise anything
         return None
     return kept if isinstance(kept, str) else tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
 
@@ -107,8 +108,7 @@ def _function(f: FunctionType, of) -> object:
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the values that the code reads by name; for a user's module, also the attributes that it
-        uses.
+        """Return the content of a name's value; for a user's module, of the attributes that the code names.
         """
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)

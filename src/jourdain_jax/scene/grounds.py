@@ -1,10 +1,12 @@
-"""The grounds that bodies roll on: planes, cylinders, spheres, surfaces `f(x, y, z) = 0` and height maps, at rest or in rigid motion.
+"""The grounds that bodies roll on: planes, cylinders, spheres, surfaces `f(x, y, z) = 0` and height maps, at
+rest or in rigid motion.
 
     n = grad f/|grad f|     unit normal out of the ground, on the side of the bodies, where f > 0
-    n x p = t1, t2          two unit tangents: the directions of the no-slip rows
+    n x p = t1, t2          two unit tangents: the directions of the no-slip constraints
 
-A moving ground states its motion twice: its shape as a function of time, and `velocity` and `angular_velocity`, the rates of that and what
-moves within the ground itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
+A moving ground states its motion twice: its shape as a function of time, and `velocity` and
+`angular_velocity`. The latter are the rates of the shape plus motion within the ground (a belt, a turntable).
+Both must agree along the normal, which is checked when a scene is probed.
 """
 
 from abc import abstractmethod
@@ -39,41 +41,45 @@ class _Ground(eqx.Module):
     angular_velocity: Vector3  # rad/s
 
     def velocity_at(self, position: Vector) -> Vector3:
-        """Velocity (m/s, inertial frame) of the ground's material point at `position` (m, inertial frame)."""
+        """Return the velocity (m/s, inertial frame) of the ground's material point at `position` (m, inertial
+        frame).
+        """
         return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
     def _moves(self, what: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)) -> None:
-        """Take the motion, checked."""
+        """Store the motion, checked."""
         self.origin = checked_real(origin, f"origin of {what}", (3,))
         self.velocity = checked_real(velocity, f"velocity of {what}", (3,))
         self.angular_velocity = checked_real(angular_velocity, f"angular velocity of {what}", (3,))
 
     def _tangent(self, origin, normal, tangents) -> "Plane":
-        """Return a plane of known axes that moves with the ground."""
+        """Return a plane with the given axes that moves with the ground."""
         parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
         return eqx.tree_at(parts, Plane(), (origin, normal, tangents, self.velocity_at(origin), self.angular_velocity))
 
 
 class Plane(_Ground):
-    """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+    """A plane through `origin` (m), at rest or in rigid motion: the velocity of its point at p is `velocity +
+    angular_velocity x (p - origin)`.
 
-    `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt`: an angle (rad) about the y axis, so that positive tilt
-    slopes down along x, or a rotation matrix (3, 3), such as `jj.rot_x(0.1)`. `Plane(normal=n)`: the plane with this unit vector as normal, in place
-    of a tilt. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
+    `Plane(origin, tilt, velocity, angular_velocity)` is the plane z = 0, turned by `tilt`: an angle (rad)
+    about the y axis, so that positive tilt slopes down along x, or a rotation matrix (3, 3), such as
+    `jj.rot_x(0.1)`. `Plane(normal=n)` is the plane with this unit normal. `velocity` in m/s,
+    `angular_velocity` in rad/s; all vectors in the inertial frame.
 
-    The no-slip rows are along the rotated x and y axes. With `normal`, they are along the x and y axes after
-    the shortest rotation that takes z (or -z, if n points down) to n. If `along` is given too (any vector
-    that is not normal to the plane), they are along its projection onto the plane, and across it.
+    The no-slip constraints act along the rotated x and y axes. With `normal`, they act along the x and y axes
+    after the shortest rotation that takes z (or -z, if n points down) to n. `along`, any vector that is not
+    normal to the plane, chooses the directions: its projection onto the plane, and across it.
 
     A moving plane states its motion twice: by `origin` and `tilt` or `normal` as functions of time, and by
-    `velocity` and `angular_velocity`, which are their rates plus motion within the plane itself (a belt, a
-    turntable). Along the normal both must agree, which is checked when a scene is probed. Raises ValueError
-    for an `along` that is normal to the plane, and for both `tilt` and `normal`; for a normal that is not a
-    unit vector, when its scene is built.
+    `velocity` and `angular_velocity`. The latter are the rates of the former plus motion within the plane (a
+    belt, a turntable). Both must agree along the normal, which is checked when a scene is probed. Raises
+    ValueError for an `along` normal to the plane, and for both `tilt` and `normal`. A normal that is not a
+    unit vector is refused when the scene is built.
     """
 
     normal: Vector3  # unit vector, out of the ground
-    tangents: Tangents  # unit vectors along the no-slip rows
+    tangents: Tangents  # unit vectors along the no-slip constraints
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
         """Make the plane z = 0, rotated by `tilt` (rad, about y; or a rotation matrix), or the plane with
@@ -92,8 +98,8 @@ class Plane(_Ground):
 
     @property
     def axes(self) -> Matrix3:
-        """Return the rotation matrix with the two tangents and the normal as columns: from components in the
-        plane to the inertial frame.
+        """Return the rotation matrix from components in the plane to the inertial frame: its columns are the
+        two tangents and the normal.
         """
         return jnp.concatenate([self.tangents, self.normal[None]]).T
 
@@ -114,26 +120,27 @@ class Plane(_Ground):
 
 
 class _Round(_Ground):
-    """A ground at one distance from an axis or a centre."""
+    """A ground at a constant distance from an axis or a centre."""
 
     radius: Scalar  # m
     side: str = static()  # "inside" or "outside"
 
     @abstractmethod
     def arm_to(self, point: Vector) -> Vector3:
-        """Return the vector from the nearest point of the axis, or from the centre, to the `point` (m,
-        inertial frame).
+        """Return the vector to the `point` (m, inertial frame) from the nearest point of the axis, or from
+        the centre.
         """
 
     @abstractmethod
     def _tangents(self, normal: Vector3) -> Tangents:
-        """Unit vectors along the no-slip rows."""
+        """Return unit vectors along the no-slip constraints."""
 
     def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
-        """Take radius, side and motion, checked."""
+        """Store radius, side and motion, checked."""
         if side not in ("inside", "outside"):
-            raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies "
-                "are")
+            raise ValueError(
+                f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are"
+            )
         self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
         self._moves(what, **motion)
 
@@ -146,7 +153,7 @@ class _Round(_Ground):
         return -outward if self.side == "inside" else outward
 
     def plane_at(self, point: Vector) -> Plane:
-        """The tangent plane where the ground is nearest to the `point` (m, inertial frame)."""
+        """Return the tangent plane at the ground's point nearest to the `point` (m, inertial frame)."""
         arm = self.arm_to(point)
         out = arm / jnp.sqrt(arm @ arm)
         normal = -out if self.side == "inside" else out
@@ -154,12 +161,13 @@ class _Round(_Ground):
 
 
 class Cylinder(_Round):
-    """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector `axis`.
+    """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector
+    `axis`.
 
-    `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s): a drum that
-    turns has `angular_velocity = rate * axis`. All vectors in the inertial frame. The no-slip rows are along the axis and around it.
-    ValueError: a radius that is not positive, an unknown side; an axis that is not a unit vector, where its
-    scene is built.
+    `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin,
+    `angular_velocity` (rad/s): `rate * axis` for a turning drum. All vectors in the inertial frame. The
+    no-slip constraints act along the axis and around it. Raises ValueError for a radius that is not positive
+    or an unknown side. An axis that is not a unit vector is refused when the scene is built.
     """
 
     axis: Vector3  # unit vector
@@ -181,10 +189,11 @@ class Cylinder(_Round):
 
 
 class Sphere(_Round):
-    """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl) or "outside".
+    """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl) or
+    "outside".
 
-    `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s). All vectors in the inertial frame.
-    ValueError: a radius that is not positive, an unknown side.
+    `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s). All vectors in the
+    inertial frame. Raises ValueError for a radius that is not positive or an unknown side.
     """
 
     def __init__(self, radius, *, side: str, **motion: Unpack[RigidMotion]):
@@ -204,15 +213,16 @@ class Surface(_Ground):
     """The smooth surface `f(x, y, z) = 0`; f is positive on the side of the bodies.
 
     `f`: a function of three numbers (m, inertial frame) that returns one, twice differentiable by JAX, with a
-    nonzero gradient where bodies touch it. It may close over traced numbers, as for a moving surface: `lambda
+    nonzero gradient at points of contact. It may close over traced numbers, as for a moving surface: `lambda
     x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity`
-    (rad/s) describe a moving surface; all in the inertial frame. Raises ValueError for any other `f`.
+    (rad/s) describe the motion of the surface, all in the inertial frame. Raises ValueError for any other
+    `f`.
     """
 
     f: Callable = static()  # (x, y, z) -> number, positive on the side of the bodies
 
     def __init__(self, f, **motion: Unpack[RigidMotion]):
-        """The surface on which `f(x, y, z)` is zero; `motion`: of the ground."""
+        """Make the surface on which `f(x, y, z)` is zero; `motion`: of the ground."""
         self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
         self._moves("a surface", **motion)
 
@@ -233,15 +243,15 @@ class HeightMap(_Ground):
     """The surface `z = h(x, y)`, with the bodies above it.
 
     `h`: a function of two numbers (m, inertial frame) that returns one (m), twice differentiable by JAX.
-    `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity` (rad/s) describe a moving
-    surface; all in the inertial frame. The first no-slip row is along the projection of x onto the surface.
-    Raises ValueError for any other `h`.
+    `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity` (rad/s) describe the motion
+    of the surface, all in the inertial frame. The first no-slip constraint acts along the projection of x
+    onto the surface. Raises ValueError for any other `h`.
     """
 
     h: Callable = static()  # (x, y) -> height, m
 
     def __init__(self, h, **motion: Unpack[RigidMotion]):
-        """The surface of height `h(x, y)`; `motion`: of the ground."""
+        """Make the surface of height `h(x, y)`; `motion`: of the ground."""
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
         self._moves("a height map", **motion)
 
@@ -255,7 +265,7 @@ class HeightMap(_Ground):
         return z - self.height_at(x, y)
 
     def plane_at(self, point: Vector) -> Plane:
-        """Return the tangent plane at a `point` (m, inertial frame) of the surface; only its x and y are
+        """Return the tangent plane of the surface above or below a `point` (m, inertial frame); its z is not
         used.
         """
         x, y, _ = as_real(point)
@@ -275,16 +285,16 @@ Ground = Plane | Cylinder | Sphere | Surface | HeightMap
 
 
 def normal_at(ground: Ground, point: Vector3) -> Vector3:
-    """`grad f/|grad f|` at a point; NaN where the gradient vanishes."""
+    """Return `grad f/|grad f|` at a point; NaN where the gradient vanishes."""
     gradient = jnp.stack([jax.jvp(ground.value, (point,), (e,))[1] for e in jnp.eye(3, dtype=point.dtype)])
     return gradient / jnp.sqrt(gradient @ gradient)
 
 
 def tangents_of(n: Vector3) -> Tangents:
-    """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y
-    after the shortest rotation of z (or -z) to n.
+    """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: the x and y
+    axes after the shortest rotation of z (or -z) to n.
 
-    No field of tangents is continuous on a whole sphere. These change at n_z = 0, and with them the no-slip
+    No field of tangents is continuous on a whole sphere. These jump at n_z = 0, and with them the no-slip
     constraints, but not their solutions. Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
     """
     x, y, z = n
@@ -294,7 +304,7 @@ def tangents_of(n: Vector3) -> Tangents:
 
 
 def _turned(tilt) -> Matrix3:
-    """Columns: x, y and z, turned about y."""
+    """Return the axes x, y and z, turned about y, as columns."""
     advice = "give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)"
     tilt = checked_real(tilt, "tilt of a plane", advice=advice)
     return tilt if tilt.shape == (3, 3) else rot_y(checked_real(tilt, "tilt of a plane", (), advice=advice))
@@ -302,11 +312,12 @@ def _turned(tilt) -> Matrix3:
 
 def _tangents_along(n, along) -> Tangents:
     along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the "
-        "plane")
+                                                                   "plane")
     first = along - (n @ along) * n
     if not np.all(known_numbers((first @ first) / (along @ along)) > 1e-8):
-        raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another "
-            "vector")
+        raise ValueError(
+            "`along` of a plane is normal to it, expected a direction within it; give another vector"
+        )
     first = first / jnp.sqrt(first @ first)
     return jnp.stack([first, jnp.cross(n, first)])
 

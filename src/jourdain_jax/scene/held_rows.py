@@ -1,9 +1,10 @@
-"""Velocity rows that hold up to a force: friction in joints, and blades that may slip sideways.
+"""Velocity constraints that hold up to a maximum force: friction in joints, and blades that may slip
+sideways.
 
-    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        L: force along the row, N or N m
+    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        L: constraint force, N or N m
 
-A contact with friction whose normal force is one newton and whose coefficients of friction are the forces
-`F`: the modes, events and derivatives of contacts serve (`equations/switching.py`).
+Each is treated as a contact with friction whose normal force is one newton and whose coefficients of friction
+are the forces `F`. So it shares the modes, events and derivatives of contacts (`equations/switching.py`).
 """
 
 from typing import Any
@@ -20,7 +21,8 @@ from jourdain_jax.scene.names import check_names
 
 
 class HeldRow(eqx.Module):
-    """A velocity row, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m."""
+    """A velocity constraint, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m.
+    """
 
     w: Scalar
     friction: Coulomb
@@ -32,12 +34,12 @@ class HeldRow(eqx.Module):
 
     @property
     def slip(self) -> Float[Array, "2"]:
-        """Slip along the row; there is no second tangent."""
+        """Return the slip along the constraint; the second tangent is unused."""
         return jnp.stack([self.w, jnp.zeros_like(self.w)])
 
 
 class JointFriction(Load):
-    """Friction on speeds: the rows that hold, by name of the speed."""
+    """Friction on speeds: constraints that hold up to a force, by name of the speed."""
 
     rows: dict[str, HeldRow]
 
@@ -48,12 +50,12 @@ class JointFriction(Load):
 
 def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
     """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`. A speed at rest
-    stays at rest while that takes no more than this force; otherwise the force acts against the speed.
+    stays at rest while this needs at most the given force; otherwise the force opposes the speed.
 
-    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or
-      `jj.Coulomb(sliding, static)` with two forces.
+    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
+      static)` with two forces.
 
-    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` tells whether
+    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` returns whether
     it holds or slips. Raises ValueError for an unknown speed.
 
     **Examples**
@@ -66,7 +68,8 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the rows that hold up to a force, from the results of `velocity_constraints` and `loads`."""
+    """Return the constraints that hold up to a force, from the results of `velocity_constraints` and `loads`.
+    """
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}

@@ -1,9 +1,9 @@
-"""Results kept per scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
+"""Caches keyed by scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
 also by values.
 
-Reference parameters are numbers that replace parameters that JAX traces. Facts that hold at every
-state of a scene, such as rank and independent speeds, must be known before compilation. It is found by
-evaluating the scene at a few states, which takes numbers for its parameters.
+Reference parameters replace traced parameters by numbers. Facts that hold at every state of a scene, such as
+rank and independent speeds, must be known before compilation. They are found by evaluating the scene at a few
+states, with numbers for its parameters.
 """
 
 import sys
@@ -28,14 +28,15 @@ from jourdain_jax.scene.parameters import stacked_parameters
 def clear_caches() -> None:
     """Empty the caches of this package and of JAX, and free their memory.
 
-    Every scene is traced, probed and compiled again at its next use. Call this after a change of values in
-    helpers, modules or classes. Machine code stays: it depends on the text of its program only, and another
-    thread may be running it.
+    Every scene is traced, probed and compiled again at its next use. Call this after changing values in
+    helper functions, modules or classes. Machine code is kept: it depends only on the text of its program,
+    and another thread may be running it.
     """
     for name, module in list(sys.modules.items()):
         if name.startswith("jourdain_jax.") and ".native" not in name:
             for value in list(vars(module).values()):
-                if callable(value) and hasattr(value, "cache_clear"):  # no module: one that is imported on first use would be
+                # not for modules: this would trigger lazy imports
+                if callable(value) and hasattr(value, "cache_clear"):
                     value.cache_clear()
     jax.clear_caches()
 
@@ -44,7 +45,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
     """Decorate a function of a scene (and of further keys) to run once per class and values, on concrete
     parameters, even during tracing.
 
-    `of_traced`: a function that runs in its place, every time, for scenes with traced parameters.
+    `of_traced`: a function called instead, without caching, for scenes with traced parameters.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -68,7 +69,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
 
 
 class Values:
-    """A key of a scene by its class and the numbers of its leaves, for caches."""
+    """A hashable key of a scene: its class and the numbers of its leaves."""
 
     def __init__(self, leaves: list, treedef):
         self.leaves, self.structure = leaves, (treedef, jax.config.jax_enable_x64)
@@ -87,11 +88,12 @@ class Values:
         return self.key == other.key
 
 
-_latest: list[Values] = []  # a call asks about one scene several times; arrays of JAX never change, and are read for the first of them
+# one call looks up one scene several times; JAX arrays are immutable, so their numbers are read once
+_latest: list[Values] = []
 
 
 def _asked_about_before(leaves: list, treedef) -> Values | None:
-    """Return the latest scene, where these are the same objects."""
+    """Return the key of the latest scene if its leaves are these objects."""
     for known in _latest:
         if len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves)) and known.structure == (treedef, jax.config.jax_enable_x64):
             return known
@@ -105,10 +107,9 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Return a context in which numbers of `scene` replace traced parameters of its class, if they are known
-    in `scene`.
+    """Return a context in which known numbers of `scene` replace traced parameters of its class.
 
-    Parameters that are `varied` (names; None: all) are replaced by generic numbers near those of the scene.
+    Parameters that are `varied` (names; None: all) are replaced by generic numbers near the scene's.
     """
     token = _STAND_IN.set((scene, varied))
     try:
@@ -121,8 +122,8 @@ def with_reference_parameters(scene):
     """Return the scene with numbers in place of traced parameters: generic ones near the reference, the
     class's defaults, or one.
 
-    Generic numbers are used so that a default of zero (a tilt, a rate) does not hide a term, and two equal
-    defaults do not count as one length.
+    Generic numbers keep a default of zero (a tilt, a rate) from hiding a term, and two equal defaults from
+    counting as one length.
     """
     leaves, treedef = jax.tree.flatten(scene)
     unknown = [is_traced_type(type(x)) for x in leaves]
@@ -141,7 +142,7 @@ def with_reference_parameters(scene):
 
 
 def _defaults(scene) -> list:
-    """For every leaf of a scene the class's default for it, or None."""
+    """Return the class's default for every leaf of a scene, or None."""
     found: list = []
     for field in fields(scene):
         if field.metadata.get("static", False):
@@ -154,14 +155,15 @@ def _defaults(scene) -> list:
 
 
 def _generic(x, near, place: int) -> np.ndarray:
-    """Return numbers of the shape of x, near the given ones (or one), different for every `place`."""
+    """Return numbers of the shape of x near the given ones (or near one), different for every `place`."""
     draws = np.random.default_rng(place).uniform(size=np.shape(x))
     try:
         near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
-    except (TypeError, ValueError):  # no numbers, or as many of them as do not fit
+    except (TypeError, ValueError):  # not numbers, or a shape that does not fit
         near = np.full(np.shape(x), np.nan)
     if not all_finite(near):
-        return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)  # knots of a table increase
+        # sample points of a table increase
+        return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)
     if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
         steps = np.diff(near, append=2 * near[-1] - near[-2])
         return np.asarray(near + 0.01 * draws * steps, x.dtype)
@@ -169,13 +171,13 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return numbers that differ from the given ones by the fractions `change`, which have the same shape
-    after any leading axes. Each zero is replaced by `zero`.
+    """Return the given numbers changed by the fractions `change`, which have the same shape after any leading
+    axes. Each zero is replaced by `zero`.
 
-    A tensor of inertia becomes that of the body stretched, sheared and rotated, since separately changed
+    An inertia tensor becomes the tensor of the body stretched, sheared and rotated, since separately changed
     entries may belong to no body:
 
-    S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
+        S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
     """
     given = np.asarray(given)
     if not _is_inertia(given):
@@ -190,7 +192,7 @@ def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _is_inertia(x: np.ndarray) -> bool:
-    """Return whether numbers can be a tensor of inertia and are not a rotation matrix. The tolerance is one
+    """Return whether the array may be an inertia tensor and is not a rotation matrix. The tolerance is one
     per cent, the accuracy of published moments.
     """
     if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
@@ -205,7 +207,7 @@ def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     `most`: the number of stored results.
     """
     known: dict = {}
-    keeping = Lock()  # threads may ask at the same time; they may work the same out
+    keeping = Lock()  # two threads may compute the same result
 
     @wraps(describe)
     def of(scene, *case: Hashable):
@@ -228,7 +230,7 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Return a context that uses stored results of these functions, by their name and the first part of the
+    """Return a context that uses stored results of these functions, keyed by function name and first further
     key.
     """
     token = _BEFORE.set(found)

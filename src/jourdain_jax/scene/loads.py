@@ -1,8 +1,8 @@
 """Impressed forces: known functions of time, state and parameters, as resultants on bodies or on speeds.
 
-A load acts on the mass centres (`forces`), as torques (`torques`), or directly on generalized speeds (`generalized`). Its
-virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a `potential` is conservative, and its energy counts in V;
-the work of the others is integrated along the motion.
+A load acts on the mass centres (`forces`), as torques (`torques`), or directly on generalized speeds
+(`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a `potential`
+is conservative and counts in the potential energy V; the work of the others is integrated along the motion.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ class Load(eqx.Module):
     - `forces`: body -> (3,) in N, inertial frame, at the mass centre; `torques`: body -> (3,) in N m,
       inertial frame, about the mass centre.
     - `generalized`: speed -> force on it, in N or N m.
-    - `potential` in J, with the forces as its gradient (`verify` checks this); None: not conservative, so
-      that its work is integrated along the motion.
+    - `potential` in J, whose negative gradient is the force (`verify` checks this). None: not conservative,
+      and its work is integrated along the motion.
     """
 
     forces: dict[str, Vector3]  # N, inertial frame, at the mass centre
@@ -38,7 +38,7 @@ class Load(eqx.Module):
 
 
 class Gravity(Load):
-    """The load of `gravity`; its `direction` is checked when a scene is probed."""
+    """Uniform gravity with its `direction`, which is checked when a scene is probed."""
 
     direction: Vector3
 
@@ -57,7 +57,8 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
 def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) -> Load:
     """Return uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
-    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length, where its scene is built.
+    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. A direction of another length
+    is refused when the scene is built.
     """
     motion = _motion(motion, "gravity")
     e = checked_real(direction, "direction of gravity", (3,), advice="give a unit vector")
@@ -68,18 +69,18 @@ def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) ->
 
 
 def point_force(point: Point, force: Any) -> Load:
-    """Return a `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no
-    potential.
+    """Return the load of a `force` (3,) (N, inertial frame) on a `point` of a body,
+    `motion["body"].point(local)`; no potential.
     """
     point = _as_point(point, "point of a force")
     return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"))
 
 
 def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = None) -> Load:
-    """Return a torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, with the opposite torque
-    on `reaction` if that body is named.
+    """Return a torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, and the opposite torque
+    on the body `reaction`, if given.
 
-    No potential. ValueError for an unknown body.
+    No potential. Raises ValueError for an unknown body.
     """
     motion = _motion(motion, "torque")
     moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial "
@@ -97,7 +98,7 @@ def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
     apart, length, direction = _line(a, b, "spring")
     stiffness, rest_length = checked_real(stiffness, "stiffness of a spring", ()), checked_real(rest_length, "rest length of a spring", ())
     extension = length - rest_length
-    # k (l - l0) e, written so that a spring of no natural length is smooth where its ends meet
+    # k (l - l0) e, written so that a spring of zero rest length is smooth where its ends meet
     pull = stiffness * (apart - rest_length * direction)
     return _between(a, b, pull, 0.5 * stiffness * extension**2)
 
@@ -116,7 +117,7 @@ def generalized_force(motion: Motion, **forces: Any) -> Load:
     """Return forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`;
     no potential.
 
-    `forces`: speed -> force, in N or N m. ValueError for an unknown speed.
+    `forces`: speed -> force, in N or N m. Raises ValueError for an unknown speed.
     """
     motion = _motion(motion, "generalized_force")
     check_names(forces, motion.u.keys(), "generalized force on unknown speed `{}`")
@@ -149,8 +150,8 @@ def _on_point(point: Point, force) -> Load:
 
 
 def _between(a: Point, b: Point, pull, potential) -> Load:
-    """`pull` acts on `a` towards `b`, and its opposite on `b`."""
+    """Return the load of the force `pull` on `a` towards `b` and the opposite force on `b`."""
     if a.body is not None and a.body == b.body:
-        return Load(potential=potential)  # an internal force of one rigid body does no virtual power
+        return Load(potential=potential)  # internal forces of a rigid body do no virtual power
     first, second = _on_point(a, pull), _on_point(b, -pull)
     return Load(first.forces | second.forces, first.torques | second.torques, {}, potential)

@@ -1,10 +1,10 @@
-"""Modes, inputs switched by events of the motion, and events at which a motion continues, possibly with a
-jump of the state.
+"""Modes, which are inputs switched by events, and events at which the motion continues, possibly with a jump
+of the state.
 
     t_e:  c(t, q, u) falls through zero      (q, u) <- R(t, q, u),   mode <- another one
 
-Between events a mode is a constant number: the place of its value in the list that the scene gives. Source of the derivatives:
-`motion/native/transitions.py`.
+Between events a mode is a constant number: the index of its value in the scene's list. Source of the
+derivatives: `motion/native/transitions.py`.
 """
 
 from collections.abc import Mapping
@@ -18,23 +18,23 @@ from jourdain_jax.scene.names import Labels, check_name, nearest
 
 @dataclass(frozen=True)
 class Modes:
-    """Names of modes, and of the values of each."""
+    """Names of modes, and of the values of each mode."""
 
     pairs: tuple[tuple[str, Labels], ...] = ()
 
     @property
     def values(self) -> dict[str, Labels]:
-        """Mode -> names of its values."""
+        """Return a dictionary: mode -> names of its values."""
         return dict(self.pairs)
 
     @property
     def names(self) -> Labels:
-        """The modes, in order."""
+        """Return the modes, in order."""
         return tuple(name for name, _ in self.pairs)
 
     def number(self, name: str, value, where: str):
-        """Return the number of a mode's value from its name or number. Raises ValueError if there is none.
-        `where`: the origin of the value.
+        """Return the number of a mode's value, given by name or number. Raises ValueError if there is none.
+        `where`: the origin of the value, for the message.
         """
         names = self.values[name]
         if isinstance(value, str):
@@ -47,16 +47,16 @@ class Modes:
 
 
 def modes(**values) -> Modes:
-    """Declare modes: name -> names of its values; a motion begins with the first.
+    """Declare modes: name -> names of its values. A motion starts with the first value.
 
-    `motion.modes.name` is the number of the value: constant between events, and switched by `jj.Event(..., to={name: value})`.
-    `inputs={name: value}` begins a motion in another one.
+    `motion.modes.name` is the number of the value: constant between events, and switched by `jj.Event(...,
+    to={name: value})`. `inputs={name: value}` starts a motion with another value.
 
     **Examples**
 
         modes = jj.modes(gear=("first", "second"))
 
-    **Raises** ValueError for fewer than two values, or values that are no texts.
+    **Raises** ValueError for fewer than two values, or values that are not texts.
     """
     for name, of_mode in values.items():
         if isinstance(of_mode, str) or not all(isinstance(value, str) for value in of_mode) or len(set(of_mode)) < 2:
@@ -67,13 +67,13 @@ def modes(**values) -> Modes:
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a scene at which the motion continues. `events` returns it in place of a plain value.
+    """An event at which the motion continues. `events` returns it in place of a plain value.
 
-    - `value`: the event happens where it falls through zero.
-    - `to`: mode -> its value afterwards, by name.
-    - `jump`: coordinate or speed -> its value afterwards; all others keep theirs. Named speeds must satisfy
-      the velocity rows.
-    - `stop`: whether the motion ends here, as it does at a plain value.
+    - `value`: the event occurs where it falls through zero.
+    - `to`: mode -> name of its value afterwards.
+    - `jump`: coordinate or speed -> its value afterwards; all others keep theirs. The new state must satisfy
+      the velocity constraints.
+    - `stop`: whether the motion ends here, as at a plain value.
 
     **Examples**
 

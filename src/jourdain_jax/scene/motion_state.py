@@ -1,7 +1,8 @@
-"""The arguments of a scene's methods: poses, and poses with velocities, of all bodies at one instant.
+"""The arguments of a scene's methods: poses, or poses with velocities, of all bodies at one instant.
 
-`Pose` (t, q, bodies) is given to geometric constraints and contacts; `Motion` adds `u`, `qdot`, inputs and velocities and is given to
-loads, velocity constraints and events. Velocities are those of the mass centres and angular velocities in space components.
+`Pose` (t, q, bodies) is the argument of geometric constraints and contacts. `Motion` adds `u`, `qdot`, inputs
+and velocities, and is the argument of loads, velocity constraints and events. Velocities refer to the mass
+centres, angular velocities are in space components.
 """
 
 from typing import Any
@@ -36,24 +37,24 @@ def fixed_point(position: Any) -> Point:
 
 
 class BodyPose(eqx.Module):
-    """One body's pose."""
+    """Pose of one body."""
 
     name: str = static()
     body: Body
 
     @property
     def mass(self) -> Float[Array, "*times"]:
-        """Mass in kg."""
+        """Return the mass in kg."""
         return self.body.mass
 
     @property
     def position(self) -> Vectors:
-        """Position of the mass centre, m, inertial frame."""
+        """Return the position of the mass centre, m, inertial frame."""
         return self.body.position
 
     @property
     def orientation(self) -> Float[Array, "*times 3 3"]:
-        """Rotation matrix, body to space; the identity for a particle."""
+        """Return the rotation matrix, body to space; the identity for a particle."""
         if isinstance(self.body, RigidBody):
             return self.body.orientation
         return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
@@ -68,7 +69,7 @@ class BodyPose(eqx.Module):
 
 
 class BodyMotion(eqx.Module):
-    """One body's pose and velocity."""
+    """Pose and velocity of one body."""
 
     name: str = static()
     body: Body
@@ -82,14 +83,14 @@ class BodyMotion(eqx.Module):
 
     @property
     def angular_velocity_body(self) -> Vectors:
-        """Angular velocity in body components, rad/s."""
+        """Return the angular velocity in body components, rad/s."""
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
     def velocity_at(self, position) -> Vectors:
         """Return the velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame):
         `v + omega x (position - r)`.
 
-        `position`: three components, or along a motion three at each time.
+        `position`: three components, or three at each time of a motion.
         """
         where, advice = f"point of body `{self.name}`", "give three components in the inertial frame, m"
         position = checked_real(position, where, advice=advice)
@@ -102,7 +103,7 @@ class BodyMotion(eqx.Module):
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
     def rate_of_pose(self) -> BodyPose:
-        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`; mass and inertia do not change.
+        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`, with constant mass and inertia.
         """
         rate = eqx.tree_at(lambda b: b.position, jax.tree.map(jnp.zeros_like, self.body), self.velocity)
         if isinstance(rate, RigidBody):
@@ -142,11 +143,11 @@ class Motion(eqx.Module):
 
     @property
     def modes(self) -> Named:
-        """The modes, numbers of their values: inputs that events switch."""
+        """Return the inputs under the name used for modes; each mode is the number of its value."""
         return self.inputs
 
     def pose(self) -> Pose:
-        """Time, coordinates and the poses of all bodies, without velocities."""
+        """Return time, coordinates and the poses of all bodies, without velocities."""
         return Pose(self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()})
 
 

@@ -1,4 +1,4 @@
-"""Named access to flat arrays, and error texts with the valid and the nearest names."""
+"""Named access to flat arrays, and error messages that list the valid and the nearest names."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 Labels = tuple[str, ...]
-Sentences = tuple[str, ...]  # for a reader
+Sentences = tuple[str, ...]  # messages to the user
 
 
 class UnknownNameError(KeyError):
@@ -32,7 +32,7 @@ def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception
 
 
 def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
-    """Check each of several names; `{}` in `what` stands for it."""
+    """Check each of several names. `{}` in `what` is replaced by the name."""
     for name in names:
         check_name(name, valid, what.replace("{}", str(name)), error)
 
@@ -45,12 +45,14 @@ def as_names(names: "str | Iterable[str]") -> Labels:
 
 
 def as_labels(labels: "str | Iterable[str]") -> Labels:
-    """Return names of another tool as a tuple. They may contain blanks, so a single text is one name."""
+    """Return names of another tool as a tuple. A text counts as one name, since such names may contain
+    blanks.
+    """
     return (labels,) if isinstance(labels, str) else as_names(labels)
 
 
 class Named(eqx.Module):
-    """A flat array whose entries, or runs of entries, are reached by name: `q.yaw`, `q["yaw"]`, `q.array`."""
+    """A flat array with access by name to entries and groups of entries: `q.yaw`, `q["yaw"]`, `q.array`."""
 
     array: Float[Array, "*shape"]
     slots: tuple[tuple[str, int, int], ...] = eqx.field(static=True)  # name, first entry, length (0 for a scalar)
@@ -60,8 +62,10 @@ class Named(eqx.Module):
             if slot == name:
                 return self.array[..., first] if length == 0 else self.array[..., first : first + length]
         if not isinstance(name, str):
-            raise TypeError(f"`{name}` was given, but entries are accessed by name; write `q.yaw`, "
-                "`q['yaw']`, or `q.array[0]` for the first of all")
+            raise TypeError(
+                f"`{name}` was given, but entries are accessed by name; write `q.yaw` or `q['yaw']`, or "
+                "`q.array[0]` for the first entry"
+            )
         raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):

@@ -1,16 +1,16 @@
 """Names that methods read from outside their arguments.
 
-As everywhere in JAX, a method is traced once, and what it reads that is not a field of the scene is a
-constant of the trace: a part of the structure of the
-scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
-functions that a method loads itself:
+As everywhere in JAX, a method is traced once, and values that are not fields of the scene become constants of
+the trace. They belong to the structure of the scene, and are compared at each call. Tracked are the members
+of the class, and the global names and variables of enclosing functions that a method loads itself:
 
-- numbers, texts and tuples of them are compared by type and value, functions by their identity and that of
-  their code, so that `g = 1.62` in the next cell of a notebook is noticed, and what `%autoreload` does;
-- modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
-- arrays, containers and objects with state are refused by name: what changes in them could not be seen.
+- numbers, texts and tuples of them are compared by type and value, functions by the identity of the function
+  and of its code. So `g = 1.62` in a later cell of a notebook, or `%autoreload`, takes effect;
+- modules, classes and their attributes are constants, and so are functions wrapped by Python, JAX or another
+  package, by identity;
+- arrays, containers and objects with state raise an error, since their changes could not be noticed.
 
-Values read by helper functions are not tracked. `clear_caches` makes every scene be traced again.
+Values read by helper functions are not tracked. After `clear_caches` every scene is traced again.
 """
 
 import dis
@@ -40,7 +40,7 @@ _CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_cu
 
 
 class StatefulError(ValueError):
-    """A name stands for something whose changes cannot be seen."""
+    """Error for a name of an object whose changes cannot be noticed."""
 
 
 class NamesRead:
@@ -58,7 +58,7 @@ class NamesRead:
 
     def now(self) -> tuple["NamesRead", int]:
         """Return the names with their present values, and a version number; equal contents have equal
-        numbers. Raises ValueError where a name now refers to an object with state.
+        numbers. Raises ValueError if a name now refers to an object with state.
         """
         found = [x for look in self._looks for x in look()]
         if len(found) != len(self._seen) or not all(map(is_, found, self._seen)):
@@ -89,7 +89,8 @@ class NamesRead:
         seen = [x for look in looks for x in look()]
         content.append(tuple(map(_Same, looks[-1]())))
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
-        self._looks, self._seen = looks, seen  # last: what is refused now is refused at the next call, too
+        # last, so that a value that raises here raises again at the next call
+        self._looks, self._seen = looks, seen
 
 
 jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: now[0])
@@ -97,25 +98,25 @@ jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lam
 
 @lru_cache(maxsize=1024)
 def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
-    """Return the names that the methods of classes, and functions, read. Raises ValueError where a name in a
-    method refers to an array, a container or an object with state; in a function such an object is a
+    """Return the names that functions, and the methods of classes, read. Raises ValueError for a name in a
+    method that refers to an array, a container or an object with state. In a function such an object is a
     constant, unless `strict`.
     """
     return NamesRead(roots, strict)
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """Return present values of the names that a function reads. Return None if one of them has state, or if
-    it is no function: its trace cannot be stored.
+    """Return the present values of the names that a function reads. None if its trace cannot be stored: one
+    of the values has state, or the argument is no function.
     """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
-    except (StatefulError, TypeError):  # the second: it cannot be hashed
+    except (StatefulError, TypeError):  # TypeError: the function is not hashable
         return None
 
 
 def is_function(x) -> bool:
-    """Return whether it is a function that may read values, and not a module that holds numbers."""
+    """Return whether it is a function that may read values, rather than a module with numbers."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(_attribute(x, "__wrapped__"))
 
 
@@ -136,14 +137,14 @@ def functions_in(member) -> list[FunctionType]:
     while member is not None and not isinstance(member, type):
         if isinstance(member, FunctionType) and (member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")):
             found.append(member)
-        names = ("__wrapped__", "__func__", "func", "method")  # the last: as Equinox holds methods
+        names = ("__wrapped__", "__func__", "func", "method")  # Equinox stores methods as `method`
         member = next((inner for name in names if callable(inner := _attribute(member, name))), None)
     return found
 
 
 def _attribute(x, name: str):
-    """Return an attribute, or None if reading it fails. An object's own `__getattr__` may raise any error,
-    and so may a variable that is not yet set.
+    """Return an attribute, or None if reading it fails: an object's `__getattr__` may raise any error, and so
+    may an unset variable.
     """
     try:
         return getattr(x, name, None)
@@ -155,7 +156,8 @@ def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[str], Any]], ...]
     """Return the names that a function itself loads, each set with a function that reads one: globals, and
     variables of enclosing functions (None if not yet set).
     """
-    written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
+    # such as a counter of calls
+    written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
     cells = {name: cell for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True) if name not in written}
     return (own, f.__globals__.get), (tuple(cells), lambda name: _attribute(cells[name], "cell_contents"))
@@ -163,7 +165,7 @@ def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[str], Any]], ...]
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]:
-    """Return names used by code (by some instructions only, if given), including attributes and inner
+    """Return the names used by code, or by the given instructions only, including attributes and inner
     functions.
     """
     own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
@@ -171,7 +173,7 @@ def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]
 
 
 class _Same:
-    """An object that is compared by identity, and kept."""
+    """A reference to an object, compared by identity."""
 
     def __init__(self, x):
         self.x = x
@@ -184,15 +186,18 @@ class _Same:
 
 
 def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
-    """Return the key of a name's value. A value with state has its identity as key; if `where` is given,
-    raise StatefulError instead.
+    """Return the key of a name's value. The key of a value with state is its identity; if `where` is given,
+    raises StatefulError instead.
     """
     try:
         return key(x)
     except StatefulError:
         if not where:
             return _Same(x)
-    what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without being noticed"
+    what = (
+        f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without "
+        "being noticed"
+    )
     raise StatefulError(
         f"{where} reads `{name}`, "
         f"{'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
@@ -237,4 +242,5 @@ def _is_constant(x: Any) -> bool:
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":
         return True
-    return callable(_attribute(x, "__wrapped__")) and is_installed(type(x).__module__)  # a user's own class of wrappers may have state
+    # a user's wrapper class may have state
+    return callable(_attribute(x, "__wrapped__")) and is_installed(type(x).__module__)

@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, all_finite, as_real, described, ha
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array. Values that cannot be converted stay unchanged; they are
-    refused later, when the name of the field is known.
+    """Return a parameter as a floating-point array. Values that cannot be converted stay unchanged;
+    `check_parameters`, which knows the field's name, refuses them.
     """
     try:
         return as_real(value)
@@ -23,11 +23,12 @@ def _as_leaf(value):
 
 
 def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = "") -> Any:
-    """Declare a field of a scene as a physical parameter. It is converted to a floating-point array, and
-    derivatives with respect to it exist.
+    """Declare a field of a scene as a physical parameter. It is converted to a floating-point array and is
+    differentiable.
 
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
-    - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
+    - `positive`, `non_negative`: raise ValueError for other signs when a scene is made with known values.
+      Numbers that are not finite are always refused.
     """
     options = {} if default is ... else {"default": default} if np.ndim(default) == 0 else {"default_factory": lambda: default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
@@ -35,15 +36,15 @@ def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non
 
 
 def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
-    """Name, value and metadata (unit, ...) of every parameter of a scene."""
+    """Yield name, value and metadata (unit, ...) of every parameter of a scene."""
     for name, field in scene.__dataclass_fields__.items():
         if field.metadata.get("parameter"):
             yield name, getattr(scene, name), dict(field.metadata)
 
 
 def parameter_faults(scene) -> dict[str, Flag]:
-    """Return for each parameter whether it is not finite or has the wrong sign. It works under jit and vmap,
-    where nothing can be raised.
+    """Return for each parameter whether it is not finite or has the wrong sign. Unlike `check_parameters`,
+    works under jit and vmap.
     """
     faults = {}
     for name, value, metadata in parameters_of(scene):
@@ -55,8 +56,8 @@ def parameter_faults(scene) -> dict[str, Flag]:
 
 
 def check_parameters(scene) -> None:
-    """Raise ValueError with the name of a parameter that is not finite or has the wrong sign; traced values
-    are not checked.
+    """Raise ValueError for a parameter that is not finite or has the wrong sign. Traced values are not
+    checked.
     """
     for name, value, metadata in parameters_of(scene):
         where = f"parameter `{name}` of `{type(scene).__name__}`"
@@ -78,8 +79,8 @@ def check_parameters(scene) -> None:
 
 
 def stacked_parameters(scene) -> str:
-    """Return the names of parameters of a scene that have one axis more than their defaults, as in a batch of
-    scenes; empty if there are none.
+    """Return a sentence on parameters with one axis more than their defaults, as in a batch of scenes; empty
+    if there are none.
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}
@@ -87,9 +88,8 @@ def stacked_parameters(scene) -> str:
     if not many:
         return ""
     return (
-        f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than by "
-        "default; for many scenes at once use `jax.vmap` over them, or `rollout` with `parameters={name: "
-        "values}`"
+        f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than the "
+        f"default; for many scenes use `jax.vmap`, or `rollout` with `parameters={name: values}`"
     )
 
 

@@ -3,9 +3,10 @@ moment at most the sum of the other two.
 
     I = tr(S) 1 - S,      S = A A'       A = [exp(d1) s12 s13; 0 exp(d2) s23; 0 0 exp(d3)]
 
-S is the second moment of the mass about the mass centre, positive definite for every body that is not flat; A is its Cholesky factor, upper triangular. It is
-the block of the pseudo-inertia of a body about its mass centre; mass and mass centre do not enter it, and have ranges of their own.
-Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022) 2700, eqs. (10)-(13).
+S is the second moment of the mass about the mass centre, positive definite for every body that is not flat; A
+is its Cholesky factor, upper triangular. It is the block of the body's pseudo-inertia about the mass centre,
+independent of mass and mass centre. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters
+7 (2022) 2700, eqs. (10)-(13).
 """
 
 import jax.numpy as jnp
@@ -16,12 +17,12 @@ from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, la
 
 
 def inertia_from_log_cholesky(numbers) -> Matrix3:
-    """Return an inertia matrix (3, 3) about the mass centre, in kg m^2. It is physically possible whatever
-    the numbers are.
+    """Return an inertia matrix (3, 3) about the mass centre, in kg m^2, that is physically possible for all
+    `numbers`.
 
     **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13): d are the logarithms of the diagonal entries of a
-    triangular factor, s its other entries; the entries are in sqrt(kg) m. For a body that is symmetric about
-    its x-z plane, where Ixy = Iyz = 0: (d1, d2, d3, s13).
+    triangular factor, s its other entries, in sqrt(kg) m. For a body that is symmetric about its x-z plane,
+    where Ixy = Iyz = 0: (d1, d2, d3, s13).
 
         class Frame(jj.Scene):
             inertia: jax.Array = jj.parameter(jj.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit
@@ -51,8 +52,8 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
     three principal moments, kg m^2, about the mass centre.
 
     `symmetric`: return four numbers, for a body that is symmetric about its x-z plane. **Raises** ValueError
-    for another shape, a matrix that is not symmetric, nonzero Ixy or Iyz despite `symmetric`, and for moments
-    that no body with a thickness has; traced matrices give NaN there instead.
+    for another shape, an asymmetric matrix, nonzero Ixy or Iyz with `symmetric`, and moments that no body of
+    nonzero thickness has. Traced matrices give NaN instead.
     """
     I = checked_real(inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal "
         "moments, kg m^2")
@@ -63,7 +64,7 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
     S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
     if known_numbers(I).size:
         _check(np.asarray(I), np.asarray(S), symmetric)
-    # from the last row up, since A is upper triangular: that of S with its rows and columns the other way round
+    # A is upper triangular: the lower factor of S with reversed rows and columns, reversed back
     A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
     d = jnp.log(jnp.diag(A))
     return jnp.concatenate([d, A[0, 2:] if symmetric else jnp.stack([A[0, 1], A[1, 2], A[0, 2]])])
@@ -78,7 +79,7 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
             "`symmetric` excludes them; omit `symmetric`")
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
-            f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 "
-            "(`inertia` of `log_cholesky`): each must be positive, and less than the sum of the other two; "
-            "for a flat body, give the largest a little less than that sum"
+            f"no body of nonzero thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg "
+            "m^2 (`inertia` of `log_cholesky`): each must be positive and less than the sum of the other "
+            "two; for a flat body, reduce the largest slightly"
         )

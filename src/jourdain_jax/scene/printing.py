@@ -1,4 +1,6 @@
-"""Text of results in a console and in a notebook, with shapes in place of traced values; tables and matrices as text."""
+"""Text of results in a console and in a notebook, with shapes in place of traced values; tables and matrices
+as text.
+"""
 
 import dataclasses
 import html
@@ -24,7 +26,7 @@ class Printed:
         return f"<pre>{html.escape(str(self))}</pre>" + ("" if is_traced(self) else self._picture())
 
     def _picture(self) -> str:
-        """Return HTML below the text in a notebook."""
+        """Return HTML shown below the text in a notebook."""
         return ""
 
     def _text(self) -> str:
@@ -35,14 +37,14 @@ _picture: Callable = lambda scene: ""  # noqa: E731
 
 
 def show_scenes_with(picture: Callable) -> None:
-    """Have notebooks also show the HTML of `picture(scene)`, a function of a higher layer."""
+    """Show the HTML of `picture(scene)` in notebooks; a higher layer sets this function."""
     global _picture
     _picture = picture
 
 
 def scene_text(scene) -> str:
     """Return a scene as its constructor call: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; large
-    fields are described.
+    arrays by their shape.
     """
     shown = []
     for field in (field for field in dataclasses.fields(scene) if field.repr):
@@ -57,8 +59,8 @@ def scene_text(scene) -> str:
 
 
 def scene_html(scene) -> str:
-    """Return a scene for a notebook: parameters with values and units, names of coordinates, speeds and
-    inputs; a picture at its example start.
+    """Return HTML of a scene for a notebook: parameters with values and units, names of coordinates, speeds
+    and inputs, and a picture at its example start.
     """
     left = "style='text-align:left'"
     cell = lambda text: f"<td {left}>{html.escape(text)}</td>"  # noqa: E731
@@ -88,7 +90,7 @@ def in_digits(values) -> list[str]:
 
 
 def shapes_of(result) -> str:
-    """Return the description of a result whose numbers are unknown."""
+    """Return the description of a result with traced numbers."""
     shapes = [tuple(leaf.shape) for leaf in jax.tree.leaves(result) if hasattr(leaf, "shape")]
     largest = max(shapes, key=lambda shape: (len(shape), shape), default=())
     name = type(result).__name__
@@ -96,13 +98,13 @@ def shapes_of(result) -> str:
 
 
 def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return lines with the cells of all rows in columns, indented by two blanks."""
+    """Return the rows as lines with aligned columns, indented by two blanks."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
-    """Return a matrix under the names of its columns."""
+    """Return lines of a matrix with names of its rows and columns."""
     shape, digits = np.shape(values), in_digits(np.ravel(values))
     return table([(name, *column_names), *((row, *digits[k * shape[1] : (k + 1) * shape[1]]) for k, row in enumerate(row_names))])
 

@@ -1,6 +1,6 @@
-"""The scene: a module whose fields are physical parameters and whose methods describe, in plain JAX, bodies,
-loads and constraints. Velocities, partial velocities, mass matrix and constraint rows follow by automatic
-differentiation.
+"""The scene: a module whose fields are physical parameters and whose methods describe bodies, loads and
+constraints in plain JAX. Velocities, partial velocities, the mass matrix and the constraint rows follow by
+automatic differentiation.
 """
 
 import inspect
@@ -36,22 +36,25 @@ class Scene(eqx.Module):
     needs.
 
     Class attributes (or properties, where they depend on a static field such as a number of bodies)
+
     - `coordinates`: names, from `jj.coordinates(...)` (required).
-    - `speeds`: names of user-defined quasi-velocities, from `jj.speeds(...)`; then also define `coordinate_rates`.
+    - `speeds`: names of user-defined quasi-velocities, from `jj.speeds(...)`; then also define
+      `coordinate_rates`.
     - `inputs`: names of inputs, from `jj.inputs(...)`; `motion.inputs.name` in the methods.
-    - `modes`: names of modes and of their values, from `jj.modes(...)`: inputs that events switch; `motion.modes.name` in the methods.
-    - `privileged`: names of the independent speeds, where the user wants to choose them; otherwise the engine does.
-    - `domain`: coordinate or speed name -> (low, high), where states may be sampled for probing and tests; default (-3.2, 3.2)
-      for coordinates, (-1, 1) for speeds.
-    - `conventions`: one text: axes, signs, frames.
+    - `modes`: modes and their values, from `jj.modes(...)`: inputs that events switch; `motion.modes.name` in
+      the methods.
+    - `privileged`: names of the independent speeds; chosen by the engine if not given.
+    - `domain`: coordinate or speed name -> (low, high), the range of states sampled for probing and tests;
+      default (-3.2, 3.2) for coordinates, (-1, 1) for speeds.
+    - `conventions`: one text on axes, signs and frames.
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
-    Methods are traced once, as everywhere in JAX: values from outside the fields of the scene are constants.
-    Numbers, texts, tuples of them and functions that a method itself reads, as global names or as variables
-    of an enclosing function, may change: the next call notices it, as it notices a replaced method and code
-    changed by `%autoreload`. Arrays, lists, dictionaries and objects with state are refused by name: make
-    them parameters or static fields. Changes of values that helper functions read, of attributes of modules
-    and classes, and of files are not noticed: call `jj.clear_caches()` after them.
+    As everywhere in JAX, methods are traced once, and values from outside the fields of the scene become
+    constants. Some may change: numbers, texts, tuples of them, and functions that a method itself reads as
+    global names or as variables of an enclosing function. The next call notices the change, as it notices a
+    replaced method or code changed by `%autoreload`. Arrays, lists, dictionaries and objects with state raise
+    an error; make them parameters or static fields. Call `jj.clear_caches()` after other changes: values that
+    helper functions read, attributes of modules and classes, and files.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -63,13 +66,12 @@ class Scene(eqx.Module):
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
-    _may_switch: ClassVar[bool] = False  # whether contacts may have friction, as the methods say
-    _read: NamesRead = eqx.field(init=False, repr=False)  # a change of what they stand for makes another scene
-    switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts that have friction
+    _may_switch: ClassVar[bool] = False  # whether the methods mention friction
+    _read: NamesRead = eqx.field(init=False, repr=False)  # a change of these values makes another scene
+    switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts with friction
 
     def __init_subclass__(cls, **options):
-        """Check the names that the methods read. Raises ValueError where one refers to an object with state.
-        """
+        """Check the names that the methods read. Raises ValueError for a name of an object with state."""
         super().__init_subclass__(**options)
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
             modes = dict(cls.modes.pairs)
@@ -82,10 +84,10 @@ class Scene(eqx.Module):
         _names_read(cls)
 
     def __new__(cls, *args, **kwargs):
-        """Before any field is set: the arguments are parameters of the scene."""
+        """Check that the arguments are parameters of the scene, before any field is set."""
         checked_arguments(cls, kwargs)
         scene = super().__new__(cls)
-        object.__setattr__(scene, "_read", _names_read(cls))  # functions in fields come to it when they are known
+        object.__setattr__(scene, "_read", _names_read(cls))  # `hold_leaves` adds the functions in fields
         object.__setattr__(scene, "switching", NONE_SWITCHES)
         return scene
 
@@ -100,7 +102,7 @@ class Scene(eqx.Module):
             object.__setattr__(self, "switching", switching_of(self))
 
     def bodies(self, t: Scalar, q: Named) -> Mapping[str, Body]:
-        """Return poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial
+        """Return the poses of all bodies by name, at time t (s) and coordinates q (`q.name`), in the inertial
         frame. Required.
         """
         raise NotImplementedError(f"scene `{type(self).__name__}` has no bodies; define `bodies(self, t, q)`")
@@ -112,12 +114,12 @@ class Scene(eqx.Module):
         return self.coordinates.default_rates(q.array, u.array)
 
     def loads(self, motion: Motion) -> tuple[Load, ...]:
-        """Return impressed forces at a `motion` (t, q, u, inputs, velocities)."""
+        """Return the impressed forces at a `motion` (t, q, u, inputs, velocities)."""
         return ()
 
     def potential(self, pose: Pose) -> Scalar | None:
-        """Return the potential energy (J) at a `pose` in addition to that of the loads, a function of time
-        and coordinates; None if there is none.
+        """Return the potential energy (J) at a `pose`, in addition to the loads' potentials; None if there is
+        none.
         """
         return None
 
@@ -125,59 +127,56 @@ class Scene(eqx.Module):
         """Return a function S (J s) of a `pose` whose rate is subtracted from the Lagrangian, L = T - V -
         dS/dt; None if there is none.
 
-        The motion does not depend on it, but integrators built on a discrete Lagrangian do. It shows how much
-        their accuracy depends on the choice of L.
+        The motion is independent of S, but integrators built on a discrete Lagrangian are not. S shows how
+        much their accuracy depends on the choice of L.
         """
         return None
 
     def prescribed(self, t: Scalar) -> Mapping[str, Scalar]:
-        """Return prescribed coordinates as functions of time: name -> value. The multiplier of the constraint
-        is the actuator's force.
+        """Return prescribed coordinates as functions of time, name -> value. The multiplier of the constraint
+        is the force of the actuator.
         """
         return {}
 
     def geometric_constraints(self, pose: Pose) -> Mapping[str, Array]:
-        """Return geometric constraints g(q, t) = 0 at a `pose`, by name, each a scalar or a vector; eq. (5).
-        """
+        """Return geometric constraints g(q, t) = 0 at a `pose`, name -> scalar or vector; eq. (5)."""
         return {}
 
     def velocity_constraints(self, motion: Motion) -> Mapping[str, Array | HeldRow]:
-        """Return velocity constraints phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector:
-        linear, affine or nonlinear in u; (6)-(9).
+        """Return velocity constraints phi(q, u, t) = 0 at a `motion`, name -> scalar or vector: linear,
+        affine or nonlinear in u; (6)-(9).
         """
         return {}
 
     def contacts(self, pose: Pose) -> Mapping[str, Contact]:
-        """Return rolling contacts at a `pose`, by name; each adds its no-slip constraints, and with
+        """Return the rolling contacts at a `pose`, by name. Each adds its no-slip constraints, and with
         `height="row"` its height constraint.
         """
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
-        """Return named events at a `motion`: values that are positive while the motion may continue. It stops
-        where a value falls through zero; beyond that the value may be NaN. A value that begins at zero and
-        rises does not count as an event. A `jj.Event` in place of a value may let the motion continue.
+        """Return named events at a `motion`: values that are positive while the motion may continue. The
+        motion stops where a value falls through zero; beyond that the value may be NaN. A value that starts
+        at zero and rises is no event. Return a `jj.Event` instead of a value to let the motion continue.
 
-        If several events happen in one step, the first in time counts. A value that falls through zero and
-        rises again within one step is found in two cases: a relation in it (`<`, `where`, `abs`, ...)
-        changes, or the fall shows in the cubic through values and rates at the ends of the step (default
-        solvers) or in the dense output at three times in the step (other adaptive solvers). A smooth dip of a
-        stop event that is narrower than the longest step may be missed: use values that fall once, or a
-        smaller `max_step`.
+        The first of several events in one step counts. A value that falls through zero and rises again within
+        one step is found if a relation in it (`<`, `where`, `abs`, ...) changes. It is also found if the fall
+        shows in the cubic through values and rates at the ends of the step (default solvers), or in the dense
+        output at three times in the step (other adaptive solvers). A smooth dip of a stop event that is
+        narrower than the longest step may be missed. Use values that fall once, or a smaller `max_step`.
         """
         return {}
 
     def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
-        """Return named quantities of a `motion` that this scene conserves, besides its energy; used in checks
-        and summaries.
+        """Return quantities that this scene conserves besides energy, by name; used in checks and summaries.
         """
         return {}
 
     def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
-        """Return shapes of bodies at a `pose`, by name, `""` for shapes fixed in the inertial frame; for
-        pictures only. See `jj.Visual`.
+        """Return shapes of bodies at a `pose`, by name, for pictures only. The name `""` holds shapes fixed
+        in the inertial frame. See `jj.Visual`.
 
-        Omitted bodies are drawn by their `outline`, their contacts, or their inertia.
+        A body that is not listed is drawn from its `outline`, its contacts, or its inertia.
         """
         return {}
 
@@ -203,8 +202,7 @@ class Scene(eqx.Module):
         """Return a copy of this scene with changed parameters: `changes`, name -> value in the parameter's
         unit.
 
-        Raises ValueError for an unknown name (with the nearest valid one) or a value that the parameter does
-        not allow.
+        Raises ValueError for an unknown name (with the nearest valid one) or an inadmissible value.
         """
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:
@@ -214,12 +212,12 @@ class Scene(eqx.Module):
         return replace(self, **changes)
 
     def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
-        """Return q and u with the named `values`, the rest at the reference (zero; the identity for
-        quaternions), and the given names.
+        """Return q and u with the named `values`, and the given names. Other entries are at the reference:
+        zero, or the identity for quaternions.
 
         A quaternion or its angular velocity may be given as a whole, by its own name. If a quaternion is
-        given in part, its other parts are zero. Raises ValueError for an unknown name or a wrong shape, and
-        for parts of a quaternion that alone define no attitude.
+        given in part, its other parts are zero. Raises ValueError for an unknown name, a wrong shape, or
+        parts of a quaternion whose squares do not sum to one.
         """
         q, u, given = vectors_named(self, values)
         return jnp.asarray(q), jnp.asarray(u), given
@@ -231,13 +229,13 @@ def state_names(scene: Scene) -> Labels:
 
 
 def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
-    """As `Scene.named`; on NumPy where all numbers are known."""
+    """Return the result of `Scene.named`, as NumPy arrays if all numbers are known."""
     q, u, given = entries_named(scene, values)
     return _vector(q), _vector(u), given
 
 
 def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
-    """As `Scene.named`, with entries of q and u in lists."""
+    """Return the result of `Scene.named`, with the entries of q and u in lists."""
     coordinates, speeds = scene.coordinate_names, scene.speed_names
     q, u = scene.coordinates.reference().tolist(), [0.0] * len(speeds)
     given: list[str] = []
@@ -253,20 +251,17 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
 
 
 def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str]:
-    """Return the omitted parts of a partly given quaternion as zero, since its attitude would be ambiguous
-    otherwise.
-    """
+    """Set the omitted parts of a partly given quaternion to zero, and return their names."""
     named = [name for name in parts if name in given]
     if len(named) in (0, 4):
         return []
     q[first : first + 4] = [value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)]
     square = sum(value * value for value in q[first : first + 4])
-    if np.any(abs(known_numbers(square) - 1) > 1e-4):  # parts may be typed with a few digits
+    if np.any(abs(known_numbers(square) - 1) > 1e-4):  # users round the parts to a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
-            f"of the quaternion `{group}` only {told} is given; its squares sum to {float(square):.4g}, so "
-            f"it is not an attitude; give all four parts, {group}=(w, x, y, z), or parts whose squares sum "
-            "to 1, with zero for the others"
+            f"only {told} of the quaternion `{group}` is given, and the squares sum to {float(square):.4g}, "
+            f"not 1; give all four parts, {group}=(w, x, y, z), or parts whose squares sum to 1"
         )
     return [name for name in parts if name not in named]
 
@@ -281,8 +276,10 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
     shape = () if type(value) is float else np.shape(value)
     if not groups:
         if shape != ():
-            raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use "
-                "`jax.vmap` or `rollout` for many")
+            raise ValueError(
+                f"`{name}` was given an array of shape {shape}, expected one number; use `jax.vmap` or "
+                "`rollout` for many"
+            )
         entries[names.entries.index(name)] = value
         return [name]
     ((first, length),) = groups
@@ -295,11 +292,12 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
 def _vector(entries: list) -> Float[Entries, "entries"]:
     if array_module(entries) is jnp:
         return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
-    return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile
+    # one conversion: no small programs to compile
+    return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())
 
 
 def _names_read(kind: type[Scene], *functions: Callable) -> NamesRead:
-    """Return the names that functions and the methods of a scene's own classes read."""
+    """Return the names that the functions, and the methods of the scene's own classes, read."""
     return names_read(*(owner for owner in kind.__mro__ if owner not in Scene.__mro__), *functions)
 
 
@@ -319,8 +317,8 @@ class HeldFunction(eqx.Module):
 
 
 def hold_leaves(scene) -> None:
-    """Make the functions in a new scene static, at any depth of its fields, and convert floats to arrays as
-    parameters are converted.
+    """Make the functions in the fields of a new scene static, at any depth, and convert floats to arrays, as
+    for parameters.
 
     Raises ValueError for texts, which only a static field can hold.
     """

@@ -1,12 +1,14 @@
-"""A cubic spline through samples, for poses and prescribed coordinates that are known at some times only.
+"""Cubic spline through samples, for poses and prescribed coordinates known at discrete times.
 
-On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second derivatives m_k at the knots (Press et al., Numerical Recipes, 3.3):
+On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second derivatives m_k at the knots
+(Press et al., Numerical Recipes, 3.3):
 
     s(t) = a v_k + b v_k+1 + ((a^3 - a) m_k + (b^3 - b) m_k+1) h^2/6
     h_k-1 m_k-1 + 2 (h_k-1 + h_k) m_k + h_k m_k+1 = 6 ((v_k+1 - v_k)/h_k - (v_k - v_k-1)/h_k-1)
 
-with the third derivative continuous at the second and the last but one knot ("not a knot"). A piecewise linear curve has no second derivative but at its
-knots, where no integrator looks: a motion along it has no force of inertia.
+The third derivative is continuous at the second and the last but one knot ("not a knot"). A piecewise linear
+curve would not do: its second derivative is zero between knots, so a motion along it would have no inertia
+force.
 """
 
 import equinox as eqx
@@ -30,10 +32,12 @@ class Spline(eqx.Module):
                 return {"x": self.drive(t)}
 
     **Arguments**
-    - `ts`: knots, s, increasing; `values`: one number per knot. Two of them give a line, three a parabola, more a cubic spline.
+    - `ts`: knots, s, increasing; `values`: one number per knot. Two of them give a line, three a parabola,
+      more a cubic spline.
 
-    It is differentiable with respect to `values` and `ts`, and serves as a field of a scene, inside its methods, and as an input. Between samples of a
-    smooth motion at distances h its error is of order h^4. **Raises** ValueError for other shapes, times that do not increase, numbers that are not finite.
+    It is differentiable with respect to `values` and `ts`, and can be a field of a scene, be made in its
+    methods, or be an input. For samples of a smooth motion at intervals h its error is of order h^4.
+    **Raises** ValueError for other shapes, times that do not increase, or numbers that are not finite.
     """
 
     ts: Float[Array, "samples"]  # s
@@ -43,13 +47,13 @@ class Spline(eqx.Module):
         self.ts, self.values = checked_samples("Spline", ts, values, 2, "coordinate")
 
     def __call__(self, t):
-        """Return value at time t (s)."""
+        """Return the value at time t (s)."""
         return smooth_through_samples(jnp.asarray(t, real_type()), self.ts, self.values)
 
 
 def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
-    """Return times and values, of which there must be at least `least`; `kind` and `of` name them in errors.
-    Raises ValueError for other shapes and for invalid numbers.
+    """Return times and values, at least `least` of each, as checked arrays. `kind` and `of` name them in
+    errors. Raises ValueError for other shapes and invalid numbers.
     """
     ts = checked_real(ts, f"`ts` of `{kind}`", advice="give times in s")
     values = checked_real(values, f"`values` of `{kind}`", advice="give one number per time")
@@ -69,7 +73,7 @@ def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[A
     return ts, values
 
 
-@jax.jit  # so that its name stands in what JAX traces: it need not be looked at for kinks
+@jax.jit  # jitted so that its name appears in the trace and the search for kinks can skip it
 def smooth_through_samples(t, ts, values):
     """Return the cubic spline through `values` at `ts`, at time(s) t."""
     m, inside = _second_derivatives(ts, values), jnp.clip(t, ts[0], ts[-1])
@@ -88,7 +92,8 @@ def _second_derivatives(ts, values) -> Float[Array, "samples"]:
         return jnp.zeros_like(values)
     if bends.shape[0] == 1:  # a parabola
         return jnp.broadcast_to(bends / (3 * (h[0] + h[1])), values.shape)
-    first, last = h[0] / h[1], h[-1] / h[-2]  # m_0 = (1 + first) m_1 - first m_2, and so at the other end
+    # m_0 = (1 + first) m_1 - first m_2, and likewise at the other end
+    first, last = h[0] / h[1], h[-1] / h[-2]
     middle = (2 * (h[:-1] + h[1:])).at[0].add(h[0] * (1 + first)).at[-1].add(h[-1] * (1 + last))
     below, above = h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last), h[1:].at[-1].set(0.0).at[0].add(-h[0] * first)
     m = jax.lax.linalg.tridiagonal_solve(below, middle, above, bends[:, None])[:, 0]

@@ -1,14 +1,14 @@
-"""Contacts with friction as declarations of a scene: a mode, three events and a direction of slip each.
+"""Declarations that friction adds to a scene: a mode, three events and a direction of slip per contact.
 
-Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It
-then has, besides that which its class states (rows that hold up to a force count as contacts, which hold
-where others roll),
+Which contacts have friction depends only on the structure of the scene, and is found once for each structure.
+Velocity constraints that hold up to a force count as contacts; they hold where others roll. For a contact
+`rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
-    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero where it does not slip
+    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero unless it slips
 
-The mechanics of it: `equations/switching.py`.
+Its mechanics: `equations/switching.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,8 @@ from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
-GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4  # in place of a mode: why a motion cannot continue
+# used in place of a mode: why a motion cannot continue
+GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # it never flies
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
@@ -43,7 +44,7 @@ class Switching:
     coordinates: Coordinates | None = None
     inputs: Names | None = None
     modes: Modes | None = None
-    rows: Labels = ()  # the contacts that are rows and hold up to a force
+    rows: Labels = ()  # the velocity constraints among them, which hold up to a force
 
     @property
     def events(self) -> Labels:
@@ -55,7 +56,8 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """Declarations of a class, extended by an instance that has contacts with friction."""
+    """Class attribute with the class's declarations, extended for instances that have contacts with friction.
+    """
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated
@@ -68,7 +70,7 @@ class Declared:
 
 
 def has_friction(kind: type) -> bool:
-    """Return whether methods of a class speak of friction."""
+    """Return whether methods of a class mention friction."""
     return any(
         word in _words(function.__code__)
         for method, word in (
@@ -90,7 +92,7 @@ def _words(code: CodeType) -> set[str]:
 
 @once_per_class
 def switching_of(scene) -> Switching:
-    """Return the contacts of a scene that switch."""
+    """Return the contacts with friction of a scene, and their declarations."""
     leaves, structure = jax.tree.flatten(scene)
     names: dict[str, Labels] = {}
 

@@ -1,7 +1,6 @@
-"""Return values of a scene's methods, checked for kind and shape, or a ValueError that names the method and
-its expected result.
+"""Checked results of a scene's methods, or a ValueError that names the method and the expected result.
 
-The checks look at kinds and shapes, which are known while a scene is traced: no compiled program contains any of them.
+The checks read kinds and shapes, which are known during tracing, so compiled programs contain none of them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -40,7 +39,7 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
 
 def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
     """Return the rates of all coordinates."""
-    directions = 2 * len(scene.switching.contacts)  # of slip: they come last, and are constant
+    directions = 2 * len(scene.switching.contacts)  # directions of slip come last, and are constant
     names = scene.coordinate_names.entries[: len(scene.coordinate_names) - directions]
     rates = checked_real(
         scene.coordinate_rates(t, q, u),
@@ -52,7 +51,7 @@ def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "co
 
 
 def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
-    """Return the loads of a scene; a single one counts as a tuple of one."""
+    """Return the loads of a scene; a single load becomes a tuple of one."""
     given = scene.loads(motion)
     loads = (given,) if isinstance(given, Load) else tuple(given) if isinstance(given, Iterable) and not isinstance(given, dict | str) else None
     if loads is None:
@@ -77,34 +76,34 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
 
 
 def potential_of(scene: Scene, pose: Pose) -> Scalar | None:
-    """Return the scene's own potential energy, J; None where it has none."""
+    """Return the scene's own potential energy, J; None if there is none."""
     V = scene.potential(pose)
     return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
 
 
 def gauge_of(scene: Scene, pose: Pose) -> Scalar | None:
-    """Return the scene's gauge function, J s; None where it has none."""
+    """Return the scene's gauge function, J s; None if there is none."""
     S = scene.gauge(pose)
     return None if S is None else checked_real(S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None")
 
 
 def prescribed_of(scene: Scene, t) -> dict[str, Scalar]:
-    """Prescribed coordinates and their values."""
+    """Return the prescribed coordinates and their values."""
     advice = "prescribe every coordinate by its own name"
     return _numbers(scene, "prescribed", t, '{"x": 0.1 * jnp.sin(t)}', "prescribed value of", advice)
 
 
 def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
-    """Return values of the scene's own geometric rows."""
-    return _numbers(scene, "geometric_constraints", pose, '{"edge": value}', "row", _VANISH, None)
+    """Return values of the scene's own geometric constraints."""
+    return _numbers(scene, "geometric_constraints", pose, '{"edge": value}', "constraint", _VANISH, None)
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of the scene's own velocity rows. Rows that hold up to a force are omitted."""
+    """Return values of the scene's own velocity constraints, without those that hold up to a force."""
     given = _dictionary(scene, "velocity_constraints", (motion,), '{"edge": value}')
     always = {name: value for name, value in given.items() if not isinstance(value, HeldRow)}
     _declared(scene, given.keys() - always, "velocity_constraints", "holds=")
-    return _checked(scene, always, "row", _VANISH, None)
+    return _checked(scene, always, "constraint", _VANISH, None)
 
 
 def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> None:
@@ -116,14 +115,14 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
 
 
 def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
-    """Return the velocity rows that hold up to a force, by name."""
+    """Return the velocity constraints that hold up to a force, by name."""
     if not scene.switching.rows:
         return {}
     return held_rows(scene.velocity_constraints(motion), loads_of(scene, motion))
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
-    """Rolling contacts by name."""
+    """Return the rolling contacts by name."""
     contacts = _dictionary(scene, "contacts", (pose,), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
         check_kind(
@@ -137,7 +136,7 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
 
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
-    """Return the events by name; a plain value is that of an event that stops the motion."""
+    """Return the events by name; a plain value becomes an event that stops the motion."""
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; name every condition"
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
@@ -145,8 +144,9 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
         for what, changed in (("to", event.to), ("jump", event.jump)):
             check_kind(changed, Mapping, f"`{what}` of {where}", "a dictionary by name")
         if event.stop and (event.to or event.jump):
-            raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, "
-                "or `stop`")
+            raise ValueError(
+                f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, or `stop`"
+            )
         check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")
         check_names(event.jump, state_names(scene), f"{where} moves "
             "`{}`, which is not a coordinate or speed")
@@ -166,7 +166,7 @@ def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
-    """Return the scene's own shapes of its bodies; `""` is for shapes fixed in the inertial frame."""
+    """Return the scene's own shapes of its bodies; the name `""` holds shapes fixed in the inertial frame."""
     given = _dictionary(scene, "visuals", (pose,), '{"ball": jj.Visual.ball(0.1)}')
     found = {}
     for name, looks in given.items():

@@ -1,8 +1,7 @@
-"""Looks of bodies: shapes in the frame of their body, for pictures only.
+"""Shapes of bodies, in the body frame, for pictures only.
 
-A scene states them in `visuals(self, pose)`; omitted bodies are drawn by other information: their `outline`,
-the shapes of
-their contacts, their inertia.
+A scene states them in `visuals(self, pose)`. Bodies without shapes are drawn from their `outline`, the shapes
+of their contacts, or their inertia.
 """
 
 import os
@@ -33,9 +32,7 @@ from jourdain_jax.scene.grounds import tangents_of
 
 
 class Faces:
-    """Corners (points, 3) and faces of a mesh, as known numbers. Two meshes are equal only if they are one
-    object.
-    """
+    """Corners (points, 3) and faces of a mesh, as known numbers; compared by identity."""
 
     def __init__(self, corners: np.ndarray, polygons: tuple[Indices, ...]):
         self.corners, self.polygons = corners, polygons
@@ -51,16 +48,18 @@ class Look(TypedDict, total=False):
 
 
 class Visual(eqx.Module):
-    """A shape in the frame of a body, for pictures only. Made by its constructors: `jj.Visual.ball(0.1)`, `wheel`, `box`, `cylinder`, `capsule`, ...
+    """A shape in the frame of a body, for pictures only. Made by its constructors: `jj.Visual.ball(0.1)`,
+    `wheel`, `box`, `cylinder`, `capsule`, ...
 
     All of them take
-    - `at`: (3,) in m, where its middle is, in the body frame, from the mass centre (default: there).
-    - `turn`: (3, 3), from its own axes to those of the body (default: the same axes).
-    - `colour`: "#rrggbb" (default: the body's, one of a palette). `opacity`: 0 to 1.
 
-    Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Sizes are those at the first
-    saved time; places, turns and the points of lines may
-    change with the pose. ValueError for anything but a shape.
+    - `at`: (3,) in m, the position of its middle in the body frame, from the mass centre (default: there).
+    - `turn`: (3, 3), from its own axes to the body axes (default: the same axes).
+    - `colour`: "#rrggbb" (default: the body's, from a palette). `opacity`: 0 to 1.
+
+    Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Positions, rotations and the
+    points of lines may change with the pose; sizes are taken at the first saved time. Raises ValueError for
+    anything but a shape.
 
     **Examples**
 
@@ -81,8 +80,8 @@ class Visual(eqx.Module):
 
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":
-        """Return a ball of the given `radius` (m), whose octants are painted in turn, so that its rolling is
-        visible; `look`: as for all shapes.
+        """Return a ball of the given `radius` (m), its octants in alternating colours to show its rotation;
+        `look`: as for all shapes.
         """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
@@ -94,9 +93,7 @@ class Visual(eqx.Module):
     @staticmethod
     def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
         """Return a wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis`
-        ("x", "y" or "z"), its quarters painted in turn.
-
-        `look` as for all shapes.
+        ("x", "y" or "z"), its quarters in alternating colours. `look`: as for all shapes.
         """
         radius = _lengths(radius, "radius of a wheel", ())
         return _about(axis, "wheel", [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())], **look)
@@ -126,8 +123,10 @@ class Visual(eqx.Module):
         (default: thin); `colour`, `opacity` as for all.
         """
         if len(points) < 2:
-            raise ValueError(f"a line to be drawn has {len(points)} points, expected at least two; write "
-                "jj.Visual.line(a, b)")
+            raise ValueError(
+                f"a line to be drawn has {len(points)} points, expected at least two; write "
+                "jj.Visual.line(a, b)"
+            )
         stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
         radius = None if radius is None else _lengths(radius, "radius of a line", ())
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
@@ -150,17 +149,18 @@ class Visual(eqx.Module):
 
     @staticmethod
     def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
-        """Return a body of flat faces.
+        """Return a body with flat faces.
 
-        `vertices` (points, 3) in m and `faces`, one row of vertex indices for each, anticlockwise seen from
+        `vertices` (points, 3) in m and `faces`, a list of vertex indices for each, anticlockwise seen from
         outside, are known numbers; `scale`, one factor or three, may depend on parameters. `look` as for all
         shapes.
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
         if corners.ndim != 2 or corners.shape[1] != 3 or not all_finite(corners):
-            raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, "
-                "m")
+            raise ValueError(
+                f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m"
+            )
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
         if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
             raise ValueError("faces of a mesh need at least three vertex numbers each, from 0 to "
@@ -170,15 +170,17 @@ class Visual(eqx.Module):
 
     @staticmethod
     def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
-        """Return the mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001
-        for millimetres).
+        """Return the mesh in the file `path`, in a format that `trimesh` reads, such as .stl or .obj, times
+        `scale` (0.001 for millimetres).
 
-        `look` as for all shapes. ImportError without `trimesh` (the extra `robots`); ValueError for a file that is missing, of an unknown format, or
-        without faces.
+        `look` as for all shapes. Raises ImportError without `trimesh` (the extra `robots`), and ValueError
+        for a missing file, an unknown format, or a mesh without faces.
         """
         if not os.path.isfile(path):
-            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative "
-                f"paths begin at `{os.getcwd()}`")
+            raise ValueError(
+                f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative paths start "
+                f"at `{os.getcwd()}`"
+            )
         try:
             read = needed("trimesh", "reading a mesh from a file", "robots").load(os.fspath(path), force="mesh")
         except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
