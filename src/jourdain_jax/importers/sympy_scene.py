@@ -1,4 +1,4 @@
-"""Scenes from SymPy's mechanics: poses, loads and constraints are SymPy expressions evaluated on JAX; the
+"""Scenes from SymPy's mechanics: SymPy expressions for poses, loads and constraints are evaluated on JAX; the
 equations of motion are derived here.
 """
 
@@ -32,8 +32,8 @@ class _Expressions:
     u: tuple[Any, ...]
     inputs: tuple[Any, ...]
     fields: dict[Any, str]  # constant -> name of the field
-    is_rigid: dict[str, bool]  # body -> whether it is a rigid one
-    formulas: dict[str, Formulas]  # bodies, rates, loads, and geometric and velocity rows
+    is_rigid: dict[str, bool]  # body -> whether it is rigid
+    formulas: dict[str, Formulas]  # of bodies, rates, loads, and geometric and velocity constraints
 
     def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Scalar]]:
         """Return the values of a part; `others`: speeds and inputs, if it depends on them."""
@@ -45,12 +45,12 @@ class _Expressions:
 
 
 class SympyScene(Scene):
-    """Base of the scenes that `from_sympy` makes."""
+    """Base of the scenes made by `from_sympy`."""
 
     _expressions: ClassVar[_Expressions]
 
     def bodies(self, t, q):
-        """Poses by SymPy's positions and rotation matrices."""
+        """Return poses from SymPy's positions and rotation matrices."""
         values = {key: jnp.stack(several) for key, several in self._expressions.values("bodies", self, t, q).items()}
         found: dict[str, Particle | RigidBody] = {}
         for name, rigid in self._expressions.is_rigid.items():
@@ -63,7 +63,7 @@ class SympyScene(Scene):
         return found
 
     def coordinate_rates(self, t, q, u):
-        """SymPy's kinematic equations, solved for the rates."""
+        """Return the rates from SymPy's kinematic equations."""
         return jnp.stack(self._expressions.values("rates", self, t, q, u)["rates"])
 
     def loads(self, motion):
@@ -76,26 +76,26 @@ class SympyScene(Scene):
         return (*found, Load(*others)) if any(others) else tuple(found)
 
     def geometric_constraints(self, pose):
-        """SymPy's configuration constraints."""
+        """Return SymPy's configuration constraints."""
         return {f"configuration {k}": row for k, row in enumerate(self._expressions.values("geometric", self, pose.t, pose.q)["rows"], 1)}
 
     def velocity_constraints(self, motion):
-        """SymPy's velocity constraints that are not rates of the others."""
+        """Return SymPy's velocity constraints, without rates of the configuration constraints."""
         rows = self._expressions.values("velocity", self, motion.t, motion.q, motion.u, motion.inputs)["rows"]
         return {f"velocity {k}": row for k, row in enumerate(rows, 1)}
 
 
 def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene") -> type[Scene]:
-    """Return a class of scenes from SymPy's mechanics: poses, loads and constraints are imported, the
-    equations of motion are derived here.
+    """Return a class of scenes from SymPy's mechanics: poses, loads and constraints are imported, and the
+    equations of motion derived.
 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81})
         jj.simulate(Pendulum(), {"q": 0.3}, t1=5.0)
 
     - `system`: a `KanesMethod` that knows its bodies and loads (its equations need not be formed), a
       `System`, or a `JointsMethod`, all of `sympy.physics.mechanics`.
-    - `origin`: SymPy's point that is the origin of positions, at rest or moving (default: the `fixed_point`
-      of a `System`; otherwise required).
+    - `origin`: SymPy's point of origin for positions, at rest or moving (default: the `fixed_point` of a
+      `System`; otherwise required).
     - `values`: symbol, or its name, -> number, for every constant in the expressions, in its unit.
     - `name`: of the class.
 
@@ -108,8 +108,8 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
     angular velocity and no orientation.
 
     **Raises** ValueError, with the name, for a constant without a value, a value without a constant, a
-    function that JAX does not have, a system without bodies or kinematic equations, and a rate without an
-    equation. Raises ImportError without `sympy`.
+    function that JAX lacks, a system without bodies or kinematic equations, and a rate without an equation.
+    Raises ImportError without `sympy`.
 
     **Examples**
 
@@ -132,7 +132,7 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
 
 
 def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type[Scene]:
-    """Return the class, when all poses are known."""
+    """Return the class, from known poses."""
     bodies: dict[Any, Any] = {}
     for pose in poses:
         bodies |= {("mass", pose.name): [pose.mass], ("position", pose.name): pose.position}
@@ -169,8 +169,8 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
         "coordinates": coordinates(" ".join(identifiers([str(x.func) for x in system.coordinates], "coordinate").values())),
         "speeds": speeds(" ".join(u_names.values())),
         "inputs": inputs(" ".join(identifiers([str(x.func) for x in unknown], "input").values())),
-        "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions count "
-            f"from {system.origin.name}.",
+        "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions are "
+                       f"from {system.origin.name}.",
         "_expressions": expressions,
     }
     parameters = {fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
@@ -182,8 +182,8 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str
     """Return the loads by kind and place, inertial frame: "weight" (constant, so that it has a potential),
     "force" and "torque" of a body, "generalized" of a speed.
 
-    A force on a point that is not a mass centre, and a torque on a frame that is not a body's, count by their
-    power: Q_k = F . dv/du_k, with the velocity that SymPy has for that point or frame.
+    A force on a point other than a mass centre, or a torque on a frame other than a body's, enters by its
+    power: Q_k = F . dv/du_k, with SymPy's velocity of the point or frame.
     """
     sympy = sympy_package()
     found: dict[tuple[str, Any], Any] = {}
@@ -204,7 +204,7 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str
 
 
 def velocity_rows(system: MechanicalSystem) -> list[Any]:
-    """Return the velocity rows that are not the rates of geometric ones; SymPy requires both."""
+    """Return the velocity constraints without rates of geometric constraints; SymPy requires both."""
     rows = [system.resolved(row) for row in system.velocity]
     if not rows or not system.configuration:
         return rows
@@ -215,27 +215,29 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
     for sample in samples:
         given, implied = (affine(lambda at, name=name: formulas.numbers(at)[name], sample.leaves, system.speeds) for name in both)  # type: ignore[misc]
         left = given - given @ np.linalg.pinv(implied) @ implied
-        # of a row: what of it the geometric rows leave, relative
+        # relative remainder of a row after the geometric rows
         kept |= largest(left, 1) > 1e-9 * largest(given, 1)
     return [row for row, keep in zip(rows, kept, strict=True) if keep]
 
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
     """Raise ValueError for a function of time that can be neither a coordinate nor an input: no kinematic
-    equation contains it, but it appears as a rate, or poses depend on it.
+    equation contains it, but its rate occurs, or poses depend on it.
     """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds
-        advice = "loads and rows may depend on speeds, not on their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
+        advice = "loads and constraints may contain speeds, not their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
         raise ValueError(f"`{x}` occurs, but no kinematic equation determines it; {advice}")
     if x in of_poses:
         advice = "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a subclass"
-        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, but is "
-            f"neither a coordinate nor a speed; {advice}")
+        raise ValueError(
+            f"`{x}` occurs in a position, an orientation or a configuration constraint, but is neither a "
+            f"coordinate nor a speed; {advice}"
+        )
 
 
 def _check_values(given: Mapping[str, float], names: set[str]) -> None:
-    """Raise a ValueError for constants without a value, and values of nothing."""
+    """Raise ValueError for constants without a value, and for values without a constant."""
     if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
         raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each "

@@ -44,7 +44,7 @@ class RosenbergParticle(_OnSheets):
     """
 
     conventions = (
-        "Right-handed inertial frame without gravity; y is in metres in the constraint zdot = y xdot."
+        "Right-handed inertial frame without gravity; zdot = y xdot with y in metres."
     )
     example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
 

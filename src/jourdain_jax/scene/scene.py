@@ -168,7 +168,8 @@ class Scene(eqx.Module):
         return {}
 
     def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
-        """Return quantities that this scene conserves besides energy, by name; used in checks and summaries.
+        """Return quantities of a `motion` that this scene conserves besides energy, by name; used in checks
+        and summaries.
         """
         return {}
 
