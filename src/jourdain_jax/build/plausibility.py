@@ -39,10 +39,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
 TOLERANCE = 1e-4  # relative: covers rounded constants, while mistakes are larger
-_ROWS_INSTEAD = (
-    "write its constraints in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - "
-    "ground.velocity_at(point))"
-)
+_ROWS_INSTEAD = "state it in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 
 # kind -> name of the owner -> values; at one state or, with a leading axis, at many; or nodes
 Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
@@ -171,10 +168,7 @@ def _exceeds_the_others(x):
 
 
 def _says_nothing(piece: str) -> Callable:
-    return lambda _: (
-        f"has no finite {piece} at any probed state, expected finite numbers; check the computation of its "
-        f"{piece}"
-    )
+    return lambda _: f"has no finite {piece} at any probed state, expected finite numbers; check its computation"
 
 
 def _unit(kind: str, group: str) -> Check:
@@ -248,15 +242,12 @@ CHECKS = (
     Check(
         "orientation",
         lambda R: _volume(R) < 0,
-        lambda R: "has an orientation of determinant -1, a reflection instead of a rotation; reverse one "
-                  "axis",
+        lambda R: "has an orientation of determinant -1, a reflection; reverse one axis",
         "a reflected orientation",
     ),
     _unit("unit", "grounds"),
-    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check its "
-                                                "computation", "no positive length"),
-    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius that is not "
-                                             "negative", "a negative tyre"),
+    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check it", "no positive length"),
+    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius >= 0", "a negative tyre"),
     Check(
         "gap",
         lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],

@@ -111,7 +111,7 @@ def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _said(scene: Scene, what: str, where: str) -> str:
     return (
         f"{what} of `{type(scene).__name__}` is not smooth: it jumps, or its velocity does, {where}, as by a "
-        "piecewise linear interpolation, a look-up or a branch. A jump has no force of inertia, since the "
-        "second derivative is zero on either side. Give samples as `jj.Spline(ts, values)`, and let pieces "
-        "meet with equal slopes"
+        "piecewise linear interpolation, a look-up or a branch. The inertia force of a jump is lost, since "
+        "the second derivative is zero on either side. Give samples as `jj.Spline(ts, values)`, and join "
+        "pieces with equal slopes"
     )

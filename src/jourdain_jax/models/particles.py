@@ -43,9 +43,7 @@ class RosenbergParticle(_OnSheets):
     The unit of length is chosen so that the constraint has no factor.
     """
 
-    conventions = (
-        "Right-handed inertial frame without gravity; zdot = y xdot with y in metres."
-    )
+    conventions = "Right-handed inertial frame without gravity; zdot = y xdot with y in metres."
     example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
 
     def velocity_constraints(self, motion):
@@ -69,10 +67,7 @@ class HeisenbergParticle(_OnSheets):
     The unit of length is chosen so that the constraint has no factor.
     """
 
-    conventions = (
-        "Right-handed inertial frame without gravity; x, y are in metres in the constraint zdot = y xdot - x "
-        "ydot."
-    )
+    conventions = "Right-handed inertial frame without gravity; zdot = y xdot - x ydot with x, y in metres."
     example = {"x": 0.3, "y": -0.2, "x_rate": 0.7, "y_rate": 0.4}
     example_span = 10.0
 

@@ -194,10 +194,7 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
     except StatefulError:
         if not where:
             return _Same(x)
-    what = (
-        f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without "
-        "being noticed"
-    )
+    what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change unnoticed"
     raise StatefulError(
         f"{where} reads `{name}`, "
         f"{'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
