@@ -39,7 +39,9 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, held_rows_of, loads_of
 
 TOLERANCE = 1e-4  # relative: covers rounded constants, while mistakes are larger
-_ROWS_INSTEAD = "state it in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
+_ROWS_INSTEAD = (
+    "state it in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
+)
 
 # kind -> name of the owner -> values; at one state or, with a leading axis, at many; or nodes
 Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
