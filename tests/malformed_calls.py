@@ -132,7 +132,7 @@ OPTIONS |= {
     "calls['fit'](ts=TS)": ("TypeError", "each `Experiment` states start, times and inputs"),
     "calls['fit'](retry=True)": ("TypeError", "its motions are compiled"),
     "calls['log_likelihood'](events=False)": ("TypeError", "ends with its last sample"),
-    "calls['Study.run'](parameters=None)": ("TypeError", "what is kept is said by `outputs` and `save`"),
+    "calls['Study.run'](parameters=None)": ("TypeError", "what is stored is chosen by `outputs` and `save`"),
     "calls['simulate'](backend='native', solver=diffrax.Heun())": "'native' cannot integrate `ChaplyginSleigh`: the solver is",
     "calls['rollout'](backend='native', solver=diffrax.Heun())": "'native' cannot integrate `ChaplyginSleigh`: the solver is",
     "calls['simulate'](backend='native', formulation=jj.Formulation(reduction='kkt'))": "'native' cannot integrate `ChaplyginSleigh`: its own reduction",

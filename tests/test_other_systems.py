@@ -252,7 +252,7 @@ def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text):
 def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monkeypatch):
     monkeypatch.setattr(memory, "os", SimpleNamespace(name="nt"))
     monkeypatch.setattr(memory.ctypes, "CDLL", _no_library)
-    with pytest.raises(ValueError, match="`memory` is held on Linux with glibc only"):
+    with pytest.raises(ValueError, match="`memory` is limited only on Linux with glibc"):
         memory.give_back_at_once()
 
 
@@ -261,5 +261,5 @@ def test_a_study_whose_workers_cannot_begin_says_so(tmp_path, monkeypatch):
     store = Store.make(tmp_path / "study", {"samples": 4, "chunk": 2, "block": 2}, {}, {}, {})
     monkeypatch.setattr(workers, "sent_to_others", lambda _: sent)
     found = workers.in_processes(object.__new__(workers.Task), 1)(store, [0, 1], lambda: False)
-    with pytest.raises(RuntimeError, match=r"no worker of this study could begin.*__main__"):
+    with pytest.raises(RuntimeError, match=r"no worker of this study could start.*__main__"):
         next(found)

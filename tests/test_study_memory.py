@@ -90,7 +90,7 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
 
 def test_systems_that_do_not_say_refuse(tmp_path, monkeypatch):
     monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
-    with pytest.raises(ValueError, match="held on Linux with glibc only"):
+    with pytest.raises(ValueError, match="limited only on Linux with glibc"):
         run(tmp_path / "discs.zarr", memory="4GB")
 
 

@@ -1,1 +1,1 @@
-"""Studies of many motions: designs, runs that survive interruption, storage, statistics, sensitivity indices."""
+"""Studies of many motions: designs, interruptible runs, storage, statistics, sensitivity indices."""

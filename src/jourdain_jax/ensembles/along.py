@@ -1,9 +1,11 @@
-"""A quantity along a motion, from its values at saved times and at the end: its largest value, also between them, and its integral.
+"""Extremes and integrals of a quantity along a motion, from its values at saved times and at the end, also
+between them.
 
-Between them it is the polynomial through its values nearby: for the largest value one of fourth degree through the five around the largest of them, whose
-largest value is looked for on a fine grid, then by one step of Newton's method for p'(s) = 0; for the integral one of third degree through the four around
-each interval, which Simpson's rule integrates exactly. With h the time between values, a smooth quantity is found to the fifth order of h, and its integral to
-the fourth; of the saved values alone both would be of the second.
+Between saved times the quantity is a polynomial through nearby values. For the largest value it has degree
+four, through the five values around the largest; a fine grid and one step of Newton's method for p'(s) = 0
+locate its maximum. For the integral it has degree three, through the four values around each interval;
+Simpson's rule integrates it exactly. With time h between values, the maximum of a smooth quantity is accurate
+to the fifth order of h and its integral to the fourth; saved values alone would give the second.
 """
 
 import dataclasses
@@ -17,7 +19,7 @@ from jourdain_jax.calculus.reals import Count, Scalar, described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 
 Values = Float[Array, "times"]
-FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
+FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # number of values that determine a polynomial
 
 
 def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
@@ -25,13 +27,13 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     all times), and the number of valid ones.
 
     Times are the saved ones that were reached, followed by the end. The end replaces the last saved time if
-    that is very near. Remaining entries repeat the end.
+    the two are very close. Remaining entries repeat the end.
     """
     reached, ts = jnp.sum(motion.valid), jnp.asarray(motion.ts)
     before, last = (ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
     beyond = jnp.abs(motion.t_end - last)
-    # of the time between values: an end that follows the last of them sooner takes its place, since a polynomial through both swings
-    place = reached - ((beyond > 0) & (beyond <= (1 / 16) * jnp.abs(last - before)))  # of the end
+    # An end very close to the last saved time replaces it, since a polynomial through both oscillates.
+    place = reached - ((beyond > 0) & (beyond <= (1 / 16) * jnp.abs(last - before)))  # index of the end
 
     def with_end(values, end):
         kept = jnp.where((jnp.arange(len(values)) < place).reshape(-1, *[1] * end.ndim), values, end)
@@ -42,21 +44,23 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
     if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
-        raise ValueError(f"the quantity of an output is {described(values)}, expected its real values at all "
-            f"{times.shape[0]} times of the motion")
+        raise ValueError(
+            f"the quantity of an output is {described(values)}, expected its real values at all "
+            f"{times.shape[0]} times of the motion"
+        )
     return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 
 
 def largest(times: Values, values: Values, count: Count) -> Scalar:
-    """Return the largest of the first `count` of `values`, also between them. Its derivative is that of the
-    quantity at the time of the largest value.
+    """Return the largest of the first `count` of `values`, also between them. Its derivative is the
+    quantity's at the time of the maximum.
     """
     k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
     if times.shape[0] < FOR_EXTREMES:
         return values[k]
     first, s, y = _window(times, values, count, k - FOR_EXTREMES // 2, k, FOR_EXTREMES)
     low, high = s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)], s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)]
-    # places at which the polynomial is looked at
+    # a fine grid for the polynomial
     places = jnp.linspace(low, high, 33)
     near = places[jnp.argmax(jax.vmap(lambda place: _polynomial(s, y, place))(places))]
     slope = jax.grad(lambda place: _polynomial(s, y, place))
@@ -66,11 +70,11 @@ def largest(times: Values, values: Values, count: Count) -> Scalar:
 
 
 def integral(times: Values, values: Values, count: Count) -> Scalar:
-    """The integral over time of the first `count` of `values`."""
+    """Return the integral over time of the first `count` of `values`."""
 
     def over(i):
         """Return the integral from time i to the next: h (y_i + 4 p(middle) + y_next) / 6, or the trapezoid
-        if there are fewer values than a polynomial needs.
+        if there are too few values for a polynomial.
         """
         even = 0.5 * (values[i] + values[i + 1])
         middle = even
@@ -84,10 +88,10 @@ def integral(times: Values, values: Values, count: Count) -> Scalar:
 
 
 def _window(times, values, count, first, zero, points: int):
-    """Return the index of the first of `points` neighbouring values (if possible `first`), their times in
-    units of the window since `zero`, and the values.
+    """Return the index of the first of `points` neighbouring values (`first` if possible), their times since
+    `zero` in units of the window, and the values.
 
-    If there are fewer values than `points`, the missing times are made up, so that nothing divides by zero.
+    If there are fewer values than `points`, artificial times avoid a division by zero.
     """
     first = jnp.clip(first, 0, jnp.maximum(count - points, 0))
     some = first + jnp.arange(points)
@@ -97,7 +101,7 @@ def _window(times, values, count, first, zero, points: int):
 
 
 def _polynomial(s: Float[Array, "points"], y: Float[Array, "points"], place: Scalar) -> Scalar:
-    """The value at `place` of the polynomial through (s, y), by Lagrange's formula."""
+    """Return the value at `place` of the polynomial through (s, y), by Lagrange's formula."""
     total = jnp.zeros_like(place)
     for i in range(s.shape[0]):
         factor = y[i]

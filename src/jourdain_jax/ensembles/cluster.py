@@ -1,6 +1,8 @@
-"""Workers of a Dask cluster that compute the chunks of one study. Its folder must be where all of them, and the process that asks, can reach it.
+"""Workers of a Dask cluster that compute the chunks of one study. All workers and the calling process must
+reach the study's folder.
 
-Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then left out with a warning.
+Dask restarts a chunk whose worker died. A chunk on which workers died repeatedly is tried once more alone,
+then omitted with a warning.
 """
 
 import os
@@ -14,17 +16,18 @@ from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_
 
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
-    """Return the workers of `run`. Raises ValueError where `client` is no client of Dask, or the task cannot
-    be sent to another process.
+    """Return the workers of `run`. Raises ValueError if `client` is no Dask client, or if the task cannot be
+    sent to another process.
     """
     distributed = needed("distributed", "a cluster", "cluster")
     check_kind(client, distributed.Client, "`client`", "a `dask.distributed.Client`")
     sent = sent_to_others(task)
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
-        study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
+        # a task instead of scattered data: the scheduler can recreate it when a worker dies
+        study = client.submit(bytes, sent, pure=False)
         asked = study, str(store.path.resolve()), os.getpid(), _places(distributed, client)
-        # chunks per thread of a worker: one under way, one that waits for it
+        # chunks per worker thread: one running, one queued
         most = 2 * max(1, sum(client.nthreads().values()))
         pool = client.get_executor(pure=False)
 
@@ -38,8 +41,8 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
 
 
 def _places(distributed, client) -> dict[object, int] | None:
-    """Return the index of each worker by name if all workers have one thread each, on this machine, in
-    separate processes; otherwise None.
+    """Return the index of each worker by name if the workers are separate processes of this machine with one
+    thread each; otherwise None.
     """
     cluster = client.cluster
     threads = client.nthreads().values()
@@ -49,10 +52,11 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
-    """Compute and store a chunk in this worker; `asking`: the process that requests it; `places`: as returned
-    by `_places`.
+    """Compute and store a chunk in this worker; `asking`: the process that requests it; `places`: result of
+    `_places`.
     """
-    if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
+    # a separate worker process uses only its share of the cores
+    if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:
         from distributed import get_worker
 
         worker = get_worker()

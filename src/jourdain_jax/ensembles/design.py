@@ -1,8 +1,9 @@
-"""The samples of a study: the values of what varies, for any range of sample numbers.
+"""The samples of a study: values of the varying quantities, for any range of sample indices.
 
-Correlated normal distributions: with z = Phi^-1(u), independent standard normal, and the Cholesky factor L of the correlation matrix, L z has that
-correlation; u of the varying quantity is Phi(L z), which its distribution maps to a value. So any distributions may be given a correlation of ranks, and that
-of normal ones is the one stated.
+Correlated normal distributions: with independent standard normal z = Phi^-1(u) and the Cholesky factor L of
+the correlation matrix, L z has that correlation. The probability u of a quantity becomes Phi(L z), which its
+distribution maps to a value. Any distributions can thus have a correlation of ranks; for normal ones it is
+the stated correlation.
 """
 
 import math
@@ -21,22 +22,22 @@ from jourdain_jax.scene.names import Labels, check_names, nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
-MOST_SAMPLES = 2**53  # whole numbers that are floats
-MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
+MOST_SAMPLES = 2**53  # integers that floats represent exactly
+MOST_CROSSED = 2**62  # samples of a grid, counted in 64 bits
 
 
 @dataclass(frozen=True, repr=False)
 class Design(Printed):
-    """The samples of a study: names and distributions of what varies, the sampler, the number of samples.
+    """The samples of a study: names and distributions of varying quantities, sampler, and number of samples.
 
     - `variables`: name -> a distribution (`Normal`, `Uniform`, `LogNormal`, `LogUniform`), `Levels` of a
       grid, or a column of a table (one number per sample). All must be of one kind.
-    - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); grids and tables
-      have none.
-    - `samples`: their number; a grid has all combinations of its levels, a table one for each row. `seed`:
-      sample k follows from the seed and k alone (in a Latin hypercube also from the number of samples).
-    - `correlation`: pair of names -> correlation coefficient, of normal distributions (of others, of the
-      normal scores of their ranks).
+    - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); not for grids and
+      tables.
+    - `samples`: their number; a grid has all combinations of its levels, a table one sample per row. `seed`:
+      sample k depends only on the seed and k (in a Latin hypercube also on the number of samples).
+    - `correlation`: pair of names -> correlation coefficient, for normal distributions; for others, of the
+      normal scores of their ranks.
 
         design = jj.Design({"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
         design.values(0, 8)["mass"]                               # of samples 0 to 7, in kg
@@ -53,8 +54,9 @@ class Design(Printed):
         kinds = {self._kind(name, what) for name, what in self.variables.items()}
         if len(kinds) != 1:
             found = "nothing varies" if not kinds else f"there are {' and '.join(sorted(kinds))} at once"
-            raise ValueError(f"{found}; give distributions, or `Levels` that are crossed, or the columns of "
-                "one table")
+            raise ValueError(
+                f"{found}; give distributions, or `Levels` of a grid, or the columns of one table"
+            )
         kind = kinds.pop()
         checked_whole(self.seed, "`seed`", 0, 2**63 - 1, expected="from 0 to 2^63 - 1")
         if kind == "distributions":
@@ -77,8 +79,10 @@ class Design(Printed):
             raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as "
                 "jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
         if not all_finite(column):
-            raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are "
-                "not finite; omit these rows")
+            raise ValueError(
+                f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; "
+                "omit these rows"
+            )
         return "columns"
 
     def _check_sampler(self) -> None:
@@ -105,8 +109,7 @@ class Design(Printed):
         if self.correlation:
             raise ValueError(f"a {kind} has no `correlation`; give distributions")
         if self.sampler not in ("random", kind):
-            raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}, which draws "
-                "nothing; omit it")
+            raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}; omit it")
         if kind == GRID:
             count = math.prod(len(levels.levels) for levels in self.variables.values())
             if count > MOST_CROSSED:
@@ -151,7 +154,7 @@ class Design(Printed):
 
     @property
     def names(self) -> Labels:
-        """Names of what varies, in order."""
+        """Return names of the varying quantities, in order."""
         return tuple(self.variables)
 
     def __len__(self) -> int:
@@ -169,7 +172,8 @@ class Design(Printed):
     def _at(self, index, on_device: bool = False) -> dict:
         """Return the values of samples with these indices, in order.
 
-        Values drawn `on_device` are arrays of JAX with the bits of the host. Grids and tables draw nothing.
+        Values drawn `on_device` are JAX arrays with the same bits as on the host. Grids and tables draw
+        nothing.
         """
         if self.sampler == TABLE:
             return {name: column[index] for name, column in self.variables.items()}

@@ -1,7 +1,7 @@
-"""How a parameter or a start value varies over the lanes of a study: distributions, and levels of a grid.
+"""Variation of a parameter or a start value over the samples of a study: distributions, and levels of a grid.
 
-A distribution maps numbers u that are even on (0, 1) to values by its inverse distribution function, one number for one value, so that a sampler
-which spreads u well (Latin hypercube, Sobol) spreads the values well. Its numbers may be given as anything that is one number, and are floats from then on.
+A distribution maps uniform numbers u in (0, 1) to values by its inverse distribution function. So a sampler
+that spreads u well (Latin hypercube, Sobol) spreads the values well.
 """
 
 from abc import abstractmethod
@@ -18,10 +18,11 @@ from jourdain_jax.ensembles.rounded_functions import exponential, normal_quantil
 class Distribution:
     """Base of the distributions: `values(u)` is the inverse distribution function."""
 
-    _positive: ClassVar[str] = ""  # which number must be above zero
+    _positive: ClassVar[str] = ""  # name of the number that must be positive
 
     def __post_init__(self):
-        """Convert the numbers to floats. Raises ValueError where one is not finite or out of its range."""
+        """Convert the numbers to floats. Raises ValueError for numbers that are not finite or out of range.
+        """
         kind, known = type(self).__name__, dict(vars(self))
         for name, value in known.items():
             known[name] = float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number"))
@@ -29,8 +30,7 @@ class Distribution:
             if not np.isfinite(known[name]):
                 raise ValueError(f"`{name}` of {kind} is {value}, expected a finite number")
         if known.get("sigma", 0.0) < 0:
-            raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation of at "
-                "least 0")
+            raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation >= 0")
         if not known.get("low", 0.0) < known.get("high", 1.0):
             raise ValueError(f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low "
                 "< high")
@@ -39,7 +39,7 @@ class Distribution:
                 "positive number")
 
     def values(self, u):
-        """The values at the probabilities `u`, which lie between 0 and 1."""
+        """Return the values at the probabilities `u`, between 0 and 1."""
         return self._inverse(u, *vars(self).values())
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
@@ -52,13 +52,13 @@ class Distribution:
     @staticmethod
     @abstractmethod
     def _inverse(u: np.ndarray, first, second) -> np.ndarray:
-        """The values at `u` for these two numbers, of an analytic function of them."""
+        """Return the values at `u`, an analytic function of the two numbers."""
 
 
 @dataclass(frozen=True)
 class Normal(Distribution):
     """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of the
-    quantity; with sigma = 0 it always takes the mean.
+    quantity; constant for sigma = 0.
     """
 
     mean: Any
@@ -71,7 +71,7 @@ class Normal(Distribution):
 
 @dataclass(frozen=True)
 class Uniform(Distribution):
-    """Evenly between `low` and `high`, in the unit of what varies."""
+    """A uniform distribution between `low` and `high`, in the unit of the quantity."""
 
     low: Any
     high: Any
@@ -98,8 +98,8 @@ class LogNormal(Distribution):
 
 @dataclass(frozen=True)
 class LogUniform(Distribution):
-    """A positive quantity whose logarithm is uniform between those of `low` and `high`, in the unit of the
-    quantity.
+    """A positive quantity whose logarithm is uniformly distributed between the logarithms of `low` and
+    `high`, in the unit of the quantity.
     """
 
     low: Any
@@ -113,8 +113,8 @@ class LogUniform(Distribution):
 
 @dataclass(frozen=True)
 class Levels:
-    """The `levels` of a quantity in a grid (in its unit). A grid has all combinations of levels; the last
-    quantity changes first.
+    """The `levels` of a quantity in a grid, in its unit. A grid has all combinations of levels; the last
+    quantity varies fastest.
     """
 
     levels: tuple[float, ...]

@@ -9,26 +9,28 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # not on this system: no lock is held there
+except ImportError:  # not available on this system, which then has no locks
     fcntl = None  # type: ignore[assignment]
 
 
 class InUseError(RuntimeError):
-    """Another process runs a study in this folder."""
+    """Error for a folder in which another process runs a study."""
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock file `path`, or raise `InUseError` with the name of its holder. The system releases it
-    when its owner dies, for whatever reason.
+    """Hold the lock file `path`, or raise `InUseError` with the name of its holder. The system releases the
+    lock when its holder ends, however it ends.
     """
     with open(path, "a+b") as file:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InUseError(f"`{path.parent.parent}` is in use{_owner(file)}; wait for that run, or end "
-                    "it, or give another folder") from None
+                raise InUseError(
+                    f"`{path.parent.parent}` is in use{_owner(file)}; wait for that run, end it, or give "
+                    "another folder"
+                ) from None
         file.truncate(0)
         file.write(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
         file.flush()

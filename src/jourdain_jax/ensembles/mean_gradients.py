@@ -1,11 +1,14 @@
 """Gradients of the means of a study's outputs, by the pathwise derivative.
 
-Sample k takes the probabilities u_k, whatever the distributions are; x_k(theta) is what varies, and f the output as a function of it. Then
+Sample k has the probabilities u_k, independent of the distributions. With the varying quantities x_k(theta)
+and the output f as a function of them,
 
     d mean / d theta = (1 / n) sum_k  df/dx (x_k)  dx_k / d theta
 
-and df/dx of a lane is the exact derivative of its motion, in forward mode. This is the derivative of the mean where f is continuous. Where lanes that pass from
-one end to another (from an event to none) let f jump, their share is missing: it is named, and outputs that say which event happened have no such derivative.
+where df/dx is the exact derivative of the sample's motion, in forward mode. This is the derivative of the
+mean if f is continuous. If f jumps when a sample changes from one end to another (from an event to none), the
+contribution of these samples is missing, and a warning says so. Outputs that say which event happened have no
+pathwise derivative.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,21 +31,21 @@ from jourdain_jax.scene.names import Labels, check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
-SHIFT = "shift"  # of all values of a column of a table, or of all levels of a grid
+SHIFT = "shift"  # of all values of a table column, or of all levels of a grid
 
 
 @dataclass(frozen=True, repr=False)
 class MeanGradients(Printed):
     """Means of outputs and their derivatives.
 
-    - `outputs`, `names`: rows and columns of `gradient`. A column is a parameter of the scene that all lanes
-      share, or a number of a distribution, such as "radius.sigma"; "radius.shift" moves all values of a table
-      or grid alike.
+    - `outputs`, `names`: rows and columns of `gradient`. A column is a shared parameter of the scene, or a
+      number of a distribution, such as "radius.sigma"; "radius.shift" shifts all values of a table or grid by
+      the same amount.
     - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the
-      output over that of the number. Standard errors are those of independent samples (a Sobol sequence or a
-      Latin hypercube has smaller ones). NaN where the derivative does not exist.
-    - `lanes`: the number of lanes of each output; `failed`: the number of failed motions, which are omitted;
-      `warnings`: reasons to doubt the numbers.
+      output over that of the number. Standard errors assume independent samples (a Sobol sequence or a Latin
+      hypercube has smaller ones). NaN where the derivative does not exist.
+    - `lanes`: the number of samples of each output; `failed`: the number of failed motions, which are
+      omitted; `warnings`: reasons to doubt the numbers.
     """
 
     outputs: Labels
@@ -74,11 +77,11 @@ class MeanGradients(Printed):
 
 def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
     """Return the gradients of the means of all outputs of a task, also with respect to the parameters
-    `shared` by all lanes.
+    `shared` by all samples.
     """
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
-    # 2048 lanes with their tangents, at once
+    # 2048 motions with their tangents, in one batch
     size = max(8, min(task.block, 2048 // (1 + len(columns))))
     common = {name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared}
     of_block = _of_block(task, columns)
@@ -108,8 +111,8 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
 
 
 def _of_block(task: Task, columns: Sequence[str]):
-    """Return the outputs (lanes, outputs) of a block of columns by name, their derivatives with respect to
-    each column (columns, lanes, outputs), and the result of each lane.
+    """Return a function of a block of columns by name. It returns the outputs (samples, outputs), their
+    derivatives with respect to each column (columns, samples, outputs), and the result of each sample.
     """
 
     def outputs(drawn: Mapping):
@@ -126,8 +129,8 @@ def _of_block(task: Task, columns: Sequence[str]):
 
 
 def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[tuple[str, str, np.ndarray]]:
-    """Return the numbers with respect to which means are differentiated: column, name, and dx/dtheta (lanes,)
-    of the column.
+    """Return the numbers with respect to which means are differentiated: column, name, and dx/dtheta
+    (samples,) of the column.
     """
     u, even = task.design.probabilities(first, last), np.ones(last - first)
     found = []
@@ -138,8 +141,8 @@ def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[t
 
 
 def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray) -> MeanGradients:
-    """Return means over the lanes that have an output; `values` (lanes, outputs), `derivatives` (lanes,
-    outputs, names).
+    """Return means over the samples with a finite output; `values` (samples, outputs), `derivatives`
+    (samples, outputs, names).
     """
     there = np.isfinite(values)[:, :, None]
     count = there.sum(axis=0)

@@ -1,27 +1,28 @@
-"""A bound on the memory of a process that computes a study: how much is resident, how large blocks and chunks may be.
+"""A bound on the memory of a process that computes a study: resident memory, and sizes of blocks and chunks.
 
-What a process needs is estimated before it compiles anything, and looked at after every block:
+The need of a process is estimated before it compiles anything, and checked after every block:
 
     resident now + COMPILED + BLOCKS (bytes of a block's saved states) + CHUNKS (bytes of a chunk's arrays)
 
-Blocks are chosen so that this is within the bound, and a study whose process is seen beyond it stops. The allocator of glibc keeps freed arrays for later
-ones, and grows by hundreds of megabytes as sizes change; where a bound is stated, large arrays are given back at once, which costs a tenth of the time of
-studies that keep trajectories.
+Block sizes are chosen to satisfy the bound, and a study stops if its process exceeds it. The glibc allocator
+keeps freed arrays for reuse, and grows by hundreds of megabytes as sizes change. Under a bound, large arrays
+are therefore returned to the system at once, which costs a tenth of the time of studies that keep
+trajectories.
 """
 
 import ctypes
 import os
 from typing import Any
 
-COMPILED = 500e6  # bytes for compilers and what they compile; the disc takes 220 MB, the bicycle 400 MB
-BLOCKS = 4.0  # copies of a block's states that are there at once; seen: 3.7
-CHUNKS = 2.0  # the arrays of a chunk's blocks, and these put together
-_NOT_HERE = "`memory` is held on Linux with glibc only; omit it here"
+COMPILED = 500e6  # bytes for compilers and compiled programs; the disc takes 220 MB, the bicycle 400 MB
+BLOCKS = 4.0  # simultaneous copies of a block's states; measured: 3.7
+CHUNKS = 2.0  # the arrays of a chunk's blocks, and their concatenation
+_NOT_HERE = "`memory` is limited only on Linux with glibc; omit it here"
 
 
 def resident() -> int:
-    """Return the bytes of this process that are now in memory. Raises ValueError on systems that do not
-    report them.
+    """Return the resident memory of this process in bytes. Raises ValueError on systems that do not report
+    it.
     """
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
@@ -31,8 +32,8 @@ def resident() -> int:
 
 
 def give_back_at_once() -> None:
-    """Make the allocator return large freed arrays to the system at once. Raises ValueError unless it is that
-    of glibc.
+    """Make the allocator return large freed arrays to the system at once. Raises ValueError for another
+    allocator than glibc's.
     """
     library: Any = ctypes.CDLL(None) if os.name == "posix" else None
     # M_MMAP_THRESHOLD is -3, M_TRIM_THRESHOLD -1 in glibc's malloc.h
@@ -41,17 +42,17 @@ def give_back_at_once() -> None:
 
 
 def of_each(memory: int, processes: int) -> int:
-    """Return the bytes for each computing process, from the `memory` of all of them and, if there are
-    several, of this one.
+    """Return the bytes for each computing process. `memory` is shared by all of them and, if there are
+    several, by this process.
     """
     return memory if processes == 1 else max(0, (memory - resident()) // processes)
 
 
 def room(allowed: int, *, here: bool) -> float:
     """Return the bytes for blocks and chunks in a process that may use `allowed` bytes: this process
-    (`here`), or a new one. Raises ValueError where none remain.
+    (`here`), or a new one. Raises ValueError if none remain.
     """
-    # bytes that a process holds with this package and before it computes
+    # bytes of a process with this package before it computes
     held = resident() if here else 240e6
     give_back_at_once()
     if allowed < held + COMPILED:
@@ -62,7 +63,7 @@ def room(allowed: int, *, here: bool) -> float:
 
 
 def check(allowed: int) -> None:
-    """MemoryError where this process holds more than `allowed` bytes now."""
+    """Raise MemoryError if this process now uses more than `allowed` bytes."""
     if (held := resident()) > allowed:
         text = f"a process holds {held / 1e6:.0f} MB, and `memory` allows {allowed / 1e6:.0f} MB for each; all finished chunks are kept"
         raise MemoryError(f"{text}. Run the study again with more memory, fewer processes, or fewer times "

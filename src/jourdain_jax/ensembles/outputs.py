@@ -1,6 +1,7 @@
-"""What is kept of each motion of a study: one number per output, with its unit.
+"""Outputs of a study: one number per motion, with its unit.
 
-Outputs are functions of a `Trajectory`, run on all lanes of a block as one compiled program. Of a motion that failed they are NaN.
+Outputs are functions of a `Trajectory`, evaluated on all samples of a block by one compiled program. They are
+NaN for failed motions.
 """
 
 from abc import abstractmethod
@@ -20,7 +21,7 @@ from jourdain_jax.scene.scene import Scene
 
 class Output:
     """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times`: whether it uses saved
-    times or only the end.
+    times, or only the end.
     """
 
     unit: str = ""
@@ -28,10 +29,10 @@ class Output:
 
     @abstractmethod
     def of(self, motion: Trajectory) -> Scalar:
-        """The number, of one `motion`; by operations of JAX."""
+        """Return the number of one `motion`, by operations of JAX."""
 
     def check(self, scene: Scene) -> None:
-        """ValueError where the `scene` has not what the output names."""
+        """Raise ValueError for names that the `scene` lacks."""
 
 
 def _check_name(output: Output, name, scene: Scene) -> None:
@@ -42,7 +43,7 @@ def _check_name(output: Output, name, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class End(Output):
-    """The value of the coordinate or speed `name` at the end of the motion: at its last time or at an event.
+    """The value of the coordinate or speed `name` at the end of the motion, at its last time or at an event.
     `unit`: a text stored with it.
     """
 
@@ -81,7 +82,7 @@ class _Along(Output):
     @staticmethod
     @abstractmethod
     def _number(times, values, count) -> Scalar:
-        """The number, of the first `count` values of the quantity at these times."""
+        """Return the number, from the first `count` values of the quantity at these times."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,9 @@ class LargestMagnitude(_Along):
 @dataclass(frozen=True)
 class Integral(_Along):
     """The integral of a `quantity` over time, from the start to the end of the motion. `unit`: a text stored
-    with it, that of the quantity times s.
+    with it, the quantity's unit times s.
 
-    `quantity`: as of `Largest`.
+    `quantity`: as in `Largest`.
     """
 
     _number = staticmethod(integral)
@@ -127,7 +128,7 @@ class Integral(_Along):
 
 @dataclass(frozen=True)
 class OfEvent(Output):
-    """A number of the stop event named `event`, or of any event if that is None."""
+    """A number of the stop event named `event`, or of any event for None."""
 
     event: str | None = None
     over_times = False
@@ -135,8 +136,10 @@ class OfEvent(Output):
     def check(self, scene: Scene) -> None:
         valid = names_of_events(scene)
         if not valid:
-            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no "
-                "stop events; give it a method `events`")
+            raise ValueError(
+                f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no stop events; "
+                "give it a method `events`"
+            )
         if self.event is not None and self.event not in valid:
             raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such "
                 f"stop event; {nearest(self.event, valid)}")
@@ -148,8 +151,7 @@ class OfEvent(Output):
 
 @dataclass(frozen=True)
 class EventTime(OfEvent):
-    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN where it did
-    not.
+    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN if it did not.
     """
 
     unit = "s"
@@ -160,8 +162,8 @@ class EventTime(OfEvent):
 
 @dataclass(frozen=True)
 class Happened(OfEvent):
-    """1 where the stop event `event` (default: any event) ended the motion, otherwise 0. Its mean is the
-    fraction of such lanes.
+    """1 if the stop event `event` (default: any event) ended the motion, otherwise 0. Its mean is the
+    fraction of such samples.
     """
 
     def of(self, motion: Trajectory) -> Scalar:
@@ -170,9 +172,9 @@ class Happened(OfEvent):
 
 @dataclass(frozen=True)
 class Quantity(Output):
-    """A number that `function` computes from a `Trajectory` by operations of JAX, with its `unit` as a text.
+    """A number computed by `function` from a `Trajectory` with operations of JAX, and its `unit` as a text.
 
-    jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
+        jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """
 
     function: Callable
@@ -188,8 +190,8 @@ class Quantity(Output):
 
 
 def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
-    """Check the outputs and return them by name. A function becomes a `Quantity`; None means the end values
-    of all coordinates and speeds.
+    """Return the checked outputs by name. A function becomes a `Quantity`; None means the end values of all
+    coordinates and speeds.
     """
     if outputs is None:
         outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names, *scene.speed_names)}

@@ -1,4 +1,4 @@
-"""What came out of a study: statistics, failures, single lanes, labelled arrays."""
+"""Results of a study: statistics, failures, single samples, labelled arrays."""
 
 import math
 from collections.abc import Sequence
@@ -27,17 +27,17 @@ LEVELS = (0.025, 0.5, 0.975)
 
 @dataclass(frozen=True, repr=False)
 class Lane(Printed):
-    """One lane of a study: the data to repeat it alone, and its stored results."""
+    """One sample of a study: the data to repeat it, and its stored results."""
 
     task: Task
     number: int
-    starts: dict[str, object]  # as `jj.start` takes them
+    starts: dict[str, object]  # in the form of arguments of `jj.start`
     parameters: dict[str, float]
-    kept: dict[str, float]  # result code, steps, outputs; empty where nothing is kept of single lanes
+    kept: dict[str, float]  # result code, steps, outputs; empty if only statistics are stored
 
     def simulate(self, **options) -> Trajectory:
-        """Simulate this lane with the options of the study; `options` replace some of them, such as `ts=` or
-        `rtol=`.
+        """Simulate this sample with the options of the study; `options` replace some of them, such as `ts=`
+        or `rtol=`.
         """
         task = self.task
         own = task.scene.replace(**self.parameters) if self.parameters else task.scene
@@ -55,9 +55,9 @@ class Lane(Printed):
 class StudyResult(Printed):
     """Results of a study, read from its folder.
 
-    `store.path` is the folder; `xarray.open_zarr` also opens it. Numbers cover finished chunks; `complete`:
-    whether all are finished. `left_out`: indices of chunks whose receipt is damaged or belongs to another
-    study. They do not count, and `study.run` computes them again.
+    `store.path` is the folder; `xarray.open_zarr` also opens it. Statistics cover the finished chunks;
+    `complete`: whether all are finished. `left_out`: indices of chunks whose receipt is damaged or belongs to
+    another study. They do not count, and `study.run` computes them again.
     """
 
     def __init__(self, store: Store, task: Task | None = None):
@@ -72,39 +72,41 @@ class StudyResult(Printed):
 
     @property
     def outputs(self) -> Labels:
-        """Names of the outputs."""
+        """Return names of the outputs."""
         return self.store.outputs
 
     @property
     def varied(self) -> Labels:
-        """Names of varying quantities: parameters, and start values with `_at_start`."""
+        """Return names of varying quantities: parameters, and start values with `_at_start`."""
         return tuple(self.store.study["varied"])
 
     @property
     def complete(self) -> bool:
-        """Whether all chunks are done."""
+        """Return whether all chunks are finished."""
         return len(self._done) == self.store.chunks
 
     @property
     def counts(self) -> dict[str, int]:
-        """Samples per result code, by its name, without unused codes."""
+        """Return the number of samples per result code, by its name, without unused codes."""
         return {name: int(count) for name, count in zip(CODES, self._tally.codes, strict=True) if count}
 
     @property
     def failed(self) -> np.ndarray:
-        """Numbers of the samples that reached neither their end nor an event."""
+        """Return indices of the samples that reached neither their end nor an event."""
         return self._tally.failed
 
     def lane(self, number: int) -> Lane:
-        """Return sample `number`: its parameters and start, its stored results, and `.simulate()`; IndexError
-        if there is none.
+        """Return sample `number`: its parameters and start, its stored results, and `.simulate()`. Raises
+        IndexError if there is none.
         """
         if not 0 <= number < len(self):
             raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to "
                 f"{len(self) - 1}")
         if self.task is None:
-            raise ValueError("the scene of this study is not known here; call `study.run` with the same "
-                "arguments, which computes nothing again")
+            raise ValueError(
+                "the scene of this study is unknown here; call `study.run` with the same arguments, which "
+                "recomputes nothing"
+            )
         kept = {}
         if self.store.columns:
             self.store.check_arrays({number // self.store.chunk}.intersection(self.store.receipts()))
@@ -114,11 +116,14 @@ class StudyResult(Printed):
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
+        """Return means, covariances, histograms and extremes of the outputs over the samples that have them.
+        """
         grid = self.store.read_grid()
         if grid is None or not self._done:
-            raise ValueError(f"no chunk of `{self.store.path}` is finished, or `run/grid.json` is damaged; "
-                "run the study, which computes it")
+            raise ValueError(
+                f"no chunk of `{self.store.path}` is finished, or `run/grid.json` is damaged; run the study, "
+                "which computes it"
+            )
         return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 
     def mean(self, output: str) -> float:
@@ -142,7 +147,7 @@ class StudyResult(Printed):
         return self.statistics.quantile(output, level)
 
     def histogram(self, output: str, cells: int = 64) -> tuple[np.ndarray, np.ndarray]:
-        """Return the number of lanes per cell of an `output`, and the edges of the cells. There are about
+        """Return the number of samples per cell of an `output`, and the edges of the cells. There are about
         `cells` cells, each made of several cells of the stored grid.
         """
         if cells < 1:
@@ -153,20 +158,20 @@ class StudyResult(Printed):
         first, last = (inside[0], inside[-1] + 1) if inside.size else (0, len(counts))
         step = max(1, math.ceil((last - first) / cells))
         starts = np.arange(first, last, step)
-        # the last one is as wide as the others, unless it holds what lies beyond the grid
+        # the last cell is as wide as the others, unless it holds values beyond the grid
         end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
     def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the histogram, and marks of its cells that extend beyond the grid. The lanes in such a cell
-        may lie anywhere in it.
+        """Return the histogram, and marks of its cells that extend beyond the grid, in which the position of
+        samples is unknown.
         """
         (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
         return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])
 
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
-        """Return first-order and total Sobol' indices of an `output`, with intervals that contain each with
-        the given `confidence`. Requires sampler="saltelli".
+        """Return first-order and total Sobol' indices of an `output`, with intervals of the given
+        `confidence`. Requires sampler="saltelli".
         """
         self._place(output)
         if self.store.study["sampler"] != "saltelli":
@@ -181,10 +186,10 @@ class StudyResult(Printed):
         return self.outputs.index(output)
 
     def to_xarray(self):
-        """Return all arrays as an `xarray.Dataset` with names and units, read on use. Unfinished lanes are
+        """Return all arrays as an `xarray.Dataset` with names and units, read on use. Unfinished samples are
         NaN and have the result -1.
 
-        Raises ValueError for damaged arrays; all are read once here to check them.
+        Raises ValueError for damaged arrays; all arrays are read once here for this check.
         """
         self.store.check_arrays(self.store.receipts())
         return self._opened()
@@ -216,7 +221,7 @@ class StudyResult(Printed):
         return drawn
 
     def _draw(self, whole, names: Sequence[str], cells: int = 64) -> None:
-        """Draw lanes per cell of outputs side by side. Cells that extend beyond the grid are pale; a line
+        """Draw samples per cell of outputs side by side. Cells that extend beyond the grid are pale; a line
         marks the mean.
         """
         for k, name in enumerate(names):
@@ -234,14 +239,12 @@ class StudyResult(Printed):
 
     def _repr_html_(self) -> str:
         drawn = [name for name in self.outputs if self._done and self._bars(name, 40)[0].sum() > 0]
-        shown = drawn[:12]  # in a notebook
+        shown = drawn[:12]  # limit for a notebook
         more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
         return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
 
     def _in_short(self, output: str, level: float) -> str:
-        """Return a quantile as one number, the middle of its cell. For a quantile beyond the grid, name the
-        side.
-        """
+        """Return a quantile as one number, the middle of its cell; beyond the grid, as a bound."""
         (low, high), grid, i = self.quantile(output, level), self.statistics.grid, self._place(output)
         beyond = (">", low) if low >= grid.high[i] else ("<", high) if high <= grid.low[i] else None
         return f"{beyond[0]} {beyond[1]:.5g}" if beyond and low < high else f"{(low + high) / 2:.5g}"
@@ -269,10 +272,10 @@ class StudyResult(Printed):
 
 
 def load_study(path: FilePath) -> StudyResult:
-    """Open the results of a study in the folder `path`, finished or not, without its scene. `study.run` with
-    equal arguments also offers `.lane(k).simulate()`.
+    """Return the results of a study in the folder `path`, finished or not, without its scene. `study.run`
+    with the same arguments also offers `.lane(k).simulate()`.
 
-    A warning names damaged chunks, whose lanes do not count (`left_out`). Raises ValueError where the folder
+    A warning names damaged chunks, whose samples do not count (`left_out`). Raises ValueError if the folder
     holds no study, a study of an unknown format, or one with a damaged description.
     """
     found = StudyResult(Store(path))
@@ -286,7 +289,7 @@ def merge_studies(path: FilePath, shares: Sequence[FilePath]) -> StudyResult:
     """Copy chunks from the folders `shares` of one study (`study.run(..., shard=(k, n))`) into the folder
     `path`, which is one of them.
 
-    Damaged chunks are omitted; `study.run` then computes what is missing. Raises ValueError where a folder
+    Damaged chunks are omitted; `study.run` then computes the missing ones. Raises ValueError if a folder
     holds another study.
     """
     target = Store(path)

@@ -1,17 +1,19 @@
-"""Functions of doubles that have the same bits in NumPy on the host and by JAX on a device: one text, each operation of which is rounded by itself.
+"""Functions of doubles with identical bits in NumPy on the host and in JAX on a device: one source, with
+every operation rounded separately.
 
-Sums, quotients and roots are rounded alike everywhere. Of a product that is added to something a compiler makes one operation with one rounding, on some
-machines: `product` keeps it apart. The normal distribution and its inverse are those of Cephes, as in SciPy,
-with the exponential and the logarithm of fdlibm (errors of one unit in the last place and below), and one
-pair of
-polynomials for all of a tail of the inverse (right to 3e-15 for u > 1e-16, to 1e-13 for u > 1e-22).
+Sums, quotients and roots are rounded identically everywhere. On some machines, however, compilers fuse a
+product and a sum into one operation with one rounding; `product` prevents this. The normal distribution and
+its inverse are those of Cephes, as in SciPy, with the exponential and the logarithm of fdlibm (errors of at
+most one unit in the last place). One pair of polynomials serves each tail of the inverse (accurate to 3e-15
+for u > 1e-16, to 1e-13 for u > 1e-22).
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-_LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # in two parts; a whole number times the first is exact
+# in two parts; the first times an integer is exact
+_LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LOG = (
     1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01, 2.222219843214978396e-01, 2.857142874366239149e-01,
     3.999999999940941908e-01, 6.666666666666735130e-01,
@@ -55,15 +57,14 @@ _FARTHER = (
 
 
 def library(x):
-    """The library of the array `x`: NumPy, or JAX's."""
+    """Return the library of the array `x`: NumPy or JAX's."""
     return jnp if isinstance(x, jax.Array) else np
 
 
 def apart(x, u):
-    """Return x unchanged, in a way that keeps a compiler from combining it with other operations.
+    """Return x unchanged, but so that a compiler cannot fuse it with other operations.
 
-    `u`: a positive argument of the program. Its sign, which the compiler cannot know to be positive, is
-    combined with x.
+    `u`: a positive argument of the program. Its sign bit, unknown to the compiler, is combined with x.
     """
     if not isinstance(u, jax.Array):
         return x
@@ -72,7 +73,7 @@ def apart(x, u):
 
 
 def product(a, b, u):
-    """Return a b, rounded by itself; `u` as in `apart`."""
+    """Return a b, rounded separately; `u` as in `apart`."""
     return apart(a * b, u)
 
 
@@ -84,7 +85,7 @@ def _polynomial(coefficients, x, u):
 
 
 def _logarithm(x, u):
-    """log x, for finite x > 0; `u` as in `product`."""
+    """Return log x, for finite x > 0; `u` as in `product`."""
     xp = library(x)
     m, k = xp.frexp(x)
     small = m < 0.5**0.5
@@ -96,7 +97,7 @@ def _logarithm(x, u):
 
 
 def exponential(x, u):
-    """Return e^x; of complex numbers on the host alone."""
+    """Return e^x; complex x only on the host."""
     if np.iscomplexobj(x):
         return exponential(x.real, u) * np.exp(1j * x.imag)
     xp = library(x)
@@ -110,7 +111,7 @@ def exponential(x, u):
 
 
 def normal_probability(x, u):
-    """Return the probability that a standard normal number lies below x; `u` as in `apart`, of the shape of
+    """Return the probability that a standard normal number is below x; `u` as in `apart`, with the shape of
     x.
     """
     xp = library(x)
@@ -128,8 +129,8 @@ def normal_probability(x, u):
 def correlated(factor, u):
     """Return probabilities of correlated numbers from those of independent ones, (samples, variables).
 
-    Normal numbers with these probabilities are multiplied by the rows of `factor` one after another, since a
-    product of matrices may round differently.
+    Normal numbers with these probabilities are multiplied by the rows of `factor` in sequence, since a matrix
+    product may round differently.
     """
     xp, z, rows = library(u), normal_quantile(u), []
     for row in range(u.shape[1]):
@@ -141,7 +142,7 @@ def correlated(factor, u):
 
 
 def _outer_quantile(y, u):
-    """The quantile of 1 - y, for y <= exp(-2)."""
+    """Return the quantile of 1 - y, for y <= exp(-2)."""
     x = library(y).sqrt(-2.0 * _logarithm(y, u))
     z = 1.0 / x
     top, bottom = (_polynomial(of, z, u) for of in _OUTER)
@@ -149,7 +150,7 @@ def _outer_quantile(y, u):
 
 
 def normal_quantile(u):
-    """Return the number below which a standard normal number lies with the probability u, 0 < u < 1. u is an
+    """Return the value below which a standard normal number lies with probability u, 0 < u < 1. u must be an
     argument of the program.
     """
     xp = library(u)
@@ -161,7 +162,7 @@ def normal_quantile(u):
     middle, outer = (d + product(d, dd * top / bottom, u)) * _ROOT, y <= _TAIL
     if isinstance(u, jax.Array):
         tail = _outer_quantile(jnp.minimum(y, _TAIL), u)
-    else:  # the few that lie there alone
+    else:  # only for the few in the tails
         tail = np.zeros_like(u)
         tail[outer] = _outer_quantile(y[outer], y[outer])
     return xp.where(outer, xp.where(upper, tail, -tail), middle)

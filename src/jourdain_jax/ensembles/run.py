@@ -1,6 +1,8 @@
-"""Running a study: the chunks that are missing, one after another, each kept before the next begins; a bar; what an interruption does.
+"""Running a study: computes and stores the missing chunks in sequence, with a progress bar, and handles
+interruptions.
 
-The first Ctrl-C lets the chunk under way end; a second one ends at once. Both leave a folder from which the same call goes on.
+After the first Ctrl-C the current chunk is finished; a second one stops at once. The same call continues from
+either.
 """
 
 import json
@@ -36,10 +38,10 @@ PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr"
 
 @dataclass(frozen=True)
 class Lanes:
-    """Results of a block of lanes: the stored values by column, the ends of lanes by the names of `OF_LANES`,
-    and all outputs (lanes, outputs).
+    """Results of a block of samples: the stored values by column, the ends of motions by the names of
+    `OF_LANES`, and all outputs (samples, outputs).
 
-    The last two are on the device, and may have additional lanes, which do not count.
+    The last two are on the device, and may be padded.
     """
 
     lanes: range
@@ -49,9 +51,9 @@ class Lanes:
 
 
 class Runner:
-    """Computes and stores chunks of one task in this process.
+    """Computation and storage of chunks of one task in this process.
 
-    Every process first computes the first block: it gives the grid of the statistics, and its compiled
+    Every process first computes the first block: it determines the grid of the statistics, and its compiled
     programs serve all others.
     """
 
@@ -65,13 +67,14 @@ class Runner:
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
             warn(
-                f"the first {task.block} lanes of `{store.path}` have other bits here than where the study began (another machine, or other "
-                "versions); results are right, but not bit-equal to those of one machine"
+                f"the first {task.block} lanes of `{store.path}` have other bits here than where the study "
+                "began (another machine, or other versions); results are right, but not bit-equal to those "
+                "of one machine"
             )
         self.grid = Grid.from_dict(kept, len(task.outputs))
 
     def run(self, number: int) -> tuple[int, int]:
-        """Compute and store a chunk. Return the number of its lanes and of the failed ones."""
+        """Compute and store a chunk. Return the number of its samples and of the failed ones."""
         first, last = self.store.span(number)
         kept, tallies = [], []
         for number_of_block in range(first // self.task.block, -(-last // self.task.block)):
@@ -84,7 +87,7 @@ class Runner:
         return last - first, tally.failed.size
 
     def run_block(self, number: int) -> Lanes:
-        """All lanes of a block."""
+        """Return the results of all samples of a block."""
         task = self.task
         first = number * task.block
         count = min(task.block, len(task.design) - first)
@@ -118,10 +121,10 @@ def _rows(array, index):
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
-    """Return the task, and the number of lanes of its chunks. Blocks have the size used in the folder or, in
-    a new folder, a size that keeps a process below `allowed` bytes.
+    """Return the task, and the number of samples of its chunks. Blocks have the size used in the folder or,
+    in a new folder, a size that keeps a process below `allowed` bytes.
 
-    `here`: whether this process computes. Raises ValueError where blocks or chunks would need more.
+    `here`: whether this process computes. Raises ValueError if blocks or chunks need more.
     """
     begun = Store(path) if Store.is_taken(path) else None
     if begun:
@@ -146,7 +149,7 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
 
 
 def opened(task: Task, path, chunk: int | None, command: str) -> Store:
-    """Open the folder of the task, new or existing. Raises ValueError where it holds another study."""
+    """Return the store of the task's folder, new or existing. Raises ValueError if it holds another study."""
     columns = task.columns()
     if Store.is_taken(path):
         store = Store(path)
@@ -166,20 +169,22 @@ def _constants(task: Task) -> dict[str, tuple]:
 
 
 def _chunk(task: Task, chunk: int | None) -> int:
-    """Return the number of lanes of a chunk: whole blocks and whole strides of saved lanes, by default about
-    a thousandth of all lanes.
+    """Return the number of samples of a chunk: whole blocks and whole strides of saved samples, by default
+    about a thousandth of all samples.
     """
     unit = np.lcm(task.block, task.stride)
     if chunk is None:
         return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
-        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so "
-            "many are computed together in this study")
+        raise ValueError(
+            f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are "
+            "computed together in this study"
+        )
     return int(chunk)
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes."""
+    """Return versions of Python and the packages that compute."""
     return {"python": python_version()} | {name: version_of(name) for name in PACKAGES}
 
 
@@ -189,7 +194,7 @@ def _study(task: Task, chunk: int | None, command: str) -> dict:
 
 
 def attributes(task: Task) -> dict:
-    """What the store says of itself."""
+    """Return the attributes of the store, which describe the study."""
     parameters = {name: {"value": np.asarray(value).tolist(), "unit": about["unit"]} for name, value, about in parameters_of(task.scene)}
     return {
         "title": f"study of {type(task.scene).__name__}",
@@ -210,7 +215,7 @@ def attributes(task: Task) -> dict:
 
 
 def _as_text(x) -> object:
-    """Return an option as text; numbers stay numbers. Memory addresses of functions, which differ in every
+    """Return an option as text; numbers stay numbers. Memory addresses of functions, different in every
     process, are omitted.
     """
     return np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
@@ -234,8 +239,8 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
-    """Name a part of a study that differs. For the scene, its options or its start, also name the entries
-    that differ.
+    """Return the name of a differing part of a study, with the differing entries of the scene, its options or
+    its start.
     """
     kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part)
     if kept is None:
@@ -248,7 +253,7 @@ def _difference(part: str, was: dict, now: dict) -> str:
 
 @contextmanager
 def _interruptions() -> Iterator[Callable[[], bool]]:
-    """A function that says whether Ctrl-C was pressed. Pressed twice, it interrupts as always."""
+    """Yield a function that returns whether Ctrl-C was pressed. A second press interrupts as usual."""
     pressed = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield pressed.is_set
@@ -271,7 +276,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
     """Compute the missing part of a task in the folder `path`.
 
     `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
-    numbers of lanes and of failed lanes, chunk by chunk.
+    numbers of samples and of failed ones, chunk by chunk.
     """
     store = opened(task, path, chunk, command)
     with store.lock():
@@ -289,7 +294,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
                 bar.update(lanes)
                 bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
             stopped = interrupted() and finished < len(missing)
-        if not stopped and store.read_grid() is None:  # damaged, or that of a share without a chunk
+        if not stopped and store.read_grid() is None:  # damaged, or of a share without a chunk
             Runner(task, store)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
@@ -299,7 +304,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
 
 
 def in_this_process(task: Task, store: Store, numbers, interrupted) -> Iterator[tuple[int, int]]:
-    """One chunk after another."""
+    """Yield sample counts of the chunks, computed in sequence in this process."""
     runner = None
     for number in numbers:
         if interrupted():

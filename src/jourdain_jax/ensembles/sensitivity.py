@@ -1,12 +1,14 @@
-"""Sobol' indices: which share of an output's variance is due to each quantity that varies.
+"""Sobol' indices: the share of an output's variance due to each varying quantity.
 
-With A_j, B_j independent samples and AB_j^i equal to A_j but for quantity i, which is that of B_j (Saltelli et al. 2010):
+With independent samples A_j, B_j, and AB_j^i equal to A_j except for quantity i, taken from B_j (Saltelli et
+al. 2010):
 
-    S_i  = mean_j f(B_j) (f(AB_j^i) - f(A_j)) / V             first order: what fixing quantity i would take away   (their table 2, b)
-    ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)              total: what is left if all others are fixed           (Jansen 1999; table 2, f)
+    S_i  = mean_j f(B_j) (f(AB_j^i) - f(A_j)) / V    first order: reduction of V if i is fixed (table 2, b)
+    ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)     total: remainder if all others are fixed (2, f; Jansen 1999)
 
-V is the variance over all A_j and B_j; f is taken relative to its mean, which makes the errors small. Intervals: standard errors from groups of samples drawn
-again with replacement (Efron's bootstrap), times the normal quantile of the confidence.
+V is the variance over all A_j and B_j; f is taken relative to its mean, which reduces the errors. Intervals:
+standard errors from groups of samples drawn again with replacement (Efron's bootstrap), times the normal
+quantile of the confidence.
 """
 
 from collections.abc import Sequence
@@ -22,8 +24,8 @@ special = module_on_first_use("scipy.special")
 
 @dataclass(frozen=True, repr=False)
 class SobolIndices(Printed):
-    """Sobol' indices of one output by the varying quantities; each lies in `value +- half-width` with the
-    stated confidence.
+    """Sobol' indices of one output for the varying quantities, each as `value +- half-width` at the stated
+    confidence.
     """
 
     names: tuple[str, ...]
@@ -32,8 +34,8 @@ class SobolIndices(Printed):
     total: np.ndarray
     total_half_width: np.ndarray
     confidence: float
-    groups: int  # of samples, that were used
-    left_out: int  # groups of which some sample has no finite value
+    groups: int  # number of groups of samples used
+    left_out: int  # number of groups with a sample without a finite value
 
     def _text(self) -> str:
         width = max(map(len, self.names))
@@ -55,9 +57,9 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
         at = design.values()
         print(jj.sobol_indices(at["a"] + at["b"] ** 2, design.names))
 
-    `confidence`: that of each interval. Groups with a value that is not finite are omitted and counted; if
-    these are many or not random, the indices describe only the rest. Raises ValueError where the number of
-    values is no multiple of variables + 2, or nothing varies.
+    `confidence`: of each interval. Groups with a value that is not finite are omitted and counted; if they
+    are many or not random, the indices describe only the rest. Raises ValueError if the number of values is
+    no multiple of variables + 2, or if nothing varies.
     """
     values, names = np.asarray(values, float), tuple(names)
     group = len(names) + 2
@@ -69,7 +71,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     groups = values.reshape(-1, group)
     sound = np.isfinite(groups).all(axis=1)
     groups = groups[sound]
-    if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # those whose variance is divided by
+    if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # whose variance is the divisor
         raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' "
             "indices need a quantity that varies")
     generator = np.random.default_rng(0)
@@ -80,7 +82,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
 
 
 def _indices(groups: np.ndarray) -> np.ndarray:
-    """S and ST, shape (2, variables), from rows f(A), f(AB^1), ..., f(B)."""
+    """Return S and ST, shape (2, variables), from rows f(A), f(AB^1), ..., f(B)."""
     centred = groups - groups[:, [0, -1]].mean()
     a, mixed, b = centred[:, :1], centred[:, 1:-1], centred[:, -1:]
     variance = np.concatenate([a, b]).var()

@@ -1,17 +1,18 @@
-"""Statistics of outputs while a study runs, the same bits whatever the chunks and their order.
+"""Running statistics of a study's outputs, with bits independent of the chunks and their order.
 
-Lanes are counted by JAX on the device where they lie, in doubles; sums and histograms alone come to the host. They are summed block by block (a block:
-some thousand lanes with fixed numbers), about a centre c near the mean. With m_i = 1 where output i is finite and
-x_i = 0 where it is not, a block gives
+JAX counts samples on their device, in doubles, and only sums and histograms reach the host. Sums are taken
+block by block (a block: some thousand samples with fixed indices), about a centre c near the mean. With m_i =
+1 where output i is finite and x_i = 0 where it is not, a block gives
 
     N_ij = sum m_i m_j,   A_ij = sum (x_i - c_i) m_j,   S_ij = sum (x_i - c_i)(x_j - c_j)
 
-and the sums over blocks are rounded once (Shewchuk's exact sums, `math.fsum`), so that their order does not matter. Then, over the lanes that have both,
+The sums over blocks are rounded once (Shewchuk's exact sums, `math.fsum`), so that their order has no effect.
+Then, over the samples with both outputs,
 
     mean_i = c_i + A_ii / N_ii,    cov_ij = (S_ij - A_ij A_ji / N_ij) / (N_ij - 1)
 
-Histograms count in cells of a fixed grid, from twice the range of the first block; lanes beyond it are counted below and above. A quantile is known to
-the cell that holds it, and the smallest and largest values are exact.
+Histograms count in cells of a fixed grid, twice the range of the first block; samples beyond it are counted
+below and above. A quantile is known to its cell; the smallest and largest values are exact.
 """
 
 import math
@@ -39,7 +40,7 @@ class Grid:
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Grid":
-        """The grid for values of shape (lanes, outputs), those of the first block."""
+        """Return the grid for the values of the first block, shape (samples, outputs)."""
         ends = []
         for column in values.T:
             finite = column[np.isfinite(column)]
@@ -50,17 +51,17 @@ class Grid:
         return cls(low, high, centre)
 
     def edges(self) -> np.ndarray:
-        """The edges of the cells of all outputs, shape (outputs, CELLS + 1)."""
+        """Return the edges of the cells of all outputs, shape (outputs, CELLS + 1)."""
         return np.linspace(self.low, self.high, CELLS + 1, axis=1)
 
     def as_dict(self) -> dict:
-        """The grid for JSON; floats keep all their digits there."""
+        """Return the grid for JSON, where floats keep all their digits."""
         return {name: values.tolist() for name, values in vars(self).items()}
 
     @classmethod
     def from_dict(cls, found: dict, outputs: int) -> "Grid":
-        """Return the grid that `as_dict` wrote, for this number of `outputs`. Raises ValueError where its
-        numbers are not finite or not in order.
+        """Return the grid written by `as_dict`, for this number of `outputs`. Raises ValueError for numbers
+        that are not finite or not in order.
         """
         low, high, centre = numbers = [np.array(found[name], float) for name in ("low", "high", "centre")]
         if any(x.shape != (outputs,) or not np.isfinite(x).all() for x in numbers) or np.any((centre < low) | (centre > high)):
@@ -71,20 +72,21 @@ class Grid:
 
 @dataclass(frozen=True)
 class Tally:
-    """What is counted of some lanes, beside their columns; the arrays of a receipt."""
+    """Counts and sums of some samples, apart from their columns; the arrays of a receipt."""
 
-    codes: np.ndarray  # lanes per result code
-    again: np.ndarray  # (1,): lanes that were run again
+    codes: np.ndarray  # samples per result code
+    again: np.ndarray  # (1,): samples that were run again
     steps: np.ndarray  # (2,): accepted and rejected
-    failed: np.ndarray  # numbers of lanes
+    failed: np.ndarray  # indices of samples
     sums: np.ndarray  # (blocks, 3, outputs, outputs): N, A and S of each block
-    cells: np.ndarray  # (2, cells): places among (outputs, CELLS + 2) in which values lie, and how many; the first and last of each row are below and above
-    extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite where there is none
+    # (2, cells): nonempty cells among (outputs, CELLS + 2), and their counts; the first and last of each row
+    # are below and above
+    cells: np.ndarray
+    extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite if there is none
 
     @classmethod
     def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
-        """Return the tally of the first `lanes` of a block, from their results and their values (lanes,
-        outputs).
+        """Return the tally of the first `lanes` of a block, from the results and values (samples, outputs).
         """
         with jax.enable_x64(True):
             counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
@@ -96,7 +98,7 @@ class Tally:
 
     @classmethod
     def together(cls, several: Iterable["Tally"], outputs: int) -> "Tally":
-        """The tally of all lanes of `several`, of so many outputs."""
+        """Return the combined tally of `several`, for this number of outputs."""
         known = list(several)
         counts = np.zeros((outputs, CELLS + 2), np.int64)
         for one in known:
@@ -115,9 +117,7 @@ class Tally:
 
     @classmethod
     def checked(cls, arrays: Mapping[str, np.ndarray], lanes: range, outputs: int) -> "Tally":
-        """Return the tally in these arrays of some `lanes`. Raises ValueError where its numbers are out of
-        their ranges.
-        """
+        """Return the tally in these arrays of some `lanes`. Raises ValueError for numbers out of range."""
         codes, again, steps, failed, sums, (place, counts), extremes = (arrays[name] for name in cls.__dataclass_fields__)
         shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
         numbers = codes.sum() == len(lanes) and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
@@ -129,7 +129,7 @@ class Tally:
 
 @jax.jit
 def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
-    """Return the fields of a tally of the first `lanes` lanes without failed ones; `cells`: lanes in all
+    """Return the fields of a tally of the first `lanes` samples, without `failed`; `cells`: samples in all
     cells.
     """
     counts = jnp.arange(len(values)) < lanes
@@ -141,7 +141,7 @@ def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
         "codes": jnp.sum((ends["result"][:, None] == jnp.arange(len(CODES))) & counts[:, None], axis=0),
         "again": jnp.sum((ends["retries"] > 0) & counts)[None],
         "steps": jnp.stack([jnp.sum(jnp.where(counts, ends[name], 0), dtype=int) for name in ("steps", "rejected_steps")]),
-        # not by a product of matrices, whose rounding may depend on threads
+        # not by a matrix product, whose rounding may depend on threads
         "sums": jnp.stack([jnp.sum(a[:, :, None] * b[:, None], axis=0) for a, b in ((m, m), (x, m), (x, x))])[None],
         "cells": cells,
         "extremes": jnp.stack([jnp.min(values, 0, initial=jnp.inf, where=finite), jnp.max(values, 0, initial=-jnp.inf, where=finite)]),
@@ -154,11 +154,11 @@ def _sparse(counts: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of all outputs over the lanes that have them."""
+    """Statistics of all outputs over the samples that have them."""
 
     names: tuple[str, ...]
     grid: Grid
-    lanes: np.ndarray  # (outputs, outputs): lanes that have both
+    lanes: np.ndarray  # (outputs, outputs): samples with both
     mean: np.ndarray  # (outputs,)
     covariance: np.ndarray  # (outputs, outputs)
     extremes: np.ndarray  # (2, outputs)
@@ -166,12 +166,12 @@ class Statistics:
 
     @property
     def deviation(self) -> np.ndarray:
-        """Standard deviations, shape (outputs,)."""
+        """Return standard deviations, shape (outputs,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def histogram(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return lanes per cell of the output `name`, and the edges of the cells. Lanes beyond the grid are
-        in outer cells that extend to the extremes.
+        """Return samples per cell of the output `name`, and the edges of the cells. Samples beyond the grid
+        are in outer cells that extend to the extremes.
         """
         i = self.names.index(name)
         counts, (least, largest) = self.counts[i], self.extremes[:, i]
@@ -193,7 +193,7 @@ class Statistics:
 
 
 def combined(names: Sequence[str], grid: Grid, tally: Tally) -> Statistics:
-    """The statistics of all lanes of a tally."""
+    """Return the statistics of all samples of a tally."""
     sums = tally.sums.reshape(len(tally.sums), -1)
     n, a, s = np.array([math.fsum(entries) for entries in sums.T]).reshape(3, len(names), len(names))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,5 @@
-"""A study on the disk: a Zarr group (format 3) with one array per quantity along `lane`, and beside it what is needed to go on after an interruption.
+"""A study on disk: a Zarr group (format 3) with one array per quantity along `lane`, and files for continuing
+after an interruption.
 
     NAME/zarr.json, NAME/c/0, ...    arrays, cut into chunks of lanes; every chunk ends in its CRC-32C, as Zarr's codec `crc32c` has it
     run/study.json                   what study this is: format, digests, settings, versions; written once
@@ -7,9 +8,11 @@
     run/chunks/K                     receipt of chunk K: written when all its arrays are, with their checksums, its counts and its sums
     run/lock                         held by the process that runs the study
 
-A chunk counts as done if its receipt is whole, belongs to this study and this grid, and its arrays are there with the checksums of the receipt; otherwise it
-is computed again. A file that the manifest does not know is not there; the grid comes before the manifest that knows it. Processes that find the grid at the
-same time write the same one; on machines whose numbers differ, the chunks of the grid that was replaced do not count. Chunks need no manifest.
+A chunk counts as finished if its receipt is intact and belongs to this study and grid, and its arrays match
+the checksums of the receipt; otherwise it is computed again. Files that are not in the manifest count as
+missing; the grid is written before the manifest that lists it. Processes that compute the grid at the same
+time write the same one. On machines whose numbers differ, chunks of a replaced grid do not count. Chunks need
+no manifest.
 """
 
 import contextlib
@@ -42,7 +45,7 @@ _MANIFEST, _GRID = "run/manifest.json", "run/grid.json"
 @dataclass(frozen=True)
 class Column:
     """One array of a study: its type, its axes after the first (name, length), its value for missing entries,
-    and its attributes. `every`: it holds one lane in this many.
+    and its attributes. `every`: it stores every so many samples.
     """
 
     dtype: str
@@ -54,7 +57,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Receipt:
-    """What is known of a chunk that was done."""
+    """The record of a finished chunk."""
 
     first: int
     last: int
@@ -64,7 +67,7 @@ class Receipt:
 
     @property
     def lanes(self) -> tuple[int, int]:
-        """How many lanes the chunk has, and how many of them failed."""
+        """Return the number of samples of the chunk, and of failed ones."""
         return self.last - self.first, self.tally.failed.size
 
     def packed(self) -> bytes:
@@ -80,7 +83,7 @@ class Receipt:
     @staticmethod
     def unpacked(content: bytes, outputs: int) -> "Receipt":
         """Return the receipt in these bytes, for a study with this number of `outputs`. Raises ValueError, or
-        another error of the reader, where they are damaged.
+        another error of the reader, for damaged bytes.
         """
         if not content.startswith(_BEGIN) or content != _ended(content[:-4]):
             raise ValueError("the receipt of a chunk is torn")
@@ -105,13 +108,14 @@ class Store:
         self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
         self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
         self.outputs = tuple(self.study.get("outputs", ()))
-        decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # the same in all shares
+        decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # equal in all shares
         self.identity = _digest(json.dumps(decides).encode())
 
     @staticmethod
     def make(path: FilePath, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
-        """Create a folder, whole or not at all; an existing one is not changed. `constants`: name -> axis,
-        values, attributes."""
+        """Create a folder, completely or not at all; an existing one is not changed. `constants`: name ->
+        axis, values, attributes.
+        """
         zarr = needed("zarr", "storing a study", "studies")
         path = Path(path)
         if fault := _beyond(study):
@@ -121,7 +125,8 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that consolidated metadata are not yet in the standard: xarray looks for them
+                # a warning that consolidated metadata, which xarray reads, are not yet standard
+                warnings.simplefilter("ignore")
                 group = zarr.create_group(beside, zarr_format=3, attributes=dict(attributes))
 
                 def array(name: str, axes: Sequence[str], shape, chunks, about: Mapping, **kind):
@@ -142,7 +147,7 @@ class Store:
             write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
             files = [file for file in beside.rglob("*") if file.is_file()]
             _write_manifest(beside, {file.relative_to(beside).as_posix(): _digest(file.read_bytes()) for file in files})
-            with contextlib.suppress(OSError):  # an empty folder, whose place Windows does not give to another one
+            with contextlib.suppress(OSError):  # an empty folder, which blocks a rename on Windows
                 path.rmdir()
             try:
                 os.rename(beside, path)
@@ -157,7 +162,7 @@ class Store:
         return Store(path)
 
     def _read_study(self) -> dict:
-        """What study this is, its numbers within their ranges."""
+        """Return the description of the study, with its numbers checked."""
         if not os.path.exists(self.path / "run" / "study.json"):
             if os.path.isfile(self.path):
                 raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
@@ -172,8 +177,8 @@ class Store:
         return found
 
     def _read_manifest(self) -> dict[str, str]:
-        """Return the digests of the files that are written once, by name, after a check that each file exists
-        and matches. The grid is excepted, since it can be computed again.
+        """Return the digests of the files that are written once, by name, after checking that each file
+        exists and matches. The grid is exempt, since it can be computed again.
         """
         found = self._json(_MANIFEST)
         digests = found.get("digests")
@@ -185,14 +190,14 @@ class Store:
         return digests
 
     def _json(self, name: str) -> dict:
-        """The dictionary in a file of JSON."""
+        """Return the dictionary in a JSON file."""
         found = parsed(json.loads, self._read(name), f"{self.path}/{name}", "valid JSON")
         if not isinstance(found, dict):
             raise self._damaged(name)
         return found
 
     def _read(self, name: str) -> bytes:
-        # bytes of one of the files that are written once
+        # a file that is written once
         return read_bytes(self.path / name, 100_000_000, "the folder of a study with all its files")
 
     def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
@@ -201,44 +206,44 @@ class Store:
 
     @property
     def attributes(self) -> dict:
-        """Attributes of the whole store, by name."""
+        """Return attributes of the whole store, by name."""
         return json.loads(self._read("zarr.json"))["attributes"]
 
     def lanes_of(self, numbers: Sequence[int]) -> str:
-        """The lanes of chunks, in words."""
+        """Return a text that names the samples of chunks."""
         spans = (f"{first} to {last - 1}" for first, last in map(self.span, numbers[:5]))
         return f"lanes {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
 
     @staticmethod
     def is_taken(path: FilePath) -> bool:
-        """Whether something is at `path`; an empty folder does not count."""
+        """Return whether something is at `path`; an empty folder does not count."""
         path = name_of(path)
         return os.path.exists(path) and not (os.path.isdir(path) and not os.listdir(path))
 
     def lock(self):
-        """A context in which no other process can run this study."""
+        """Return a context in which no other process can run this study."""
         return locked(self.path / "run" / "lock")
 
     @property
     def chunks(self) -> int:
-        """How many there are."""
+        """Return the number of chunks."""
         return -(-self.lanes // self.chunk)
 
     def span(self, number: int) -> tuple[int, int]:
-        """First lane of a chunk, and first of the next."""
+        """Return the first sample of a chunk, and the first of the next."""
         return number * self.chunk, min((number + 1) * self.chunk, self.lanes)
 
     def _file(self, name: str, number: int) -> Path:
-        """Return the file of a chunk. An array with several axes has one folder for every chunk, since only
-        the axis of lanes is divided.
+        """Return the file of a chunk. An array with several axes has one folder per chunk, since only the
+        first axis is divided.
         """
         return (self.path / name / "c" / str(number)).joinpath(*["0"] * len(self.columns[name].more))
 
     def _write(self, name: str, number: int, content: bytes) -> None:
-        """Put the file of a chunk in its place."""
+        """Write the file of a chunk."""
         file = self._file(name, number)
         if self.columns[name].more:
-            file.parent.mkdir(exist_ok=True)  # in a folder that is there: one that was moved away is not made again
+            file.parent.mkdir(exist_ok=True)  # without parents: a folder that was moved away is not recreated
         write_whole(file, content)
 
     def _receipt_file(self, number: int) -> Path:
@@ -246,19 +251,22 @@ class Store:
 
     @contextlib.contextmanager
     def _named(self) -> Iterator[None]:
-        """Errors of the system say what became of the study."""
+        """Return a context in which errors of the system also describe the state of the study."""
         try:
             yield
         except OSError as error:
             if not (self.path / "run").is_dir():
-                text = f"the folder is gone: it was moved or removed while the study ran; put it back, or run it again under its new name ({error.strerror})"
+                text = (
+                    "the folder is gone: it was moved or removed while the study ran; put it back, or run it "
+                    f"again under its new name ({error.strerror})"
+                )
             else:
                 kept = f"{len(self.receipts())} of {self.chunks} chunks are kept"
                 text = f"{error.strerror or type(error).__name__}; {kept}: make room or mend the folder, and run the study again to go on"
             raise OSError(error.errno, text, str(self.path)) from error
 
     def write(self, number: int, values: Mapping[str, np.ndarray], tally: Tally) -> None:
-        """Keep a chunk: the values of all columns, then its receipt."""
+        """Store a chunk: the values of all columns, then its receipt."""
         checksums = {}
         with self._named():
             for name, column in self.columns.items():
@@ -271,8 +279,9 @@ class Store:
             write_whole(self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed())
 
     def receipt(self, number: int) -> Receipt | None:
-        """Return the receipt of a chunk; None if there is none, if it is damaged, or if it belongs to another
-        chunk, study or grid."""
+        """Return the receipt of a chunk; None if it is missing, damaged, or belongs to another chunk, study
+        or grid.
+        """
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
             own = [self.identity, self._digests.get(_GRID, found.of[-1])]
@@ -281,7 +290,7 @@ class Store:
             return None
 
     def receipts(self) -> list[int]:
-        """Numbers of chunks that have a receipt, whole or not, in order."""
+        """Return indices of chunks that have a receipt, intact or not, in order."""
         try:
             names = os.listdir(self.path / "run" / "chunks")
         except OSError as error:
@@ -294,7 +303,9 @@ class Store:
         return self._wrong(number) is None
 
     def _wrong(self, number: int) -> str | None:
-        """Return an array of a chunk whose file differs in length or checksum from its receipt."""
+        """Return the name of an array of a chunk whose file differs in length or checksum from its receipt;
+        None if there is none.
+        """
         receipt = self.receipt(number)
         for name, column in self.columns.items():
             size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
@@ -309,15 +320,14 @@ class Store:
         return "receipt" if receipt is None else None
 
     def check_arrays(self, numbers: Iterable[int]) -> None:
-        """ValueError where arrays of chunks are not those of their receipts."""
+        """Raise ValueError if arrays of chunks do not match their receipts."""
         for number in numbers:
             if self.columns and (wrong := self._wrong(number)):
                 text = f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
-        """Return the indices of intact chunks, and of those that have a receipt but are damaged; the receipts
-        of the latter are removed."""
+        """Return the indices of intact chunks, and of damaged ones; receipts of the latter are removed."""
         receipts = self.receipts()
         whole = [number for number in receipts if self.is_whole(number)]
         torn = sorted(set(receipts) - set(whole))
@@ -326,8 +336,9 @@ class Store:
         return whole, torn
 
     def read_grid(self) -> dict | None:
-        """Return the content that `write_grid` stored; None if there is none or if it is damaged (it is then
-        computed again)."""
+        """Return the grid stored by `write_grid`; None if it is missing or damaged (it is then computed
+        again).
+        """
         self._digests = self._read_manifest()
         with contextlib.suppress(ValueError, OSError):
             content = self._read(_GRID)
@@ -336,7 +347,7 @@ class Store:
         return None
 
     def write_grid(self, grid: dict) -> dict:
-        """Keep the grid of the statistics, and return it as it is kept."""
+        """Store the grid of the statistics, and return it."""
         content = json.dumps(grid).encode()
         with self._named():
             write_whole(self.path / _GRID, content, wait=True)
@@ -345,14 +356,14 @@ class Store:
         return grid
 
     def take_chunk(self, other: "Store", number: int) -> None:
-        """Copy a chunk that another folder of the same study holds."""
+        """Copy a chunk from another folder of the same study."""
         for name in self.columns:
             self._write(name, number, other._file(name, number).read_bytes())
         write_whole(self._receipt_file(number), other._receipt_file(number).read_bytes())
 
 
 def _beyond(study: Mapping) -> str:
-    """Return the number of a study that is out of its range, with the range; nothing if all are within."""
+    """Return a sentence on the number of a study that is out of range; empty if there is none."""
     for name, most in {"samples": MOST_SAMPLES, "chunk": MOST_LANES, "block": MOST_LANES}.items():
         value = study.get(name)
         if type(value) is not int or not 1 <= value <= most:
@@ -375,9 +386,9 @@ def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
 
 
 def _ended(content: bytes) -> bytes:
-    """Content, and its CRC-32C as Zarr's codec writes it."""
+    """Return the content followed by its CRC-32C, in the format of Zarr's codec."""
     return content + _crc32c(content).to_bytes(4, "little")
 
 
 def _crc32c(content) -> int:
-    return needed("google_crc32c", "storing a study", "studies").value(content)  # comes with zarr
+    return needed("google_crc32c", "storing a study", "studies").value(content)  # a dependency of zarr

@@ -1,4 +1,4 @@
-"""A study: what varies over many motions of one scene, and how they are run."""
+"""A study: the variation over many motions of one scene, and how they are run."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -27,13 +27,13 @@ from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
-_STATED = "times to save at are `ts`, and what is kept is said by `outputs` and `save`"
+_STATED = "times to save at are `ts`, and what is stored is chosen by `outputs` and `save`"
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
 REFUSED["every"] = "trajectories of every N-th lane are kept by `keep_every=N`"
 
 
 class TaskFields(MotionFields, total=False):
-    """What a run of a study computes, by name."""
+    """Arguments of a run of a study, by name."""
 
     t0: Any
     t1: Any
@@ -49,11 +49,10 @@ class Study(Printed):
     """Many motions of one scene with varying parameters or start values.
 
     - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
-      number for all lanes (the rest is solved for, as by `jj.start`; default: the scene's example). A
+      number for all samples (the rest is solved for, as by `jj.start`; default: the scene's example). A
       variation is a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of
-      a grid, or a list with one number per lane; all must be of one kind.
-    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Lane k follows from the seed and k
-      alone.
+      a grid, or a list with one number per sample; all must be of one kind.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Sample k depends only on the seed and k.
 
         disc = jj.models.TiltingDisc()
         study = jj.Study(disc, vary={"radius": jj.Normal(0.5, 0.01)}, start={"lean": jj.Uniform(-0.6, 0.6), "spin_rate": -3.0}, sampler="sobol", samples=1024)
@@ -63,14 +62,15 @@ class Study(Printed):
     Raises ValueError for unknown names and for quantities that cannot vary. Needs the extra `studies`.
     """
 
-    scene: Any  # a scene, or a model, of which the scene is kept
-    vary: Any = None  # a dictionary by name, as is `start`, and by pairs of names `correlation`
+    scene: Any  # a scene, or a model, from which the scene is taken
+    vary: Any = None  # dictionaries by name; `correlation` by pairs of names
     start: Any = None
     sampler: str = "random"
     samples: int | None = None
     seed: int = 0
     correlation: Any = None
-    design: Design = field(init=False, repr=False, compare=False)  # the samples: parameters by name, start values by name with `_at_start`
+    # the samples: parameters by name, start values by name with `_at_start`
+    design: Design = field(init=False, repr=False, compare=False)
     _given: Any = field(init=False, repr=False, compare=False)  # the scene, or its model
     _constants: dict = field(init=False, repr=False, compare=False)  # start values that do not vary
 
@@ -98,8 +98,10 @@ class Study(Printed):
                 raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a "
                     "parameter from which the scene makes that array")
             if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
-                raise ValueError(f"parameter `{name}` is to vary as {described(how)}; set one value on the "
-                    "scene itself, or give a distribution")
+                raise ValueError(
+                    f"parameter `{name}` is to vary as {described(how)}; set one value on the scene itself, "
+                    "or give a distribution"
+                )
             varying[name] = how
         q, u = self.scene.coordinate_names, self.scene.speed_names
         groups = {group for names in (q, u) for group, _, _ in names.groups}
@@ -130,7 +132,7 @@ class Study(Printed):
         options=None,
         **by_name,
     ) -> Task:
-        """Return a description of all that determines the results of a run. Arguments are those of `run`:
+        """Return a description of everything that determines the results of a run. Arguments as in `run`:
         `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`, `by_name`.
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
@@ -139,7 +141,8 @@ class Study(Printed):
                 "trajectories of no lane are kept")
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
-            options = replace(options, formulation=None)  # as for the scene by itself: a study may go on with other memory
+            # as for the scene itself: a study may continue with another memory bound
+            options = replace(options, formulation=None)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and keep_every is None and not any(output.over_times for output in known.values()):
@@ -162,42 +165,42 @@ class Study(Printed):
         command: str = "",
         **what: Unpack[TaskFields],
     ) -> StudyResult:
-        """Compute the missing part of the study in the folder `path`, which is created if necessary, and open
-        it.
+        """Compute the missing part of the study in the folder `path`, which is created if necessary, and
+        return its results.
 
         The same call on the same folder continues an earlier one, however that ended. Results are bit-equal
         for all `chunk` sizes, orders and interruptions.
 
         - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
-          are evaluated (default: 201 even ones; if all outputs use the end only, the end).
+          are evaluated (default: 201 equidistant ones; only the end if all outputs use only the end).
         - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`,
           `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a trajectory; default: the end values
-          of all coordinates and speeds. They are NaN where a motion failed.
-        - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every lane;
-          "statistics" stores counts, sums and histograms only.
-        - `keep_every`: 1000 also stores the states at `ts` of every thousandth lane (with save="statistics"
-          its other results, too); 1: of all lanes; None: of none.
-        - `chunk`: lanes that are stored together (default: about a thousandth of all); after a crash at most
-          one chunk is computed again.
+          of all coordinates and speeds. They are NaN for failed motions.
+        - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
+          "statistics" stores only counts, sums and histograms.
+        - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample (with save="statistics"
+          its other results, too); 1: of all samples; None: of none.
+        - `chunk`: number of samples stored together (default: about a thousandth of all); after a crash at
+          most one chunk is computed again.
         - `processes`: the number of computing processes, each with its share of the cores. More than one need
-          a script whose top level is guarded by `if __name__ == "__main__":`, and outputs that are no
-          functions within functions.
+          a script whose top level is guarded by `if __name__ == "__main__":`, and outputs that are not
+          defined inside functions.
         - `client`: a `dask.distributed.Client` whose workers compute, one chunk at a time each; all of them
           must reach the folder.
         - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
           machines; `jj.merge_studies` combines them.
-        - `progress`: a bar; `command`: text that is stored with the study.
+        - `progress`: show a bar; `command`: text stored with the study.
         - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to
           `keep_every` above, are the `what` of the signature.
 
-        If the scene is a model, `jj.build(scene, memory="2GB")`, its memory is the bound for all computing
-        processes of this machine together, including the present one; with `client`, for each worker. Blocks
-        and chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies
-        with other blocks differ in their last digits.
+        If the scene is a model, `jj.build(scene, memory="2GB")`, its memory bounds all computing processes of
+        this machine together, including the present one; with `client`, it bounds each worker. Blocks and
+        chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies with
+        other block sizes differ in their last digits.
 
-        Raises ValueError where the folder holds another study or the memory is too small, MemoryError where
-        it was exceeded, `InUseError` where another process runs the study, OSError where the folder cannot be
-        written. On Ctrl-C the current chunk ends, all results are kept, and KeyboardInterrupt is raised.
+        Raises ValueError if the folder holds another study or the memory is too small, MemoryError if it was
+        exceeded, `InUseError` if another process runs the study, and OSError if the folder cannot be written.
+        On Ctrl-C the current chunk is finished and all results are stored; then KeyboardInterrupt is raised.
         """
         task = self.task(**what)
         if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:
@@ -217,9 +220,9 @@ class Study(Printed):
         """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
         and to shared `parameters`.
 
-        They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward
-        mode, for the samples of this study. Where lanes end at events, a `SensitivityWarning` (also in
-        `warnings` of the result) names the missing part. This process computes them; nothing is stored.
+        They are pathwise derivatives: the mean over samples of exact derivatives of their motions, in forward
+        mode. If samples end at events, a `SensitivityWarning` (also in `warnings` of the result) names the
+        missing part. This process computes them; nothing is stored.
 
         - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 

@@ -1,7 +1,9 @@
-"""What a run of a study computes: lanes in blocks of a fixed size, each by one `rollout` and one compiled program of outputs.
+"""The computation of a study: samples in blocks of a fixed size, each by one `rollout` and one compiled
+program of outputs.
 
-Block b holds lanes b B to (b + 1) B - 1, whatever the chunks in which results are stored; the last one is filled up with copies of its last lane. All blocks
-run the same compiled programs on arrays of the same shapes, so a lane's numbers do not depend on chunks, order or processes.
+Block b holds samples b B to (b + 1) B - 1, independently of the chunks in which results are stored; the last
+one is padded with copies of its last sample. All blocks run the same compiled programs on arrays of the same
+shapes, so the numbers of a sample do not depend on chunks, order or processes.
 """
 
 import math
@@ -25,66 +27,65 @@ from jourdain_jax.scene.digests import digest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
-AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
-RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
+LARGEST_BLOCK = 2048  # samples: enough to hide the slowest, few enough for a chunk of a fraction of a second
+AT_START = "_at_start"  # suffix of columns of start values, after the coordinate or speed
+RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files next to the arrays
 SAVES = ("statistics", "outputs")
 
 
 @dataclass(frozen=True)
 class Task:
-    """A study with all that says which numbers come out of it."""
+    """A study with everything that determines its numbers."""
 
     scene: Scene
     design: Design  # parameters by name, start values by name and AT_START
-    constants: Mapping[str, object]  # start values that all lanes share
+    constants: Mapping[str, object]  # start values shared by all samples
     outputs: Mapping[str, Output]
     span: Mapping[str, Any]  # t0, t1, ts, inputs
     options: AllOptions
     save: str
-    keep_every: int | None  # of which lanes states at `ts` are kept; None: of none
-    # lanes; the same in all processes. A GPU takes some ten thousand at once
+    keep_every: int | None  # interval of samples whose states at `ts` are stored; None: none
+    # samples; equal in all processes. A GPU takes some ten thousand at once
     largest_block: int = field(default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17)
-    memory: int | None = None  # bytes that each process which computes may hold
+    memory: int | None = None  # bytes allowed for each computing process
 
     @property
     def block(self) -> int:
-        """Lanes of a block."""
+        """Return the number of samples of a block."""
         block = min(self.largest_block, max(8, 1 << (len(self.design) - 1).bit_length()))
-        # bytes of saved states of a block, at most
+        # limit on bytes of a block's saved states
         while block > 8 and block * self.bytes_of_lane > (2**26):
             block //= 2
         return block
 
     @property
     def bytes_of_lane(self) -> int:
-        """Bytes of the saved states of a lane while it is computed."""
+        """Return the bytes of the saved states of a sample during its computation."""
         return 8 * (len(self.scene.coordinate_names) + len(self.scene.speed_names) + 2) * len(self.ts)
 
     @property
     def bytes_of_kept_lane(self) -> float:
-        """Bytes that are kept of a lane, of all lanes on average."""
+        """Return the stored bytes per sample, on average."""
         return sum(np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every for column in self.columns().values())
 
     @property
     def stride(self) -> int:
-        """Lanes from one whose states are kept to the next."""
+        """Return the interval between samples whose states are stored."""
         return self.keep_every or 1
 
     @property
     def ts(self) -> np.ndarray:
-        """Saved times, s."""
+        """Return the saved times, s."""
         return np.asarray(self.span["ts"])
 
     def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
-        """Return start values (with those that all lanes share) and parameters, from the columns of the
-        design by name.
+        """Return start values (including shared ones) and parameters, from the columns of the design by name.
         """
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
         return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
 
     def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
-        """The outputs of one motion; NaN where it failed."""
+        """Return the outputs of one motion; NaN if it failed."""
         sound = motion.nan_if_failed()
         return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in self.outputs.values()])
 
@@ -94,8 +95,8 @@ class Task:
         return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:
-        """Return the arrays of the store. Raises ValueError where two have one name, or the name of an axis
-        or of another file in the store.
+        """Return the arrays of the store. Raises ValueError if two have one name, or one has the name of an
+        axis or of another file in the store.
         """
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
         found: list[tuple[str, Column]] = []
@@ -121,12 +122,14 @@ class Task:
             found.append((name, Column("float64", math.nan, about, (("time", len(self.ts)),), self.stride)))
         names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are "
-                f"{', '.join(map(repr, names))}: give the output another name")
+            raise ValueError(
+                f"`{twice[0]}` would name two arrays of the study; its names are "
+                f"{', '.join(map(repr, names))}: give the output another name"
+            )
         return dict(found)
 
     def identity(self) -> dict[str, str]:
-        """Digests of all that decides the numbers, by what a user would call it."""
+        """Return digests of everything that determines the numbers, under the names of the arguments."""
         return {
             "scene": digest((type(self.scene), self.scene)),
             "start": digest(dict(self.constants)),

@@ -1,7 +1,8 @@
-"""Several processes that compute the chunks of one study; each is started afresh (never forked from one in which JAX runs) and has its share of the cores.
+"""Several processes that compute the chunks of one study; each is started afresh (never forked from one in
+which JAX runs) and has its share of the cores.
 
-A worker that dies takes nothing with it: chunks that were under way are given to a new worker, one at a time. A chunk on which workers died three times is
-left out, with a warning that names its lanes.
+The unfinished chunks of a worker that died are given to a new worker, one at a time. A chunk on which workers
+died three times is omitted, with a warning that names its samples.
 """
 
 import contextlib
@@ -21,18 +22,17 @@ from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.scene.arguments import warn
 
-MOST_DEATHS = 3  # of processes on one chunk, before it is left out
+MOST_DEATHS = 3  # deaths of processes on one chunk before it is omitted
 _NONE_BEGAN = (
-    "no worker of this study could begin, as what it printed says. Each imports the program that was "
-    "started: run studies in it under "
-    '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
+    "no worker of this study could start; see its printed error. Each imports the main program: run studies "
+    "in it under `if __name__ == '__main__':`, and define scenes and outputs in a module; or take processes=1"
 )
-_runners: dict[tuple, Runner] = {}  # of this process: for the study that it worked on last, in one folder
+_runners: dict[tuple, Runner] = {}  # of this process: for the latest study and folder
 _one_at_a_time = threading.Lock()
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
-    """Return the workers of `run`. Raises ValueError where the task cannot be sent to another process."""
+    """Return the workers of `run`. Raises ValueError if the task cannot be sent to another process."""
     sent = sent_to_others(task)
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
@@ -55,8 +55,8 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
 
 def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
-    """Compute and store a chunk; this process computes one at a time. Chunks that a process stored before it
-    died are not computed again.
+    """Return the counts of a chunk after computing and storing it; one at a time in this process. Chunks that
+    a process stored before it died are not computed again.
     """
     with _one_at_a_time:
         which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
@@ -69,11 +69,11 @@ def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
 
 
 def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
-    """Compute the chunks `numbers` even if processes die. Chunks on which they die repeatedly are omitted
-    with a warning.
+    """Yield the counts of the chunks `numbers`, computed even if processes die. Chunks on which they die
+    repeatedly are omitted with a warning.
 
-    - `compute(numbers, alone)`: a generator that yields lanes and failed lanes of each chunk, and returns the
-      indices of unfinished ones if a process died.
+    - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed ones of each
+      chunk, and returns the indices of unfinished ones if a process died.
     - `attempts`: how often such a chunk is tried alone, so that no other chunk can be the cause.
 
     A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
@@ -97,7 +97,7 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
 
 _ADVICE = (
     "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or "
-    "simulate these lanes one by one, in a process of their own, to see why"
+    "simulate these lanes one by one, each in its own process, to see why"
 )
 
 
@@ -106,7 +106,7 @@ def _died(store: Store, numbers: list[int]) -> str:
 
 
 def sent_to_others(task: Task) -> bytes:
-    """The task as it is sent to another process; ValueError where it cannot be."""
+    """Return the task as bytes for another process. Raises ValueError if it cannot be sent."""
     try:
         return pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -115,8 +115,8 @@ def sent_to_others(task: Task) -> bytes:
 
 
 def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
-    """Yield lanes and failed lanes of chunks as they finish, at most `most` of them at once. Return the
-    indices of those on which a process died.
+    """Yield the numbers of samples and of failed ones of chunks as they finish, at most `most` of them at
+    once. Return the indices of chunks on which a process died.
 
     `submit(number)`: a future of `concurrent.futures`; `deadly`: the error that reports a dead process.
     """
@@ -127,11 +127,12 @@ def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted
         while not died and len(running) < most and not interrupted() and (number := next(left, None)) is not None:
             try:
                 running[submit(number)] = number
-            except deadly:  # a pool whose process has died
+            except deadly:  # a pool with a dead process
                 died.append(number)
         if not running:
             receipts = {number: store.receipt(number) for number in died}
-            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the process died
+            # stored before the process died
+            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)
             return [number for number, receipt in receipts.items() if receipt is None]
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             number = running.pop(future)
@@ -154,19 +155,17 @@ def _begin(sent: bytes, places, begun) -> None:
 
 
 def keep_to_share(place: int, count: int) -> None:
-    """Bind this thread, and all that it starts, to the cores of process number `place` of `count`. Call it
-    before JAX begins, which then starts one thread per core.
+    """Bind this thread, and all threads that it starts, to the cores of process `place` of `count`. Call it
+    before JAX starts its threads, one per core.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
     own = cores[place::count] or cores
     os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
-    with contextlib.suppress(AttributeError, OSError):  # not every system lets a process choose its cores
+    with contextlib.suppress(AttributeError, OSError):  # not every system supports this
         os.sched_setaffinity(0, own)
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent (a handle of the operating system) has ended, even if it ended
-    earlier.
-    """
+    """End this process when its parent (a handle of the operating system) has ended, or if it already has."""
     connection.wait([parent])
     os._exit(1)
