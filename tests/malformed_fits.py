@@ -57,7 +57,7 @@ FITS: dict[str, str] = {
     "run(sigma={'x': np.nan, 'x_rate': 1.0})": "sigma of channel `x` must be above zero",
     "run(sigma={'x': 0.1})": "channel `x_rate` has no sigma",
     "run(sigma={'x': 0.1, 'x_rate': 1.0, 'y': 1.0})": "`sigma` names channel `y`",
-    "run(values={'x': np.where(TS[4] == TS, np.inf, TS)}, sigma=1.0)": "infinite, the first at sample 4; give NaN",
+    "run(values={'x': np.where(TS[4] == TS, np.inf, TS)}, sigma=1.0)": "infinite values, the first at sample 4; give NaN",
     "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds only NaN",
     "jj.fit(cart, run(), 'mass', errors='hac')": "`errors` is 'hac', expected",
     "jj.fit(cart, run(), 'mass', errors='runs')": "from the differences between runs, but there are 1; give 5 or more",
@@ -125,7 +125,7 @@ SENSORS: dict[str, str] = {
     "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), 'mass')": (
         "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`"
     ),
-    "fitted(delay=0.3)": "`gyro` of run 0 of `Cart` begins at 0.2 s; minus its delay of up to 0.3 s, this is before the start at t0 = 0 s",
+    "fitted(delay=0.3)": "`gyro` of run 0 of `Cart` starts at 0.2 s; minus its delay of up to 0.3 s, this is before the start of the motion at t0 = 0 s",
     "fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5)))": "give an earlier `t0` with the start there, or NaN for the first samples",
     "fitted(gain=jj.Estimate(3.0, range=jj.bounds(0.0, 2.0)))": "first guess of `gyro.gain` is 3.0; expected a first guess between its bounds",
     "fitted(gain=[1.0, 2.0])": "`gain` of sensor `gyro` of run 0 of `Cart` has shape (2,), expected () or ()",

@@ -1,18 +1,19 @@
 """Least squares with unknowns shared by all runs and unknowns of single runs or pieces: an arrow-shaped
 matrix, which may contain a chain.
 
-minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2 + lambda |D d|^2
-         piece i: its own unknowns x_i, the shared ones s; its join with the piece before, if it has one
+    minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2 + l |D d|^2
+        piece i: own unknowns x_i, shared unknowns s; its join with the piece before, if there is one
 
-    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per piece: T_i is all that is kept of its samples
-    from the last pieces of the runs to their first, x_i goes out by a QR factorisation of
-    [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; what the piece after it left ]:     the Schur complement, without squaring anything
-    s by the singular values of what is left of all runs; directions whose singular value is below a cut-off stay as they are
+    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per piece, of which only T_i is kept
+    from the last pieces of the runs to their first, x_i is eliminated by a QR factorisation of
+    [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; remainder of the next piece ], a Schur complement
+    s by the singular values of the remainders of all runs; directions below a cut-off do not move
 
-A run that is not cut is one piece without a join. Time and memory grow linearly with the number of pieces. A leading axis `members` holds problems of equal
-shape. All on NumPy.
-Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D); G. J. Bierman,
-Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (square-root information, the chain).
+A run that is not cut is one piece without a join. Time and memory grow linearly with the number of pieces. A
+leading axis `members` holds problems of equal shape. All on NumPy. Source: G. H. Golub and V. Pereyra,
+Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D); G. J.
+Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (square-root information,
+the chain).
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ Parts = TypeVar("Parts", bound="ByMember")
 ByUnknown = Float[np.ndarray, "members unknowns"]
 PerMember = Float[np.ndarray, "members"]
 Flags = Bool[np.ndarray, "members"]
-Members = Int[np.ndarray, "members"]  # their numbers
+Members = Int[np.ndarray, "members"]  # their indices
 
 
 class ByMember:
@@ -37,11 +38,11 @@ class ByMember:
         return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
 
     def of(self: Parts, members) -> Parts:
-        """Return a copy of the parts of some members."""
+        """Return the parts of some members."""
         return type(self)(*(x if x is None else x.of(members) if isinstance(x, ByMember) else x[members] for x in self._parts()))
 
     def put(self: Parts, members, new: Parts) -> None:
-        """Put the parts of `new` in the places of these members."""
+        """Store the parts of `new` for these members."""
         for kept, one in zip(self._parts(), new._parts(), strict=True):
             if isinstance(kept, ByMember):
                 kept.put(members, one)
@@ -59,11 +60,12 @@ class ByMember:
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
-    """Return T of [J r], not finite where [J r] is not."""
+    """Return T of [J r]; not finite if [J r] is not."""
     width = whole.shape[-1]
     if whole.shape[-2] < width:
         whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
-    reflected, _ = np.linalg.qr(whole, mode="raw")  # as LAPACK leaves it: the transposed triangle, and reflectors beyond its diagonal
+    # LAPACK's raw form: the transposed triangle, with reflectors beyond the diagonal
+    reflected, _ = np.linalg.qr(whole, mode="raw")
     index = np.arange(width)
     return reflected[..., :width].swapaxes(-1, -2) * (index[:, None] <= index)
 
@@ -72,14 +74,16 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
 class Arrow(ByMember):
     """A linearised least-squares problem. Its unknowns are (shared, own of piece 0, own of piece 1, ...)."""
 
-    local: Float[np.ndarray, "members pieces local width"]  # the rows of T that hold own unknowns
-    shared: Float[np.ndarray, "members rows columns"]  # of all pieces together the rest, as one triangle
-    scores: Float[np.ndarray, "members pieces _"]  # of each: gradient in the shared unknowns, its own ones being fitted
-    joins: Float[np.ndarray, "members pieces joined both"] | None = None  # [B A C c]; zero of the first piece of a run
+    local: Float[np.ndarray, "members pieces local width"]  # the rows of T that contain own unknowns
+    shared: Float[np.ndarray, "members rows columns"]  # the other rows of all pieces, as one triangle
+    # of each piece: gradient in the shared unknowns after fitting its own
+    scores: Float[np.ndarray, "members pieces _"]
+    # [B A C c]; zero for the first piece of a run
+    joins: Float[np.ndarray, "members pieces joined both"] | None = None
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Numbers of pieces, of unknowns of each piece, and of shared unknowns."""
+        """Return the numbers of pieces, of unknowns of each piece, and of shared unknowns."""
         pieces, local = self.local.shape[1:3]
         return pieces, local, self.shared.shape[-1] - 1
 
@@ -90,14 +94,14 @@ class Arrow(ByMember):
 
     @property
     def _blocks(self) -> list[np.ndarray]:
-        """Return three blocks of rows: those that contain shared unknowns only, those of single pieces, and
-        those that join a piece to its predecessor.
+        """Return up to three blocks of rows: with shared unknowns only, of single pieces, and of joins
+        between a piece and its predecessor.
         """
         return [x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None]
 
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
-        """Return the entries of x for the columns of each block. A first piece has no predecessor; the
-        entries for its place are arbitrary.
+        """Return the entries of x for the columns of each block; arbitrary entries for the missing
+        predecessor of a first piece.
         """
         shared, own = self.split(x)
         if len(self._blocks) == 1:
@@ -111,14 +115,14 @@ class Arrow(ByMember):
         return Arrow(self.local if local is None else local, shared, self.scores, joins)
 
     def scaled(self, size: ByUnknown) -> "Arrow":
-        """Return this arrow in unknowns divided by `size`."""
+        """Return this arrow for unknowns divided by `size`."""
         blocks = [rows.copy() for rows in self._blocks]
         for rows, x in zip(blocks, self._columns(size), strict=True):
             rows[..., :-1] *= x[..., None, :]
         return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
 
     def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
-        """Return, for each column, the sum over all rows of the function `of`: (..., rows, columns and
+        """Return for each column the sum over all rows of the function `of`: (..., rows, columns and
         residual) -> (..., columns).
         """
         shared, *others = map(of, self._blocks)
@@ -132,24 +136,24 @@ class Arrow(ByMember):
 
     @cached_property
     def column_norms(self) -> ByUnknown:
-        """Length of each column of the Jacobian."""
+        """Return the length of each column of the Jacobian."""
         return np.sqrt(self._by_unknown(lambda rows: np.einsum("...ij,...ij->...j", rows[..., :-1], rows[..., :-1])))
 
     @cached_property
     def gradient(self) -> ByUnknown:
-        """`J' r`."""
+        """Return `J' r`."""
         return self._by_unknown(lambda rows: (rows[..., None, :, -1] @ rows[..., :-1])[..., 0, :])
 
     def _changes(self, d: ByUnknown) -> list[np.ndarray]:
-        """Return by how much the residuals of each block change, to first order."""
+        """Return the first-order change of the residuals of each block."""
         return [(rows[..., :-1] @ x[..., None])[..., 0] for rows, x in zip(self._blocks, self._columns(d), strict=True)]
 
     def change(self, d: ByUnknown) -> PerMember:
-        """`|J d|^2`."""
+        """Return `|J d|^2`."""
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
     def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: ByUnknown) -> "Arrow":
-        """Return the problem of all other unknowns, with the residuals that result when the `held` ones have
+        """Return the problem of all other unknowns, with the residuals after the `held` ones have changed by
         `moved`.
         """
         blocks = [rows.copy() for rows in self._blocks]
@@ -175,8 +179,8 @@ class Arrow(ByMember):
 
 
 def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
-    """Add the `residual` (theta - mean) * weight of each unknown, which is zero without a prior. For shared
-    unknowns it is multiplied by M; the scores stay.
+    """Return the arrow with the added `residual` (theta - mean) * weight of each unknown, zero without a
+    prior. For shared unknowns it is multiplied by M; the scores do not change.
     """
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
@@ -185,8 +189,8 @@ def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[n
 
 
 def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the unknowns of a piece. Return the rows that express these unknowns by the shared ones and
-    by those of the previous piece, and the remaining rows.
+    """Return the rows that express the own unknowns of a piece by the shared ones and by those of the
+    previous piece, and the remaining rows, without own unknowns.
 
     `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """
@@ -220,8 +224,8 @@ def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.nd
 
 
 def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float) -> Float[np.ndarray, "members shared"]:
-    """Return the damped step of the shared unknowns times D: (S^2 + lambda) ds = - S U' c. Undetermined
-    directions do not move.
+    """Return the damped step of the shared unknowns times D: (S^2 + lambda) ds = - S U' c, zero in
+    undetermined directions.
     """
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest
@@ -231,7 +235,7 @@ def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cu
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """Make an arrow from the triangles of all runs. The first `local` columns of a triangle belong to the
+    """Return the arrow of the triangles of all runs. The first `local` columns of a triangle belong to the
     run's own unknowns.
     """
     members, runs, width, _ = triangles.shape

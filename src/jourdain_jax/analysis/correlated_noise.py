@@ -4,13 +4,16 @@ intervals.
     E e(t) e(t') = sigma^2 exp(-|t - t'| / tau),        rho_k = exp(-(t_k - t_j) / tau),      j: the last sample before k that is not missing
     whitened     w_k = (r_k - rho_k r_j) / sqrt(1 - rho_k^2),      w = r at the first sample:  independent, of variance one where r = e / sigma
 
-This is exact at uneven times and across samples that are missing. A correlation time tau that is not known is where, at the estimates of all else,
+This is exact at uneven times and across missing samples. An unknown correlation time tau minimises, at the
+estimates of all other unknowns,
 
     sum w^2 / 2 + sum log sqrt(1 - rho_k^2) + log det(J_w' J_w) / 2
 
-is lowest (restricted likelihood): without its last term, which stands for the unknowns, tau would come out too short. tau and the unknowns take turns.
-Intervals are as wide as estimates and their variance are spread over all tau, weighted by that likelihood, evenly in arcsin rho (see `Problem.doubt`).
-Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation (1993), chapter 3.
+(restricted likelihood): without its last term, which accounts for the unknowns, tau would be too short. tau
+and the unknowns are estimated alternately. Intervals include the spread of estimates and variances over all
+tau, weighted by that likelihood, uniformly in arcsin rho (see `Problem.doubt`). Source: H. D. Patterson and
+R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation (1993), chapter
+3.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,15 +27,15 @@ from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.calculus.reals import Entries, Scalar
 
-SHORTEST = 0.1  # tau over the shortest interval: the noise is white
+SHORTEST = 0.1  # in shortest intervals: below this tau, the noise is white
 
 
 def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Return two arrays for a channel: the index of the previous sample that is not missing (the sample's own
     index if there is none), and the time since that sample in s.
 
-    The time is infinite for missing samples and where there is no predecessor. `weight` is zero where a
-    sample is missing. Results have its shape.
+    The time is infinite for missing samples and without a predecessor. `weight` is zero for a missing sample.
+    Results have its shape.
     """
     index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
     last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)
@@ -43,7 +46,7 @@ def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp
 
 
 def memory(gap, tau, xp=np):
-    """Return `rho = exp(-gap / tau)`, smooth in tau; zero where the gap is infinite or tau is zero."""
+    """Return `rho = exp(-gap / tau)`, smooth in tau; zero for an infinite gap or a zero tau."""
     counts = xp.isfinite(gap) & (tau > 0)
     return xp.where(counts, xp.exp(-xp.where(counts, gap, 1.0) / xp.where(counts, tau, 1.0)), 0.0)
 
@@ -56,13 +59,13 @@ def whitened(r, previous, rho):
 @dataclass(frozen=True)
 class Chains:
     """For each sample among the residuals, the index of the previous sample. There is one set for each member
-    of runs of equal structure.
+    of a group of equally structured runs.
     """
 
     before: Int[np.ndarray, "runs members samples"]
     gap: Float[np.ndarray, "runs members samples"]  # s
-    known: Float[np.ndarray, "runs samples"]  # tau, s; zero where the noise is white or tau is not known
-    unknown: list[slice]  # samples of channels whose tau is not known
+    known: Float[np.ndarray, "runs samples"]  # tau, s; zero for white noise or an unknown tau
+    unknown: list[slice]  # samples of channels with unknown tau
 
     @staticmethod
     def of(
@@ -83,8 +86,8 @@ class Chains:
         return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
     def at(self, places: np.ndarray, members: np.ndarray, taus: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of preceding samples, and rho, for some runs of some members (`lanes`); estimated
-        correlation times have shape (lanes, channels).
+        """Return indices of preceding samples, and rho, for pairs of a run (`places`) and a member; estimated
+        correlation times have shape (pairs, channels).
         """
         tau = self.known[places].copy()
         for where, value in zip(self.unknown, taus.T, strict=True):
@@ -121,20 +124,20 @@ def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) 
 
 
 def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float, float]:
-    """Return the shortest and longest correlation time (s) of the search. Raises ValueError where no run has
-    two samples.
+    """Return the shortest and longest correlation time (s) of the search. Raises ValueError if no run has two
+    samples.
     """
     ts = [np.asarray(run.ts) for run in runs if channel in run.values and len(run.ts) > 1]
     if not ts:
         raise ValueError("a correlation time is None, but each run has only one sample, which cannot "
             "determine it; give a number in s, or 0 for white noise")
-    # beyond ten spans hardly to be told from a bias
+    # beyond ten spans it is hardly distinguishable from a bias
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
 def log_density(r, weight, ts, tau) -> Scalar:
     """Return the logarithm of the density of `r` in units of sigma, without the term `log(sigma sqrt(2 pi))`:
-    `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`. It works on arrays of JAX.
+    `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`, for JAX arrays.
 
     r, weight: (times, *channel); a weight of zero marks a missing sample.
     """

@@ -22,7 +22,7 @@ from jourdain_jax.scene.scene import Scene
 
 _ORIGINS = {
     "loads": "loads without a potential",
-    "rows": "constraint rows that do real work",
+    "rows": "constraints that do real work",
     "driven": "poses driven as functions of time",
     "potential": "potentials that depend on time",
     "inertia": "masses or inertias that change",
@@ -33,17 +33,17 @@ class Energy(eqx.Module):
     """Energy of one state, in J: `kinetic` T, `potential` V and their `total`."""
 
     kinetic: Scalar
-    potential: Scalar  # of all loads and of the scene that have one; loads without one are not in it
+    potential: Scalar  # of all loads and the scene; loads without a potential contribute nothing
 
     @property
     def total(self) -> Scalar:
-        """T + V."""
+        """Return T + V."""
         return self.kinetic + self.potential
 
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Conservation of T + V along every motion of a scene, or the list of loads that change it."""
+    """Conservation of T + V along every motion of a scene, or the list of causes that change it."""
 
     conserved: bool
     changed_by: tuple[str, ...]
@@ -61,10 +61,10 @@ def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
 
 @of_known_numbers
 def energy_balance(scene: Scene) -> EnergyBalance:
-    """Find out whether T + V is conserved and, if not, what changes it. Powers are those of eqs. (71)-(73).
+    """Return whether T + V is conserved and, if not, what changes it. Powers are those of eqs. (71)-(73).
 
     Eight random admissible states with random inputs are examined. A power counts as zero below 1e-9 of the
-    largest power (1e-4 in single precision). Raises DifferentiationModeError where numbers are traced.
+    largest power (1e-4 in single precision). Raises DifferentiationModeError for traced numbers.
     """
     t, q, u = (jnp.asarray(x) for x in sample_states(scene, 8))
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))

@@ -1,26 +1,29 @@
 """Unknowns of a fit: first guess, range and prior.
 
-With a prior of mean m and standard deviation s, (theta - m) / s is one residual more: the estimate is the most probable value (maximum a posteriori).
-Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), section 2.7.
+With a prior of mean m and standard deviation s, (theta - m) / s is an additional residual: the estimate is
+the most probable value (maximum a posteriori). Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression
+(1989), section 2.7.
 
-The numbers that an unknown may take: low <= theta <= high, and what counts as a large change of it.
+Ranges low <= theta <= high: steps are taken in theta itself and end at a bound, so that an unknown can lie
+exactly at its bound.
 
-Steps are taken in theta itself and end at a bound, so that an unknown can lie at its bound exactly.
+Priors with correlated errors, of numbers that were measured together:
 
-Numbers that were measured together: priors whose errors are correlated.
+    r = M S^-1 (theta - mean),     M C M' = 1,     |r|^2 = d' (S C S)^-1 d       r: additional residuals
+    S: standard deviations,   C: correlations
 
-    r = M S^-1 (theta - mean),     M C M' = 1       S: standard deviations, C: correlations;     r: residuals more, so that |r|^2 = d' (S C S)^-1 d
+C = V diag(e) V' gives M = diag(e)^-1/2 V'. If only some of the numbers are free, S C S is their block of the
+covariance (the marginal).
 
-C = V diag(e) V' gives M = diag(e)^-1/2 V'. Of numbers of which only some are free, S C S is the part of the covariance that belongs to these (the marginal).
-
-Unknowns within bounds as vectors x of any real numbers, with the factor by which densities change.
+Unknowns within bounds as vectors x of any real numbers, with the factor by which densities change:
 
     unbounded  theta = x
     positive   theta = exp x                                  log |d theta / dx| = x
     bounds     theta = low + (high - low) / (1 + exp(-x))     log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
-    memory     of a correlation time: so does arcsin rho, rho = exp(-h / theta), h: the shortest interval
+    memory     of a correlation time: the same for arcsin rho, rho = exp(-h / theta), h: the shortest interval
 
-Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference manual of that year.
+Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference
+manual of that year.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,38 +42,38 @@ Numbers = Float[Array, "*batch"]
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of an unknown (infinite if there is none), and its typical change."""
+    """Bounds of an unknown (infinite if there are none), and its typical change."""
 
     kind: Literal["bounds", "positive", "unbounded", "memory"]
     low: float = -np.inf
     high: float = np.inf
     scale: float | None = None
-    interval: float = 0.0  # h, s, of a memory
+    interval: float = 0.0  # h, s, for a correlation time
 
     def least_size(self, guess: float) -> float:
-        """Return the size of a change that counts as large for an unknown near zero: its typical change if
-        there is one, else a hundredth of the first guess or of the width of the range.
+        """Return the size of a large change of an unknown near zero: its typical change if there is one, else
+        a hundredth of the first guess or of the width of the range.
         """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
         return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
-        """Return another first guess for each `share` from 0 to 1. These guesses cover the range between the
-        bounds. Without bounds they cover a factor of five, or one typical change to either side.
+        """Return another first guess for each `share` from 0 to 1. These cover the range between the bounds,
+        or without bounds a factor of five, or one typical change to either side.
         """
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
         if self.kind == "positive":
-            return guess * 5.0 ** (2 * share - 1)  # a factor by which a first guess may be off
+            return guess * 5.0 ** (2 * share - 1)  # five: by which a first guess may be wrong
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
-        """Return the part of the range that is not below this number, which is zero or slightly more."""
+        """Return the part of the range above a lower bound, which is zero or slightly more."""
         return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
 
     def constrain(self, x: Numbers) -> Numbers:
-        """Return the unknown, in its unit, that a real number stands for."""
+        """Return the unknown, in its unit, for a real number."""
         if self.kind in ("positive", "unbounded"):
             return jnp.exp(x) if self.kind == "positive" else x
         inside = self.low + (self.high - self.low) * jax.nn.sigmoid(x)
@@ -91,23 +94,24 @@ class Range:
         return jnp.log(share) - jnp.log1p(-share)
 
     def refusal(self, guess: np.ndarray) -> str:
-        """Return why a first guess cannot be taken; empty where it can."""
+        """Return why a first guess cannot be used; empty if it can."""
         if np.all((self.low < guess) & (guess < self.high)):
             return ""
         if self.kind == "positive":
-            return "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
+            return "expected a first guess above zero; or let it change sign with `unbounded()`"
         return f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen the bounds"
 
 
 def positive() -> Range:
-    """Keep an unknown at zero or above: `free={"mass": jj.positive()}`. This is the default for parameters
-    declared positive or non-negative.
+    """Return the range of an unknown that stays at zero or above: `free={"mass": jj.positive()}`. This is the
+    default for parameters declared positive or non-negative.
     """
     return Range("positive", low=0.0)
 
 
 def bounds(low: Number, high: Number) -> Range:
-    """Keep an unknown between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
+    """Return the range of an unknown between `low` and `high`, in its unit: `free={"mass": jj.bounds(0.1,
+    10)}`.
 
     Raises ValueError unless both are finite and low < high.
     """
@@ -120,8 +124,8 @@ def bounds(low: Number, high: Number) -> Range:
 
 
 def unbounded(scale: Number | None = None) -> Range:
-    """Let an unknown take any number; a parameter keeps its declared sign. `scale`: a typical change, in the
-    unit of the unknown. It is required if the first guess is zero.
+    """Return the range of an unknown that can be any number; a parameter keeps its declared sign. `scale`: a
+    typical change, in the unit of the unknown, required if the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.
     """
@@ -137,13 +141,13 @@ def unbounded(scale: Number | None = None) -> Range:
 @dataclass(frozen=True, eq=False)
 class Correlated:
     """The prior of one of several numbers that were measured together (`joint_normal`): its mean, its
-    standard deviation, and its index among them.
+    standard deviation, and its index.
     """
 
     mean: float
     sigma: float
     place: int
-    covariance: np.ndarray  # of all of them
+    covariance: np.ndarray  # of all these numbers
 
 
 def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
@@ -151,7 +155,7 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     "inertia": 1.64}, covariance)`.
 
     **Arguments**
-    - `mean`: name -> mean, in the unit of the parameter, of one number each.
+    - `mean`: name -> mean, one number in the unit of the parameter.
     - `covariance`: (n, n), in the order of the names. It may be singular: a combination without variance gets
       a standard deviation of a ten thousandth of the others.
 
@@ -199,7 +203,8 @@ def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
         which, sigma = [priors[k].place for k in places], np.array([priors[k].sigma for k in places])
         C = priors[places[0]].covariance[np.ix_(which, which)] / np.outer(sigma, sigma)
         e, V = np.linalg.eigh(C)
-        # eigenvalue of correlations: a combination that is known exactly counts as known to a ten thousandth of the sigmas
+        # least eigenvalue of correlations: an exactly known combination counts as known to a ten thousandth
+        # of the sigmas
         M[np.ix_(places, places)] = V.T / np.sqrt(np.maximum(e, 1e-8))[:, None]
     return M
 
@@ -211,8 +216,8 @@ class Estimate:
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg
 
-    - `guess`: the value at which the fit begins, in the unit of the number. Parameters and start values have
-      one already, and need none.
+    - `guess`: the initial value of the fit, in the unit of the number. Parameters and start values have one
+      already.
     - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; the default depends on the kind of number.
     - `per_run`: whether each run has its own value; otherwise all runs share it. Start values always belong
       to their run, parameters to all runs.

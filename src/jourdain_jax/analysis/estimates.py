@@ -1,14 +1,12 @@
 """Estimates of a fit: values with their uncertainty, residuals, the fitted scene, and undetermined
 combinations.
 
-Results of a fit for one unknown, and for the residuals of one channel.
+    interval      estimate -+ q e,  within the bounds      e: standard error, q: quantile (see `spread`)
+                  at a bound: up to a limit by profile likelihood
+    freedom       samples - rank + tr(C P)                 P: information of priors, C: covariance
 
-Results at the minimum of a fit: standard errors and intervals, residuals by channel, the fitted scene.
-
-interval      estimate -+ q e,  within the bounds      e: standard error, q: quantile (see `spread`); at a bound: up to a limit by profile likelihood
-freedom       samples - rank + tr(C P)       what the samples determined is less than the rank by what priors tell; P: their information, C: covariance
-
-What fitted motions pass on their way: stop events before samples (a disc that has fallen), or none where one was observed, and jumps of loads.
+Also detected: events of fitted motions before samples (a disc that has fallen), missing observed events, and
+jumps of loads.
 """
 
 from collections.abc import Callable
@@ -45,7 +43,8 @@ from jourdain_jax.scene.scene import Scene
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentences:
     """Return one sentence for each run whose motion, with these unknowns, meets an event before its last
-    sample, misses the observed event, or crosses a jump of its loads."""
+    sample, misses the observed event, or crosses a jump of its loads.
+    """
     shared, local = problem.unknowns.split(theta)
     found, layout, options = [], problem.unknowns.layout, problem.asked.options
     for index, run in enumerate(problem.runs):
@@ -56,15 +55,16 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
             found.append(
                 f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: "
-                "derivatives and standard errors omit the shift of the times of jumps; let loads change "
-                "within a short time or length"
+                "derivatives and standard errors omit the shift of the times of jumps; make the jumps gradual"
             )
         if type(scene).events is Scene.events:
             continue
         if run.ended_by:
             if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
-                found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} "
-                    "times the observed time; start nearer")
+                found.append(
+                    f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the "
+                    "observed time; use a closer first guess"
+                )
             continue
         motion = motion(one.ts)
         late = np.asarray(one.ts) > float(motion.t_end)
@@ -73,7 +73,7 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
             event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
             found.append(
                 f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as "
-                "if it continued; omit these, or give the time at which it was observed, in `events`"
+                "if it continued; omit these, or give the observed time of the event in `events`"
             )
     return tuple(found)
 
@@ -84,35 +84,38 @@ PerRepeat = Float[np.ndarray, "*repeats"]
 PerUnknown = Float[np.ndarray, "*repeats unknowns"]
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics of a minimum, besides its location."""
+    """Statistics of a minimum, apart from its position."""
 
     scene: Scene  # with the estimates
     starts: tuple[dict[str, Float[Entries, "..."]], ...]  # initial values of each run, with the estimates
     sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
-    standard_errors: PerUnknown  # NaN where not identifiable
-    low: PerUnknown  # ends of the 95 % intervals; NaN where not identifiable
+    standard_errors: PerUnknown  # NaN if not identifiable
+    low: PerUnknown  # ends of the 95 % intervals; NaN if not identifiable
     high: PerUnknown
-    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # these have no standard error, and a one-sided interval
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # without a standard error, with a one-sided interval
     quantiles: PerUnknown  # q
-    information: Information  # covariance in blocks, and the directions that do not show
-    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # of each run by channel: (prediction - value) / sigma; NaN where missing
-    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # residuals, where their noise has a memory less what the sample before foretells
-    sigma: dict[str, PerRepeat]  # of channels whose noise was estimated
-    correlation_time: dict[str, PerRepeat]  # s, of channels where they were estimated; near zero: white
-    untold: Sentences  # channels that do not tell their sigma, in any repeat
-    chi_square: PerRepeat  # sum of squared whitened residuals; NaN where the motion fails
+    information: Information  # covariance in blocks, and undetermined directions
+    # of each run by channel: (prediction - value) / sigma; NaN if missing
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    # residuals minus their prediction from the previous sample, if noise is correlated
+    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    sigma: dict[str, PerRepeat]  # of channels with estimated noise
+    correlation_time: dict[str, PerRepeat]  # s, of channels with an estimate; near zero: white
+    untold: Sentences  # channels that do not determine their sigma, in any repeat
+    chi_square: PerRepeat  # sum of squared whitened residuals; NaN if the motion fails
     samples: Counts  # with a finite sigma
-    degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
-    of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
+    degrees_of_freedom: PerRepeat  # samples minus the directions that they determine; priors reduce these
+    of_rise: PerUnknown  # divisor of 2 (F - F_min), for an interval that ends where it is `RISE_95`
     from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
-    oddities: Sentences  # sentences about what is odd in the runs
-    events_met: Sentences  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
-    too_narrow: Sentences  # sentences about intervals that bounds make too narrow; none in a batch
+    oddities: Sentences  # sentences about oddities of the runs
+    # sentences about events before the end of a run, or missed; empty for a batch or multiple shooting
+    events_met: Sentences
+    too_narrow: Sentences  # sentences about intervals that bounds make too narrow; empty for a batch
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
+@np.errstate(over="ignore", invalid="ignore")  # for unknowns without bounds that grew enormously
 def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
-    """Statistics of the minimum."""
+    """Return the statistics of the minimum."""
     unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     here = lambda x: one(x[:, places])  # noqa: E731
@@ -164,7 +167,7 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
 
 
 def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
-    """Return how many unknowns the samples determined: rank - tr(C P)."""
+    """Return the number of unknowns determined by the samples: rank - tr(C P)."""
     p, weight = len(unknowns.whitening), unknowns.prior_weight
     rows = unknowns.whitening * weight[:p]
     of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
@@ -172,7 +175,7 @@ def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "me
 
 
 class Estimated(Printed, eqx.Module):
-    """One unknown, in its unit; NaN for quantities that the measurements do not determine."""
+    """One unknown, in its unit; NaN if the measurements do not determine it."""
 
     value: PerRepeat
     standard_error: PerRepeat
@@ -202,7 +205,7 @@ class ChannelResiduals(Printed, eqx.Module):
 
     @staticmethod
     def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
-        """Return the summary of a channel's residuals `r`, which are NaN where a sample is missing."""
+        """Return the summary of a channel's residuals `r`, NaN for missing samples."""
         r = r[~np.isnan(r)]
         numbers = (r.mean(), np.sqrt((r**2).mean()), largest(r)) if r.size else (np.nan,) * 3
         return ChannelResiduals(run, name, r.size, *map(float, numbers))
@@ -215,8 +218,8 @@ class ChannelResiduals(Printed, eqx.Module):
 
 
 GONE = {
-    "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about "
-        "`simulate` of `scene` and `starts`, and give them to `fit_batch`"
+    "bootstrap": "`Fit.profiles` gives intervals of nonlinear scenes; for repeats, draw data about "
+                 "`simulate` of `scene` and `starts`, and pass them to `fit_batch`"
 }
 
 
@@ -224,36 +227,40 @@ GONE = {
 class Estimates(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
 
-    After `fit_batch`, every array has a leading axis `repeats`, also those of `scene`. Results at the minimum
-    are computed on first access: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`,
+    After `fit_batch`, every array has a leading axis `repeats`, also the arrays of `scene`. Results at the
+    minimum are computed on first access: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`,
     `residuals`, `whitened`, `sigma`, `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and
     the other fields of `Statistics`.
     """
 
     values: PerUnknown
-    beyond: PerUnknown  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
+    # for an estimate at a bound: distance in standard errors to the data's optimum beyond it; NaN elsewhere
+    beyond: PerUnknown
     converged: Marks
-    stuck: Marks  # no step lowers the sum of squares, however short, and this is no minimum
-    steps: Counts  # tried
-    grown: Marks  # whether the minimum was found over growing spans, far from where the first guess led to
-    agreeing: Counts  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
-    shooting: Shot | None  # how it was found by multiple shooting
-    trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
-    asked: Asked  # the arguments of `fit`; `guesses` and `errors` of these
-    unknowns: Unknowns  # their `labels`, `units` and `layout`
+    stuck: Marks  # no step lowers the sum of squares, but this is no minimum
+    steps: Counts  # number of tried steps
+    grown: Marks  # whether growing spans found the minimum, far from the result of the first guess
+    agreeing: Counts  # number of first guesses that led to this minimum; zero for a batch
+    shooting: Shot | None  # results of multiple shooting
+    # objective, and F initially and after each tried step; empty for a batch
+    trace: tuple[tuple[str, tuple[float, ...]], ...]
+    asked: Asked  # arguments of `fit`, among them `guesses` and `errors`
+    unknowns: Unknowns  # with `labels`, `units` and `layout`
     work_out: Callable[[], Statistics]
 
     @cached_property
     def statistics(self) -> Statistics:
-        """What follows from the minimum."""
+        """Return the statistics at the minimum."""
         return self.work_out()
 
     def __getstate__(self) -> dict:
-        return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
+        # compiled programs stay in their process
+        return vars(self) | {"statistics": self.statistics, "work_out": None}
 
     def __getattr__(self, name: str) -> Any:
-        """Return an entry of `statistics`, such as `standard_errors`, or of the arguments of the fit, or of
-        the unknowns."""
+        """Return an entry of `statistics`, such as `standard_errors`, of the arguments of the fit, or of the
+        unknowns.
+        """
         parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
         for part in (part for part, names in parts.items() if name in names):
             return getattr(getattr(self, part), name)
@@ -267,7 +274,7 @@ class Estimates(Printed):
 
     @property
     def estimates(self) -> dict[str, Estimated]:
-        """All estimates by name."""
+        """Return all estimates by name."""
         return {name: self[name] for name in self.labels}
 
     @property
@@ -279,26 +286,27 @@ class Estimates(Printed):
 
     @property
     def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
-        """Correlation of the estimates."""
+        """Return the correlation of the estimates."""
         return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
 
     @property
     def reduced_chi_square(self) -> PerRepeat:
         """Return the sum of squared residuals per degree of freedom. It is near 1 for a correct scene and
-        correct sigmas, and NaN if there are as many unknowns as samples.
+        correct sigmas, and NaN without degrees of freedom.
         """
         return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
-    # Of one fit, not of a batch. -----------------------------------------------------------------------------------
+    # For a single fit, not a batch.
+    # ------------------------------------------------------------------------------------
 
     @property
     def agreement(self) -> str:
-        """How many first guesses led to the minimum."""
+        """Return a text with the number of first guesses that led to the minimum."""
         return f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to {'this' if self.agreeing else 'a'} minimum"
 
     @property
     def not_identifiable(self) -> Sentences:
-        """Undetermined combinations of unknowns, one sentence each."""
+        """Return undetermined combinations of unknowns, one sentence each."""
         if not np.isfinite(self.chi_square):
             return ()
         return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
@@ -306,7 +314,8 @@ class Estimates(Printed):
     @property
     def correlated(self) -> Sentences:
         """Return pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first,
-        one sentence each."""
+        one sentence each.
+        """
         some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
         found = np.triu(self.correlation[np.ix_(some, some)], 1)
         pairs = sorted(zip(*np.nonzero(np.abs(found) >= 0.98), strict=True), key=lambda ij: -abs(found[ij]))
@@ -319,14 +328,16 @@ class Estimates(Printed):
 
     @property
     def weak(self) -> Sentences:
-        """Return poorly determined shared unknowns and combinations (relative standard error 0.1 or more),
-        weakest first, one sentence each."""
+        """Return poorly determined shared unknowns and combinations (relative standard error of at least
+        0.1), weakest first, one sentence each.
+        """
         return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
 
     @property
     def impossible(self) -> Sentences:
         """Return one sentence for each body of the fitted scene whose inertia no distribution of mass can
-        have."""
+        have.
+        """
         q, _, _ = self.scene.named(**self.starts[0])
         return impossible_bodies(self.scene, q)
 
@@ -346,25 +357,25 @@ class Estimates(Printed):
         return found
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
-        """Count, mean, rms and largest residual per run and channel."""
+        """Return count, mean, rms and largest residual per run and channel."""
         return tuple(ChannelResiduals.of(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
     def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
-        """Return a number, or an array of them, that follows from the parameters, with its standard error and
+        """Return a number, or an array of them, that depends on the parameters, with its standard error and
         95 % interval.
 
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
         y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first
         order (the delta method). A combination may have an interval even if its parts are not identifiable
-        one by one. The result is NaN if it depends on an undetermined direction, or on an unknown at its
+        separately. The result is NaN if it depends on an undetermined direction, or on an unknown at its
         bound.
 
-        - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for
+        - `function`: plain JAX, of a scene; returns an array of any shape. `unit`: of the result, for
           `print`.
 
         **Returns** value, standard error and ends of the interval in that shape; for a batch with a leading
-        axis `repeats`. **Raises** ValueError where the function returns no numbers. Source: C. R. Rao, Linear
+        axis `repeats`. **Raises** ValueError if the function returns no numbers. Source: C. R. Rao, Linear
         Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
         """
         shared = self.layout.sizes[0]
@@ -377,8 +388,8 @@ class Estimates(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """Return the parameters that depend on unknowns through a function or through a possible inertia in
-        `free`, in the form of `derived`.
+        """Return the parameters that depend on unknowns through a function or a possible inertia in `free`,
+        in the form of `derived`.
         """
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}

@@ -1,7 +1,7 @@
-"""An experiment, the measurements of one run: times, named channels with a sigma and a sensor each, the
-start, sampled inputs.
+"""An experiment, the measurements of one run: times, named channels with a sigma and a sensor each, start,
+and sampled inputs.
 
-value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
+    value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,45 +28,51 @@ class Experiment(eqx.Module):
         Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
 
     **Arguments**
+
     - `ts`: times in s, strictly increasing.
-    - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `sensors`.
-    - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
-      values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
-      NaN in `values`, the mask of a masked array, or an infinite sigma marks a sample that is missing.
-    - `correlation_time`: s, of noise with a memory, whose correlation falls as exp(-|t - t'| / correlation time): channel -> number, or one number for all;
-      channels that are not named have white noise, as with zero. None: not known; one for all components of the channel in all runs is estimated.
-    - `start`: coordinate or speed -> value at `t0`. These are held; missing ones are solved for, as by
+    - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a
+      name in `sensors`.
+    - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the
+      shape of its values; or one number for all channels. None: unknown; one sigma for all samples of the
+      channel in all runs is estimated. NaN in `values`, the mask of a masked array, or an infinite sigma
+      marks a missing sample.
+    - `correlation_time`: s, of noise whose correlation falls as exp(-|t - t'| / correlation time): channel ->
+      number, or one number for all; zero, and omitted channels: white noise. None: unknown; one for all
+      components of the channel in all runs is estimated.
+    - `start`: coordinate or speed -> value at `t0`. These are fixed; missing ones are solved for, as by
       `jj.start`.
-    - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
-      `unbounded()` (None: unbounded), or an `Estimate` with a prior.
+    - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name ->
+      `bounds(...)`, `positive()`, `unbounded()` (None: unbounded), or an `Estimate` with a prior.
     - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`; or an `Actuator`.
-    - `sensors`: channel -> `Sensor`; or the quantity of an ideal one: a coordinate, a speed, an
-      `Accelerometer`, a `LoadCell`, or a function of a `Motion`
-      (one instant), such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
+    - `sensors`: channel -> `Sensor`; or the quantity of an ideal sensor: a coordinate, a speed, an
+      `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one instant), such as `lambda motion:
+      motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
-    - `events`: the stop event of the scene that ended the run, with the time at which it was observed and its sigma, both in s:
-      `events={"has_fallen": (1.83, 0.005)}`. The time at which the motion stops there, less that one, is a residual. Samples after it do not count.
+    - `events`: the stop event of the scene that ended the run, with its observed time and the sigma of this
+      time, both in s: `events={"has_fallen": (1.83, 0.005)}`. The difference between simulated and observed
+      time is a residual. Later samples do not count.
 
     **Raises** ValueError for times that do not increase, infinite values, channels without any value, sigmas
     that are not positive, names that do not match, more than one event, an event that is not after the start,
-    and samples that may show times before the start.
+    and samples that may refer to times before the start.
     """
 
-    ts: Times  # s; all on NumPy where it is known
+    ts: Times  # s; all on NumPy if known
     values: dict[str, Numbers]
     sigma: dict[str, Numbers]
     start: dict[str, Numbers]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     sensors: dict[str, Sensor]
-    readings: dict[str, Reading]  # the sensors made ready; none before the run is `checked`, as of the next two
-    drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
+    readings: dict[str, Reading]  # the prepared sensors; this and the next two are empty before `checked`
+    drives: dict[str, Drive]  # actuators with estimated numbers, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Entries, ""]  # s
-    correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
-    unknown_sigma: Labels = static()  # channels; their sigma here is 1
+    # s, of channels with correlated noise; zero if to be estimated
+    correlation_time: dict[str, Float[Entries, ""]]
+    unknown_sigma: Labels = static()  # channels; their sigma is 1 here
     unknown_correlation: Labels = static()  # channels
-    ended_by: str = static()  # the event whose time was observed, among the channels; empty: none
+    ended_by: str = static()  # channel of the event with an observed time; empty: none
 
     def __init__(
         self,
@@ -128,14 +134,15 @@ class Experiment(eqx.Module):
                 raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one "
                     "number for all channels")
         if self.ended_by in (*self.sensors, *self.correlation_time):
-            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation "
-                "time; omit them, or rename the channel")
+            raise ValueError(
+                f"`{self.ended_by}` is an event, whose time has no sensor or correlation time; omit them, or "
+                "rename the channel"
+            )
         for name, value in self.values.items():
             if not holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
-                    f"channel `{name}` holds values that are infinite, the first at sample "
-                    f"{int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; give NaN for samples that are "
-                    "missing"
+                    f"channel `{name}` holds infinite values, the first at sample "
+                    f"{int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; give NaN for missing samples"
                 )
             if not holds(lambda x: ~np.all(np.isnan(x)), value):
                 raise ValueError(f"channel `{name}` holds only NaN; omit the channel")
@@ -144,7 +151,7 @@ class Experiment(eqx.Module):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the "
                     "standard deviation of its noise")
 
-    # Equinox's own costs a microsecond each time, to make methods pytrees; a fit asks for a hundred fields
+    # Equinox's own costs a microsecond per access, and a fit reads a hundred fields
     __getattribute__ = object.__getattribute__
 
     def changed(self, **fields) -> "Experiment":
@@ -177,8 +184,10 @@ def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
         "known", ())
     for name, time in found.items():
         if not holds(lambda x: np.isfinite(x) & (x >= 0), time):
-            raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero "
-                "or more; None where it is not known")
+            raise ValueError(
+                f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None "
+                "if unknown"
+            )
     return {name: time for name, time in found.items() if given[name] is None or holds(lambda x: x != 0, time)}
 
 
@@ -197,10 +206,11 @@ def _check_times(ts) -> None:
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
-    """Check channels and shapes against the scene; return the run with its inputs and sensors prepared.
+    """Return the run with its inputs and sensors prepared, after checking channels and shapes against the
+    scene.
 
     `repeats`: whether values have a leading axis. Raises ValueError for an unknown channel, start value or
-    input, for wrong shapes, and for samples that may show times before the start.
+    input, for wrong shapes, and for samples that may refer to times before the start.
     """
     where = f"run {index} of `{type(scene).__name__}`"
     entries_named(scene, run.start)
@@ -228,7 +238,8 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
     inputs, drives = _inputs(scene, run, where, estimates)
     by_name = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
     by_name |= {"readings": readings, "drives": drives, "estimates": estimates}
-    return run.changed(inputs=inputs, **{field: dict(sorted(value.items())) for field, value in by_name.items()})  # sorted as JAX orders them
+    # sorted as JAX orders them
+    return run.changed(inputs=inputs, **{field: dict(sorted(value.items())) for field, value in by_name.items()})
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
@@ -257,7 +268,7 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: Shape, esti
 
 
 def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
-    """ValueError where a sample that counts may show a time before the start."""
+    """Raise ValueError if a sample that counts may refer to a time before the start."""
     delay, values = run.sensors[name].delay, run.values[name]
     if is_traced((delay, run.ts, run.t0, values, run.sigma[name])) or latest(delay) == 0:
         return
@@ -267,14 +278,14 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     first, t0 = float(run.ts[np.argmax(at_times)]), float(run.t0)
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
-            f"channel `{name}` of {where} begins at {first:g} s; minus its delay of up to {latest(delay):g} "
-            f"s, this is before the start at t0 = {t0:g} s, where the motion is not known; give an earlier "
-            "`t0` with the start there, or NaN for the first samples"
+            f"channel `{name}` of {where} starts at {first:g} s; minus its delay of up to {latest(delay):g} "
+            f"s, this is before the start of the motion at t0 = {t0:g} s; give an earlier `t0` with the "
+            "start there, or NaN for the first samples"
         )
 
 
 def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
-    """Return all inputs, with first guesses for estimated numbers, and the actuators that have such numbers.
+    """Return all inputs, with first guesses for estimated numbers, and the actuators with estimated numbers.
     """
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
@@ -306,7 +317,7 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
 
 
 def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
-    """Raise ValueError where all samples of a varying input lie before the run, or all after it."""
+    """Raise ValueError if all samples of a varying input are before the run, or all after it."""
     def overlaps(knots, x, ts, t0):
         return np.ptp(x) == 0 or (knots[0] < ts[-1] and knots[-1] > t0)
 

@@ -2,14 +2,15 @@
 
     x = (independent coordinates, independent speeds y),   y' = f(t, x) + w,   E w(t) w(t')' = W delta(t - t'),   W = diag(process noise)
 
-    from sample to sample   x <- x(t_k+1),   P <- F P F' + sum_j h w_j B_j W B_j',   B_j = F F_j^-1 [0; 1]        F_j = d x(s_j) / d x(t_k)
+    between samples   x <- x(t_k+1),   P <- F P F' + sum_j h w_j B_j W B_j',   B_j = F F_j^-1 [0; 1]        F_j = d x(s_j) / d x(t_k)
     at a sample             r = value - reading(x),   S = H P H' + R,   K = P H' S^-1,   H = d reading / d x
                             x <- x + K r,   P <- (1 - K H) P (1 - K H)' + K R K'
     log L                   - sum (r' S^-1 r + log det S + n log 2 pi) / 2
 
-s_j, w_j: nodes and weights of Gauss and Legendre between two samples. Dependent coordinates and speeds follow from the constraints. For linear scenes all of
-this is exact; otherwise it is to first order in the spread of x. Source: A. H. Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.3;
-G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), section II.6 (Joseph's form of P).
+s_j, w_j: nodes and weights of Gauss and Legendre between two samples. Dependent coordinates and speeds follow
+from the constraints. The result is exact for linear scenes; otherwise it is of first order in the spread of
+x. Source: A. H. Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.3; G. J. Bierman,
+Factorization Methods for Discrete Sequential Estimation (1977), section II.6 (Joseph's form of P).
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,28 +48,29 @@ _NODES, _WEIGHTS = gauss_legendre(5)
 def filtered_log_likelihood(
     scene: Scene | BuiltFor, data: Data, *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
 ) -> Scalar:
-    """Return the logarithm of the likelihood for a motion with process noise, by an extended Kalman filter.
-    Process noise disturbs the motion itself, as a rider or rough ground does.
+    """Return the log-likelihood for a motion with process noise, by an extended Kalman filter. Process noise
+    disturbs the motion itself, as a rider or rough ground does.
 
     **Arguments**
+
     - `data`: one run or several. A start value is known, or a first guess with an
-      `Estimate(prior=Normal(mean, sigma))` in `unknown_start`, which is its distribution at the start.
-      Sensors have no delay and no lag, and all their numbers are known.
+      `Estimate(prior=Normal(mean, sigma))` in `unknown_start`, its distribution at the start. Sensors have no
+      delay and no lag, and all their numbers are known.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the
       speed)^2 / s: alone, it makes the variance of the speed grow by q t. Speeds without an entry are not
-      disturbed. The independent speeds are those of `scene.privileged`, or the engine's choice.
-    - `options`, `by_name`: as of `simulate`.
+      disturbed. The independent speeds are `scene.privileged`, or the engine's choice.
+    - `options`, `by_name`: as in `simulate`.
 
-    The motion and its derivatives with respect to the state come from `simulate`, from each sample to the
-    next. The likelihood is exact for linear scenes; for others the covariance of the state is propagated to
-    first order. Without process noise and with a known start it equals `log_likelihood`.
+    The motion between samples and its derivatives with respect to the state come from `simulate`. The
+    likelihood is exact for linear scenes; for others the covariance of the state is propagated to first
+    order. Without process noise and with a known start it equals `log_likelihood`.
 
-    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion), under
-    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is not a
-    number.
+    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode
+    (`jax.jacfwd`: second derivatives of the motion), under `jit` and `vmap`. -inf if the motion fails. Make
+    sensors outside of `jit`: inside, their delay is traced.
 
-    **Raises** ValueError for names that are no independent speed, intensities below zero, quaternions, sensors with a delay or lag, accelerometers, noise with
-    a correlation time, and numbers that are not known.
+    **Raises** ValueError for a name that is no independent speed, intensities below zero, quaternions,
+    sensors with a delay or lag, accelerometers, noise with a correlation time, and unknown numbers.
 
     **Example**
 
@@ -97,7 +99,7 @@ class _Filter:
     """The filter of one run."""
 
     def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: Indices, intensities: Speeds):
-        assert isinstance(run.inputs, Inputs)  # of a run that was checked
+        assert isinstance(run.inputs, Inputs)  # for a run that was checked
         self.scene, self.run, self.inputs, self.options = scene, run, run.inputs, options
         self.speeds, self.intensities = np.array(speeds, int), intensities
         self.begin = self._start(run.start)
@@ -138,8 +140,8 @@ class _Filter:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
 
     def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
-        """Return the state with these independent coordinates and speeds. The others follow; coordinates are
-        found near q.
+        """Return the state with these independent coordinates and speeds; the others follow, with coordinates
+        near q.
         """
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
@@ -147,7 +149,7 @@ class _Filter:
         return consistent(self.scene, t, q, u, inputs_at(self.inputs, t), held=self.held)
 
     def _propagated(self, t, t1, q, x, P):
-        """q, x, P at the time t1, which may be t itself."""
+        """Return q, x, P at the time t1, which may equal t."""
         moves = t1 > t
         span = jnp.where(moves, t1 - t, (self.run.ts[-1] - self.run.t0) / self.run.ts.shape[0])
         times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
@@ -200,8 +202,10 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     check_known(runs, "a filter")
     for index, run in enumerate(runs):
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, but the filter assumes "
-                "white noise; omit it")
+            raise ValueError(
+                f"the noise of channel `{name}` has a correlation time, but the filter assumes white noise; "
+                "omit it"
+            )
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):
                 raise ValueError(f"run {index} gives the time of its event `{name}`, which the filter does "
@@ -222,8 +226,8 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
 
 
 def _independent_speeds(scene: Scene, run: Experiment) -> Indices:
-    """Return the scene's independent speeds. If they do not determine the rest at a known start, return those
-    of a copy of the scene with another choice.
+    """Return the scene's independent speeds. If they do not determine the rest at a known start, return the
+    independent speeds chosen for that start.
     """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)
@@ -256,7 +260,7 @@ def _intensities(scene: Scene, speeds: Indices, given: Mapping) -> Speeds:
 
 
 def _begun(run: Experiment, names: Labels) -> Float[Array, "2 unknown"]:
-    """Means and standard deviations of these start values."""
+    """Return means and standard deviations of these start values."""
     given: dict[str, Any] = dict(run.unknown_start)  # estimates with priors
     known = [(given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0) for name in names]
     return jnp.array(known, real_type()).reshape(-1, 2).T

@@ -2,10 +2,12 @@
 
     minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma,   theta within its bounds;   mean, s: of priors
 
-by Levenberg-Marquardt. Jacobians come by forward mode through the options, run by run; initial values of the runs are eliminated run by run.
-Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
+by Levenberg-Marquardt. Jacobians are computed in forward mode, run by run, and initial values of the runs are
+eliminated run by run. Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J.
+Wild, Nonlinear Regression (1989), chapter 3.
 
-How a minimum is looked for: from first guesses, over growing spans where they are far off, in turns with correlation times, and away from bounds.
+Search for a minimum: from first guesses, over growing spans if these are far off, alternating with
+correlation times, and away from bounds.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -53,13 +55,13 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     fit over growing spans as well, and return the lower minimum.
 
     Over a short span a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
-    begins at the end of the fit over the shorter span; unknowns that a short span does not determine stay
-    near the first guess. If a fit makes no progress far from its minimum, growing spans are tried; it
+    starts at the result over the shorter span; unknowns that a short span does not determine stay near the
+    first guess. If a fit makes no progress far from its minimum, growing spans are tried, and the fit
     continues only if these do not lead to small residuals either. If every theta is a first guess of the same
     problem, spans grow only if none led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
-    large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
+    large = 5.0 * samples  # F: ten times the expectation for noise alone, one half per sample
     impatient = samples > 0 and not (problem.single and len(theta) > 1)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
@@ -78,9 +80,10 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
         grown.trace[:] = [((f"the first {spans[k]:.3g} of each run", costs),) for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)]
         way = way.continued(some, grown)
         place[some] += 1
-        followed = problem.is_followed(grown.at, spans, 100.0)  # times the squares that noise leaves
+        followed = problem.is_followed(grown.at, spans, 100.0)  # in squares expected from noise
         for k in range(1, len(spans)):
-            place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
+            # the next span is followed already, and skipped
+            place[some] += (place[some] == k) & followed[:, k]
     grown = of(poor, way.theta, control).after(way, np.arange(len(poor)))
     found = found.lowered(poor, replace(grown, grown=np.ones(len(poor), bool)))
     if (late := np.flatnonzero(left & (~found.converged | (found.at.cost > large)))).size:
@@ -110,7 +113,7 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
 
 
 def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
-    """Move unknowns off their bounds where that lowers the minimum. Return the minimum, and the statistics of
+    """Return the minimum after moving unknowns off their bounds where that lowers it, and the statistics of
     the unknowns that stay at a bound.
     """
     for _ in range(20):

@@ -1,5 +1,5 @@
 """Stability charts: curves of critical points in a plane of two numbers, where eigenvalues of a steady motion
-cross the axis.
+cross the imaginary axis.
 """
 
 from collections.abc import Mapping
@@ -21,12 +21,15 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False, eq=False)
 class StabilityChart(Printed):
-    """Curves on which modes pass the axis of stability; `mode, curve = chart.boundaries[0]`, `curve["rear_spin_rate"]`."""
+    """Curves on which modes cross the imaginary axis; `mode, curve = chart.boundaries[0]`,
+    `curve["rear_spin_rate"]`.
+    """
 
-    values: Float[np.ndarray, "values"]  # of the first number, even ones
-    boundaries: tuple[tuple[str, CriticalPoint], ...]  # mode, and a point for each value: NaN, with a code, where the curve has none
+    values: Float[np.ndarray, "values"]  # of the first number, equidistant
+    # mode, and a point for each value: NaN, with a code, if there is none
+    boundaries: tuple[tuple[str, CriticalPoint], ...]
     bands: tuple[Float[np.ndarray, "values"], ...]  # standard deviations of the second number; NaN without a prior
-    middle: Family  # along the second number, in the middle of the first: it tells which side is stable
+    middle: Family  # along the second number, at the middle of the first: it shows the stable side
 
     def _text(self) -> str:
         return "\n".join(f"{mode}, {curve}" for mode, curve in self.boundaries)
@@ -42,7 +45,7 @@ def stability_chart(
     points: int = 101,
     **asked,
 ) -> StabilityChart:
-    """Find the boundaries of stability of steady motions in a plane of two numbers.
+    """Return the boundaries of stability of steady motions in a plane of two numbers.
 
         chart = jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (5.0, 35.0)})
         for mode, curve in chart.boundaries:
@@ -52,23 +55,25 @@ def stability_chart(
     - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
     - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
       parameter, at least 3.
-    - `prior`: parameter (one number) -> `jj.Normal`, as `measured_bicycle(...).prior`. `chart.bands` then has
-      the standard deviations of the second number on each boundary, to first order, for independent
+    - `prior`: parameter (one number) -> `jj.Normal`, such as `measured_bicycle(...).prior`. `chart.bands`
+      then has the standard deviations of the second number on each boundary, to first order, for independent
       parameters.
     - `asked`: arguments of `family`: `held`, `inputs`, `names`.
 
     A family along the second number, at the middle value of the first, finds the boundaries. Each is then a
-    `critical` point as a function of the first number, found to round-off. A boundary that does not pass the
-    middle value is missed, and one that turns back along the first number has gaps.
+    `critical` point as a function of the first number, accurate to round-off. A boundary that does not reach
+    the middle value is missed, and one that turns back along the first number has gaps.
 
-    **Returns** a `StabilityChart`. **Raises** as `family`; ValueError where there are not two axes; a prior that is no `jj.Normal`.
+    **Returns** a `StabilityChart`. **Raises** errors as in `family`, and ValueError unless there are two
+    axes, or for a prior that is no `jj.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
         raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, "
             "each with its first and its last value")
     (first, ends), (second, (begin, end)) = axes.items()
     values = np.linspace(*ends, points)
-    scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]  # the ends are values that it may have
+    # the ends are checked as values of the parameter
+    scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
     known, place, given = middle.equations, numbered(scene), dict(prior or {})
     assert isinstance(known, SteadyEquations)
@@ -77,14 +82,16 @@ def stability_chart(
     try:
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
-        raise ValueError(f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter "
-            "that is one number") from None
+        raise ValueError(
+            f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter that is one "
+            "number"
+        ) from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []
     for change in middle.changes:
         if change.kind != DOUBLE:
             special, curve = special_at(known, change), []
-            for x in values:  # compiled in less time than a batch
+            for x in values:  # compiled faster than a batch
                 point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
                 by_all = np.asarray(special.program.pulled(numbers, inverse[k])) if given else np.full(len(numbers), np.nan)
                 curve.append((point, np.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]))

@@ -1,4 +1,5 @@
-"""Eigenvalues and special points of steady motions as functions of the scene's parameters p, by the implicit function theorem.
+"""Eigenvalues and special points of steady motions as functions of the scene's parameters p, by the implicit
+function theorem.
 
     eigenvalue s     ds = y' dF x,    F x = s x,  y' F = s y',  y' x = 1,    dF with the change of the steady motion, J dz = -R_p dp
     special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
@@ -7,8 +8,8 @@
                                  zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that
                                  continue at the same parameters
 
-R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It has more rows than it needs, and they agree: G_X has full column rank, and its
-pseudo-inverse comes from Q R.
+R, J, F, C, z: as in `equations.py`. G and its derivatives are one scalar program. It has redundant,
+consistent rows: G_X has full column rank, and its pseudo-inverse is computed by Q R.
 """
 
 from functools import cached_property
@@ -40,8 +41,8 @@ Unknowns = Float[Array, "all_unknowns"]
 FOUND, NOT_FOUND, SINGULAR = range(3)
 MEANINGS = (
     "found",
-    "not found: there is none that the one of the family goes over into as parameters change to these",
-    "no smooth function of the parameters here: eigenvalues meet, or several special points do",
+    "not found: the family's point does not continue to these parameters",
+    "not a smooth function of the parameters here: eigenvalues meet, or special points do",
 )
 SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0))}  # S = w (first) + (second), by rows
 
@@ -53,20 +54,20 @@ class Sensitivities(Printed, eqx.Module):
 
     mode: str = static()
     eigenvalue: complex  # 1/s
-    condition: float  # |y' x| of unit left and right vectors: zero at a double root, where there is no derivative
+    condition: float  # |y' x| of unit left and right vectors: zero at a double root, which has no derivative
     by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
     code: int
-    held: Labels = static()  # what tells the motion apart and keeps its value
+    held: Labels = static()  # quantities that identify the motion and keep their values
 
     def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
-        """Return the derivative by a parameter."""
+        """Return the derivative with respect to a parameter."""
         return self.by_parameter[name]
 
     def _text(self) -> str:
         head = f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g}, {MEANINGS[self.code]}"
         rows = [(name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()]
-        return "\n".join([head, f"  derivatives, where {', '.join(self.held) or 'nothing'} keeps its "
-            "value:", *table(rows)])
+        return "\n".join([head, " derivatives at constant "
+                                f"{', '.join(self.held) or 'nothing'}:", *table(rows)])
 
 
 @of_known_numbers
@@ -93,7 +94,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     X, zero = np.concatenate([equations.at(z), x.real, x.imag, np.zeros(4)]), np.zeros(len(look.R), complex)
 
     def pulled(of_rows, of_rates):
-        """Return derivatives of `of_rows . R + of_rates . F x` by all numbers."""
+        """Return derivatives of `of_rows . R + of_rates . F x` with respect to all numbers."""
         weights = np.concatenate([of_rows, of_rates, 1j * of_rates])
         real, imag = (np.asarray(program.pulled(X, part)) for part in (weights.real, weights.imag))
         return (real + 1j * imag)[: len(equations.given)]
@@ -128,8 +129,8 @@ class CriticalPoint(Printed, eqx.Module):
     """A special point of a family; `point["lean"]`, `point.speed`. All numbers are NaN unless `code` is 0."""
 
     state: State
-    parameters: dict[str, Float[Array, "*batch"]]  # those that vary along the family
-    eigenvalue: Complex[Array, "*batch"]  # 1/s, that passes the axis or is double
+    parameters: dict[str, Float[Array, "*batch"]]  # the parameters that vary along the family
+    eigenvalue: Complex[Array, "*batch"]  # 1/s, crossing the axis or double
     condition: Float[Array, "*batch"]  # least pivot of the equations over the largest; near zero, special points are close together
     code: Int[Array, "*batch"]
     kind: str = static()
@@ -140,12 +141,12 @@ class CriticalPoint(Printed, eqx.Module):
 
     @property
     def speed(self) -> Float[Array, "*batch"]:
-        """Speed of the point (x, y) of the scene, m/s."""
+        """Return the speed of the point (x, y) of the scene, m/s."""
         return jnp.hypot(self.state["x_rate"], self.state["y_rate"])
 
     @property
     def message(self) -> str:
-        """Explanation of the code."""
+        """Return the explanation of the code."""
         return MEANINGS[int(self.code)]
 
     def _text(self) -> str:
@@ -190,7 +191,9 @@ _program_of = once_per_class(_Program)
 
 
 class Special(eqx.Module):
-    """The equations of a special point, and the point of the family from which it is followed as parameters change."""
+    """The equations of a special point, and the family's point from which it is followed as parameters
+    change.
+    """
 
     equations: SteadyEquations = static()
     program: _Program = static()
@@ -198,18 +201,18 @@ class Special(eqx.Module):
     X: Unknowns
 
     def parts(self, X: Unknowns) -> list[Array]:
-        """z, a, b and w."""
+        """Return z, a, b and w."""
         n, m = len(self.equations.places), len(self.equations.states)
         return jnp.split(X, [n, n + m, n + 2 * m])
 
     def numbers(self, scene: Scene, X: Unknowns) -> Float[Array, "numbers"]:
-        """Parameters, t, q, u and inputs in a row."""
+        """Return parameters, t, q, u and inputs as one vector."""
         of = self.equations
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
     def normal(self, X: Unknowns) -> Unknowns:
-        """X with a of unit length; of a pair a + i b."""
+        """Return X with a of unit length; for a pair a + i b."""
         z, a, b, w = self.parts(X)
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
@@ -221,12 +224,12 @@ class Special(eqx.Module):
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return rows L with L X = c. They fix the given values, the size and phase of a and b (relative to a
-        nearby point), and w where it is zero.
+        """Return rows L and c with L X = c. They fix the held values, the size and phase of a and b (relative
+        to a nearby point), and w if it is zero.
         """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
-        of_ab = {  # of a zero eigenvalue, b is zero unless steady motions continue at the same parameters
+        of_ab = {  # for a zero eigenvalue, b is zero unless steady motions continue at the same parameters
             PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)],
             DOUBLE: [(a0, no, 1.0), (no, a0, 0.0)],
             ZERO: [(a0, no, 1.0), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
@@ -237,7 +240,7 @@ class Special(eqx.Module):
         return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
 
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
-        """G."""
+        """Return G."""
         L, c = self.linear(near)
         return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
@@ -263,7 +266,8 @@ class Special(eqx.Module):
 @compiled_quickly
 def _solution(special: Special, scene: Scene) -> CriticalPoint:
     """Return the point of a scene, differentiable twice."""
-    lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)  # each takes as many steps as it needs
+    # one by one, since each takes a different number of steps
+    lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)
     X, inverse, condition, code = jax.lax.stop_gradient(lane_by_lane(*jax.lax.stop_gradient((special, scene))))
     near = X
     for _ in range(2):  # each carries one order of derivatives
@@ -272,11 +276,11 @@ def _solution(special: Special, scene: Scene) -> CriticalPoint:
 
 
 def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. All
-    are NaN unless the code is 0.
+    """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. X is
+    NaN unless the code is 0.
 
-    Parameters go straight from those of the family to the given ones. A step whose corrections do not shrink
-    at once is shortened, so that it cannot lead to another point.
+    Parameters change linearly from the family's to the given ones. A step whose corrections do not shrink
+    immediately is shortened, so that it cannot lead to another point.
     """
 
     def once(carried):
@@ -304,23 +308,25 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 @shown_from_users_lines
 def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint") -> CriticalPoint:
     """Return a special point of a family as a function of the scene's parameters: where a mode crosses the
-    imaginary axis, or two modes meet.
+    imaginary axis, or two modes coincide.
 
         straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3})
         jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(0.08)
 
     **Arguments**
+
     - `scene`: of the same class as the family's scene. Its parameters may be traced, and may differ from the
       family's: the point is followed from those parameters to these.
     - `motions`: the family, with its inputs.
-    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. If there are
-      several such points, the one nearest to the family's guess is taken.
+    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. Of several such
+      points, the one nearest to the family's guess is taken.
 
     **Returns** a `CriticalPoint`. It is twice differentiable, by the implicit function theorem, and works
-    under `jit` and `vmap`. Where the point does not exist for these parameters, or is no smooth function of
+    under `jit` and `vmap`. If the point does not exist for these parameters, or is no smooth function of
     them, its numbers and their derivatives are NaN, and `code` is not 0.
 
-    **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class; float32.
+    **Raises** ValueError if the family has no such point, or only as a fold or branch point; for a scene of
+    another class; and for float32.
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
@@ -335,7 +341,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
-    """The point of a family that is meant."""
+    """Return the point of the family selected by `what`."""
     known = {point: [point.kind, *(point.modes if point.kind != DOUBLE else ())] for point in curve.changes if point.kind in SHAPES}
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
@@ -358,8 +364,10 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
-            raise ValueError(f"steady motions continue in {freedoms.shape[1]} directions at equal "
-                "parameters, so a zero eigenvalue is not a special point; hold more, by `held`")
+            raise ValueError(
+                f"steady motions continue in {freedoms.shape[1]} directions at equal parameters, so a zero "
+                "eigenvalue is not a special point; hold more, by `held`"
+            )
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
     elif point.kind == PAIR:

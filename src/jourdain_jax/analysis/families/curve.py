@@ -3,7 +3,7 @@ points.
 
     R(z) = 0,   t.(z - z_i) = s        t: unit tangent at z_i, J t = 0;   s: distance along it
 
-There are more rows than they hold independently, so every linear system is solved by singular values, and no product J' J is formed.
+Some rows are redundant, so every linear system is solved by singular values, and no product J' J is formed.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,10 @@ from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_match
 from jourdain_jax.calculus.reals import all_finite, largest
 from jourdain_jax.scene.parameters import parameters_of
 
-Targets = list[tuple[int, float]]  # numbers of unknowns, and values at which a curve ends
+Targets = list[tuple[int, float]]  # indices of unknowns, and values at which a curve ends
 CLOSED = "the curve is closed"
-LONGEST, SHORTEST = 0.1, 1e-8  # steps, in sizes of the unknowns; the longest also relative to where the curve is, if that is far
+# steps, in sizes of the unknowns; far from the origin the longest is relative to the distance
+LONGEST, SHORTEST = 0.1, 1e-8
 
 
 @dataclass(frozen=True)
@@ -29,22 +30,23 @@ class Point:
     z: Vector
     tangent: Vector
     look: Look
-    modes: Modes  # eigenvalues of small motions, in the columns of the points before
-    hardness: int = 0  # corrections that led here
+    modes: Modes  # eigenvalues of small motions, in the columns of the previous points
+    hardness: int = 0  # number of corrections
 
 
 def solved(
     equations: Motions, z: Vector, rows: Float[np.ndarray, "fixed unknowns"], targets: Float[np.ndarray, "fixed"], most: int = 8, longest: float = np.inf
 ) -> tuple[Vector, Look, int] | None:
-    """Return z with R = 0 and `rows z = targets`, the equations there, and the number of corrections. Return
-    None if Newton's method does not converge.
+    """Return z with R = 0 and `rows z = targets`, the equations there, and the number of corrections; None if
+    Newton's method does not converge.
     """
     for k in range(most):
         look = equations(z)
         if not (all_finite(look.R) and all_finite(look.J)):
             return None
         step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[0]
-        noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))  # of R: at a branch point steps are this over a small number
+        # of R: near a branch point it leads to large steps
+        noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))
         z = z + step * min(1.0, longest / max(largest(step), 1e-300))
         if largest(step) < 1e-11 * (1 + largest(z)) or largest(look.R) < noise:
             return z, look, k
@@ -53,7 +55,7 @@ def solved(
 
 def along(equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True) -> Point | None:
     """Return the point of the curve at a given distance along the tangent of another point; None if none is
-    found. Without `modes`, the modes of that point are copied.
+    found. Unless `with_modes`, the modes of that point are copied.
     """
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
@@ -67,8 +69,8 @@ def along(equations: Motions, point: Point, s: float, guess: Vector | None = Non
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
-    """Return the points of a curve from its start on, and the reason why it ends: it meets a target or its
-    own start, or no further point is found.
+    """Return the points of a curve from its start on, and the reason why it ends: a target, its start, or a
+    failed search.
 
     A step is halved if the curve turns sharply there, if many corrections are needed, or if eigenvalues move
     so far that they cannot be matched.
@@ -98,15 +100,15 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
             return points, CLOSED
         reach = float(largest(there.z))
         if reach > 1e3:
-            return points, "it goes on without bound"
+            return points, "it continues without bound"
         if there.hardness <= easy:
             step = min(1.5 * step, LONGEST * max(1.0, reach))
     return points, f"{most} points"
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Return the reason why a curve ends before a point: a parameter has the wrong sign there. Return None if
-    all signs are right.
+    """Return the reason why a curve ends before a point, if a parameter has the wrong sign there; otherwise
+    None.
     """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):
@@ -116,16 +118,17 @@ def _left(equations: Motions, point: Point) -> str | None:
 
 
 def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point | None:
-    """Return the point at the end of a step; None where the step must be halved."""
+    """Return the point at the end of a step; None if the step must be halved."""
     there = along(equations, here, step)
     if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
         return None
-    sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)  # those that meet are taken as they come
+    # coinciding ones are matched in any order
+    sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)
     return there if sure else None
 
 
 def _closed(equations: Motions, first: Point, here: Point, there: Point) -> bool:
-    """Return whether a step comes past the start of the curve."""
+    """Return whether a step passes the start of the curve."""
     s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
     if not (0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step):
         return False
@@ -139,19 +142,19 @@ def reversed_at(point: Point) -> Point:
 
 
 def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
-    """Return the point between two neighbours at which a smooth `test` changes its sign; None where the curve
-    is lost or undefined.
+    """Return the point between two neighbours at which a smooth `test` changes its sign; None if the curve is
+    lost or undefined.
 
-    The interval is divided repeatedly, at places other than its middle; a short interval is interpolated
-    linearly. At a branch point itself the equations lose rank, and by symmetry branch points often lie in the
-    middle.
+    The interval is divided repeatedly, but not in its middle, and a short interval is interpolated linearly.
+    At a branch point the equations lose rank, and by symmetry branch points often lie in the middle.
     """
-    share, short = 0.4, 1e-6  # a piece that short differs from its chord by the square of its length
+    share, short = 0.4, 1e-6  # a piece this short differs from its chord by the square of its length
     (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there
     at_a, at_b = test(low), test(high)
     while b - a > short:
         c = a + share * (b - a)
-        middle = along(equations, here, c, low.z + share * (high.z - low.z), with_modes)  # a better guess than the tangent: another branch may be close
+        # a better guess than the tangent, since another branch may be close
+        middle = along(equations, here, c, low.z + share * (high.z - low.z), with_modes)
         if middle is None:
             return None
         value = test(middle)

@@ -1,11 +1,12 @@
-"""Equations of steady motions as one scalar program, with their slopes.
+"""Equations of steady motions as one scalar program, with their derivatives.
 
-    R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates that matter, all speeds, and parameters that vary
+    R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates, speeds, varying parameters
 
-y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which nothing of this depends, a heading say, stay out.
-Unknowns are measured in units of their size, rows in SI units. Small motions about a steady one:
+y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which none
+of these depend, such as a heading, are omitted. Unknowns are measured in units of their size, rows in SI
+units. Small motions about a steady one:
 
-    x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: orthonormal, spans the x that the rows allow, C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
+    x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: basis of C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
 """
 
 from abc import ABC, abstractmethod
@@ -32,31 +33,32 @@ PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double ro
 class Look:
     """The equations at one point, in units of rows and unknowns."""
 
-    R: Float[np.ndarray, "rows"]  # those of what keeps its value are the last
+    R: Float[np.ndarray, "rows"]  # rows of held values are the last
     J: Float[np.ndarray, "rows unknowns"]
-    small: tuple[np.ndarray, ...]  # what small motions follow from: F of (q, y), SI units, and C, rows that (dq, dy) meet; or multipliers
+    # data of small motions: F of (q, y), SI units, and C, rows that vanish for (dq, dy); or multipliers
+    small: tuple[np.ndarray, ...]
 
 
 class Motions(ABC):
-    """Equations of a kind of motions, whose solutions make up families."""
+    """Equations of a kind of motions, whose solutions form families."""
 
-    what: str  # motions
-    modes: str  # what tells small motions apart, and its unit
-    growth: Callable[[np.ndarray], np.ndarray]  # how fast modes grow
-    crossing: Callable[[complex], str]  # what it is that a mode begins or ceases to grow
+    what: str  # name of these motions
+    modes: str  # name and unit of the numbers that describe small motions
+    growth: Callable[[np.ndarray], np.ndarray]  # growth of modes
+    crossing: Callable[[complex], str]  # kind of point at which a mode starts or ceases to grow
     t: Scalar  # s, at the start
     scene: Scene
     vary: Labels  # parameters among the unknowns
-    given: np.ndarray  # all numbers, those of the unknowns at the guess
-    by_name: dict[str, int]  # where coordinates, speeds and what varies are among them
-    places: Int[np.ndarray, "unknowns"]  # where the unknowns are
+    given: np.ndarray  # all numbers, with the unknowns at the guess
+    by_name: dict[str, int]  # indices of coordinates, speeds and varying quantities
+    places: Int[np.ndarray, "unknowns"]  # indices of the unknowns
     unknowns: Labels
     size: Vector
     start: Vector  # the guess
-    held: Int[np.ndarray, "held"]  # numbers of unknowns that keep their values at the start
+    held: Int[np.ndarray, "held"]  # indices of unknowns that keep their initial values
 
     def index(self, name: str) -> int:
-        """Return the number of an unknown; a ValueError with the nearest names if there is none."""
+        """Return the index of an unknown. Raises ValueError, with the nearest names, if there is none."""
         check_name(name, self.unknowns, f"`{name}` is not an unknown of the {self.what} of "
             f"`{type(self.scene).__name__}`")
         return self.unknowns.index(name)
@@ -78,11 +80,11 @@ class Motions(ABC):
 
     @abstractmethod
     def __call__(self, z: Vector) -> Look:
-        """The equations at z."""
+        """Return the equations at z."""
 
     @abstractmethod
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Return what distinguishes small motions, in any order, without the zeros that belong to motion
+        """Return the eigenvalues or multipliers of small motions, in any order, without the zeros of motion
         along the family.
         """
 
@@ -94,9 +96,7 @@ class Motions(ABC):
 
 
 class SteadyEquations(Motions):
-    """R, J, F and the rows of (q, y) of one scene as functions of z; `held` unknowns keep their values at the
-    guess.
-    """
+    """R, J, F and C of one scene as functions of z; `held` unknowns keep their values at the guess."""
 
     what, modes = "steady motions", "eigenvalues, 1/s"
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
@@ -142,8 +142,8 @@ class SteadyEquations(Motions):
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros that belong
-        to motion along the family or to held quantities.
+        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of motion
+        along the family or of held quantities.
 
         There are further steady motions along the directions T. Their zero eigenvalues are removed as a
         subspace: the other eigenvalues are those of P' A P, where the columns of P are orthonormal and
@@ -163,14 +163,15 @@ class SteadyEquations(Motions):
 
 
 def numbered(scene: Scene) -> Scene:
-    """Return a scene in which each parameter is replaced by the index of its first number among all numbers.
+    """Return a scene in which each parameter is replaced by the index of its first entry in the vector of all
+    numbers.
     """
     leaves, treedef = jax.tree.flatten(scene)
     return jax.tree.unflatten(treedef, np.cumsum([0, *map(np.size, leaves[:-1])]).tolist())
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Return the sizes of some coordinates (from their domain) and of all speeds. They are the units of the
+    """Return the sizes of some coordinates (from their domain) and of all speeds, used as units of the
     unknowns.
     """
     low, high = coordinate_bounds(scene)

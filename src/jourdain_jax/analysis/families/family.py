@@ -25,7 +25,7 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
 
-SHOWN = 1e-9  # sizes by which an unknown changes that is printed
+SHOWN = 1e-9  # changes in sizes of an unknown above which it is printed
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -34,11 +34,11 @@ class FamilyPoint(Printed):
 
     kind: str
     state: State
-    eigenvalues: Modes  # 1/s, in the columns of the family; of a periodic motion multipliers
+    eigenvalues: Modes  # 1/s, in the columns of the family; multipliers of a periodic motion
     modes: Labels  # names of the modes concerned
     values: dict[str, float]  # of coordinates, speeds, and the parameter that varies
     tangent: Vector  # of the curve, along its unknowns
-    about: str  # what the eigenvalues are
+    about: str  # name of the eigenvalues
 
     def __getitem__(self, name: str) -> float:
         """Return a coordinate, a speed, or the parameter that varies."""
@@ -46,7 +46,7 @@ class FamilyPoint(Printed):
 
     @property
     def differentiable(self) -> bool:
-        """Whether the point is a smooth function of the scene's parameters: no branch point."""
+        """Return whether the point is a smooth function of the scene's parameters: no branch point."""
         return self.kind != "branch point"
 
     def _text(self) -> str:
@@ -59,13 +59,13 @@ class Family(Printed):
     """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
     periodic motion are those at the start of a period.
 
-    Each eigenvalue keeps its column along the curve. Zeros due to motion along the family or to held
-    quantities are omitted. For periodic motions, all multipliers take the place of eigenvalues.
+    Each eigenvalue keeps its column along the curve. Zeros of motion along the family or of held quantities
+    are omitted. Periodic motions have multipliers instead of eigenvalues.
     """
 
     equations: Motions
     points: tuple[Point, ...]
-    ends: tuple[str, str]  # why the curve ends at its first and at its last point
+    ends: tuple[str, str]  # reasons why the curve ends at its first and at its last point
     mode_names: Labels
     special: tuple[FamilyPoint, ...] = ()
 
@@ -80,28 +80,31 @@ class Family(Printed):
 
     @property
     def eigenvalues(self) -> Complex[np.ndarray, "points modes"]:
-        """Eigenvalues of small motions in 1/s, or multipliers, each in its column, named by `mode_names`."""
+        """Return eigenvalues of small motions in 1/s, or multipliers, each in its column, named by
+        `mode_names`.
+        """
         return np.array([point.modes for point in self.points])
 
     @property
     def stable(self) -> Bool[np.ndarray, "points"]:
-        """Whether no small motion about a point grows."""
+        """Return whether no small motion about a point grows."""
         return np.all(self.equations.growth(self.eigenvalues) <= SURE * (1 + np.abs(self.eigenvalues)), axis=1)
 
     @property
     def folds(self) -> tuple[FamilyPoint, ...]:
-        """Points at which a named value turns back."""
+        """Return points at which a named value turns back."""
         return tuple(point for point in self.special if point.kind.startswith("fold"))
 
     @property
     def branches(self) -> tuple[FamilyPoint, ...]:
-        """Points through which another family goes: `jj.family(scene, family.branches[0])` follows that one."""
+        """Return points where another family crosses: `jj.family(scene, family.branches[0])` follows it."""
         return tuple(point for point in self.special if point.kind == "branch point")
 
     @property
     def changes(self) -> tuple[FamilyPoint, ...]:
-        """Points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two eigenvalues
-        meet. For multipliers: points at which one passes 1 or -1, or a pair passes the unit circle.
+        """Return points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two
+        eigenvalues coincide. For multipliers: points at which one passes 1 or -1, or a pair passes the unit
+        circle.
         """
         return tuple(point for point in self.special if point.modes)
 
@@ -173,7 +176,7 @@ def family(
     inputs: Numbers | dict | None = None,
     max_points: int = 4000,
 ) -> Family:
-    """Follow the family of steady motions through the motion near a guess, or a family of periodic motions.
+    """Return the family of steady motions through the motion near a guess, or a family of periodic motions.
     Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`, with one freedom left.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
@@ -183,26 +186,30 @@ def family(
         jj.family(sleigh, jj.periodic(sleigh, guess, jnp.pi, inputs=torque), vary="drag")     # multipliers in place of eigenvalues
 
     **Arguments**
-    - `guess`: as of `steady`; or a branch point of another family of steady motions, whose other curve is
+
+    - `guess`: as in `steady`; or a branch point of another family of steady motions, whose other curve is
       followed; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
       quantities of its search.
     - `until`: name -> value at which the curve ends. The curve is followed towards it from the guess, whose
       value of that name is kept at the start; without `until` it is followed in both directions. A closed
-      curve ends at its start, and a curve along a parameter ends before it leaves the sign declared for it.
+      curve ends at its start, and a curve along a parameter ends before the parameter loses its declared
+      sign.
     - `vary`: a parameter of the scene (one number) that changes along the curve.
-    - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as of `steady`.
-    - `names`: of the modes at the start, by ascending real part, for a pair the one with positive imaginary
-      part first; default: the `mode_names` of the scene at the point farthest out (for a bicycle the
-      fastest), or "mode 1", ...
+    - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as in `steady`.
+    - `names`: of the modes at the start, by ascending real part, with the positive imaginary part of a pair
+      first; default: the scene's `mode_names` at the point farthest out (for a bicycle the fastest), or "mode
+      1", ...
     - `max_points`: the largest number of points in each direction.
 
-    **Returns** a `Family`, traced by pseudo-arclength, with special points located to round-off. Steps are at
-    most 0.1 of the sizes of the unknowns (for a coordinate the width of its domain, for a speed 10 SI units)
-    and turn by at most 10 degrees. Two special points of one kind within one step are found only if the test
-    between them bends like a parabola, as it does for points 1 mm apart on a curve of 1 m.
+    **Returns** a `Family`, traced by pseudo-arclength, with special points accurate to round-off. Steps are
+    at most 0.1 of the sizes of the unknowns (for a coordinate the width of its domain, for a speed 10 SI
+    units) and turn by at most 10 degrees. Two special points of one kind within one step are found only if
+    the test function between them is nearly a parabola, as for points 1 mm apart on a curve of 1 m.
 
-    **Raises** ValueError: an unknown name; no steady motion near the guess; none or several freedoms (the error names what may be held); a start that is a
-    branch point itself; `NotLowered` where the scene has no scalar program. `DifferentiationModeError` inside `jit`: differentiate `steady` or `linearize`.
+    **Raises** ValueError for an unknown name; if no steady motion is near the guess; for none or several
+    freedoms (the error names quantities to hold); and for a start at a branch point. Raises `NotLowered` if
+    the scene has no scalar program, and `DifferentiationModeError` inside `jit`: differentiate `steady` or
+    `linearize`.
     """
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
@@ -229,10 +236,12 @@ def family(
     elif point.kind == "branch point" and len(point.tangent) == len(equations.unknowns):
         begin = across(equations, point.tangent / equations.size)
     else:
-        raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch "
-            "point of a family with the same unknowns")
+        raise ValueError(
+            f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch point of a "
+            "family with the same unknowns"
+        )
     points, ends = followed(equations, begin, targets, max_points)
-    # between its neighbours a branch point is found as any other
+    # a branch point between its neighbours is found like any other
     labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)
     found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, labels)
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}

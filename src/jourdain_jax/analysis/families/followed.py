@@ -1,4 +1,4 @@
-"""Continuation of a curve of steady motions: its beginning, eigenvalues, end, and special points."""
+"""Continuation of a curve of steady motions: its start, eigenvalues, end, and special points."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import all_finite, largest
 
 
 def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
-    """Return all points of a curve in order, and the reasons why it ends at either side. If there are
-    targets, the curve is followed towards them only.
+    """Return all points of a curve in order, and the reasons why it ends at either side. With targets, the
+    curve is followed only towards them.
     """
     ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
     if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
@@ -27,7 +27,7 @@ def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> t
 
 
 def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Test, Point]]:
-    """Return special points between the points, in order."""
+    """Yield special points between the points, in order."""
     for here, there in pairwise(_with_dips(equations, points, turning)):
         found = []
         for test in tests_between(equations, here, there, turning):
@@ -36,14 +36,15 @@ def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]
                 found.append((test, point) if point else (replace(test, kind=f"{test.kind}, before this "
                     "point"), there))
         branch = next((point for test, point in found if test.kind == "branch point"), None)
-        if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
+        # near a branch point tangents lose digits, so points this close count as the branch point
+        if branch is not None:
             found = [(test, branch if largest(point.z - branch.z) < 1e-4 else point) for test, point in found]
         yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
 
 
 def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> list[Point]:
-    """Return the points, and one more wherever a test nearly vanishes between two of them (except near branch
-    points), since two special points may lie there.
+    """Return the points, with one inserted wherever a test nearly vanishes between two of them (except near
+    branch points), since two special points may lie there.
     """
     points, k = list(points), 1
     while k < len(points) - 1:
@@ -61,8 +62,8 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
 
 
 def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
-    """Return the steady motion near the guess. All named values are kept if possible; otherwise only those
-    that are held or followed.
+    """Return the steady motion near the guess. All named values are kept if possible; otherwise only held or
+    followed ones.
     """
     z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
     if not all_finite(look.R):
@@ -73,8 +74,9 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
         if found and largest(found[1].R) < 1e-9:
             break
     else:
-        raise ValueError(f"no {equations.what[:-1]} of `{scene}` was found near the guess; search from "
-            "further away by `jj.steady`")
+        raise ValueError(
+            f"no {equations.what[:-1]} of `{scene}` was found near the guess; search farther by `jj.steady`"
+        )
     z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
     count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
@@ -85,7 +87,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
         free = [f"`{name}`" for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True) if share > 1e-3]
         raise ValueError(
             f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: "
-            f"name {count - 1} of {', '.join(free)} in `held`, or start beside a branch point"
+            f"name {count - 1} of {', '.join(free)} in `held`, or start next to a branch point"
         )
     return Point(z, V[-1], look, equations.eigenvalues(look, V[-1]))
 

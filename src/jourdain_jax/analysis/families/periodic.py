@@ -1,18 +1,18 @@
-"""Periodic motions by shooting over several pieces of one period, and their Floquet multipliers.
+"""Periodic motions by multiple shooting over one period, and their Floquet multipliers.
 
     z_k -> f_k(z_k),  k = 1 .. n:  motions over equal parts of the period T,   z = (q, u)
     R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  f_n(z_n) - z_1 of what matters,  c(z_1) )
 
-c: the value of an event, where T is unknown. Ignorable coordinates may shift by the same amount in every period. With small motions
-dz_k = B_k x_k that meet the constraints, and L_k B_k = 1,
+c: the value of an event, if T is unknown. Ignorable coordinates may shift by the same amount in every period.
+With small motions dz_k = B_k x_k that satisfy the constraints, and L_k B_k = 1,
 
     x_{k+1} = M_k x_k,  M_k = L_{k+1} (df_k/dz_k) B_k:       the multipliers are the eigenvalues of M_n .. M_1
 
-They are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k, so that small multipliers keep their digits beside large
-ones. R has more rows than it needs, which agree; the pseudo-inverse of its slopes at the root carries derivatives with respect to
-parameters.
-Source: R. Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and
-A. D. Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
+They are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k, so that small multipliers keep
+their digits beside large ones. R has redundant, consistent rows; the pseudo-inverse of its Jacobian at the
+root carries derivatives with respect to parameters. Source: R. Seydel, Practical Bifurcation and Stability
+Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and A. D. Jepson, SIAM J. Numer.
+Anal. 28 (1991) 1446.
 """
 
 from collections.abc import Mapping
@@ -60,12 +60,12 @@ class PeriodicMotion(Printed, eqx.Module):
 
     state: State  # at the start of a period
     period: Scalar  # s
-    shift: dict[str, Scalar]  # change of a coordinate in a period: of those that are ignorable, and of those given
-    multipliers: Complex[Array, "multipliers"]  # factors by which small motions grow in a period, the largest first
+    shift: dict[str, Scalar]  # change of a coordinate per period: ignorable coordinates, and those given
+    multipliers: Complex[Array, "multipliers"]  # growth of small motions per period, the largest first
     residual: Scalar  # largest difference after one period, in units of the unknowns' sizes
     converged: Flag
-    by: "_Shooting"  # the equations it solves
-    unknowns: Unknowns  # states at which pieces begin, and the period
+    by: "_Shooting"  # the equations solved
+    unknowns: Unknowns  # states at the starts of pieces, and the period
 
     def __getitem__(self, name: str) -> Scalar:
         """Return a coordinate or speed at the start, by name."""
@@ -73,8 +73,8 @@ class PeriodicMotion(Printed, eqx.Module):
 
     @property
     def stable(self) -> Flag:
-        """Whether no small motion grows. Multipliers of symmetries and conserved quantities are one, up to
-        round-off.
+        """Return whether no small motion grows. Multipliers of symmetries and conserved quantities are one,
+        up to round-off.
         """
         return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
 
@@ -102,38 +102,40 @@ def periodic(
     options: Options | None = None,
     **by_name: Unpack[MotionFields],
 ) -> PeriodicMotion:
-    """Find the periodic motion near a guess, with its Floquet multipliers.
+    """Return the periodic motion near a guess, with its Floquet multipliers.
 
         orbit = jj.periodic(sleigh, {"forward": 0.4}, jnp.pi, inputs={"torque": lambda t: 0.6 * jnp.sin(2 * t)})
         orbit.multipliers, orbit.stable, orbit.shift["heading"]
         jax.jacfwd(lambda drag: jj.periodic(sleigh.replace(drag=drag), guess, jnp.pi).multipliers)(0.15)
 
     **Arguments**
-    - `guess`: a `State`, or named values (a start, as `simulate` takes it), of a state near the motion.
-    - `period`: in s. It is kept, and must be that of the loads or inputs, unless `until` is given; then a
-      rough value is enough.
-    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the
+
+    - `guess`: a `State`, or named values (a start, as for `simulate`), of a state near the motion.
+    - `period`: in s. It is kept, and must equal the period of the loads or inputs, unless `until` is given;
+      then a rough value is enough.
+    - `until`: the name of an event of the scene whose value is zero at the start and end of a period; the
       period is then found as well. Nothing in the scene may depend on time.
     - `held`: names of coordinates and speeds that keep the guess's value at the start, needed if there are
       neighbouring periodic motions.
-    - `shift`: name -> change of a coordinate in a period, `{"crank": 2 * jnp.pi}` for a rotating crank.
-    - `pieces`: number of equal parts of the period, which are integrated side by side. Increase it where
-      disturbances grow by more than 1e3 in a part.
-    - `options`, `by_name`: as of `simulate`, including `inputs`; the default tolerance is 1e-12.
+    - `shift`: name -> change of a coordinate per period, `{"crank": 2 * jnp.pi}` for a rotating crank.
+    - `pieces`: number of equal parts of the period, integrated as a batch. Increase it if disturbances grow
+      by more than 1e3 in a part.
+    - `options`, `by_name`: as in `simulate`, including `inputs`; the default tolerance is 1e-12.
 
-    **Returns** a `PeriodicMotion`. Check `converged` and `residual`, since nothing is raised where none is
-    found. Stop events do not end the motion, but a motion that has passed one, as seen at 100 times in the
-    period, counts as not found. Runs under `jit` and `vmap`; differentiable in the parameters of the scene,
-    where the motion is a smooth function of them and its multipliers are distinct.
+    **Returns** a `PeriodicMotion`. Check `converged` and `residual`, since a failed search raises no error.
+    Stop events do not end the motion, but a motion that passes one, sampled at 100 times in the period,
+    counts as not found. Runs under `jit` and `vmap`; differentiable in the parameters of the scene where the
+    motion is a smooth function of them and its multipliers are distinct.
 
-    **Raises** ValueError: an unknown name, a period that is not positive; TypeError for unknown options.
+    **Raises** ValueError for an unknown name or a period that is not positive; TypeError for unknown options.
     """
     built, scene = scene, as_scene(scene)
     inputs = as_inputs(scene, by_name.pop("inputs", None))
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
     beside = "it finds a motion whose length is `period`, which no stop event ends, by runs without work and retries"
     options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
-    options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)  # tolerances are traced below
+    # tolerances are traced below
+    options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)
     if not np.all(known_numbers(period) > 0) or not all_finite(known_numbers(period)):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
     checked_whole(pieces, "`pieces`", 1, expected="of at least 1")
@@ -158,34 +160,34 @@ def periodic(
 
 
 class _Shooting(eqx.Module):
-    """R and its derivatives as functions of the period and of the states at which pieces begin, shape
+    """R and its derivatives as functions of the period and of the states at the starts of pieces, shape
     (pieces, states).
     """
 
     scene: Scene
     inputs: Inputs
     options: AllOptions
-    shift: States  # change in a period, as given
+    shift: States  # change per period, as given
     instant: ByProgram | ByMatrices = static()
     pieces: int = static()
     until: int | None = static()
-    kept: Indices = static()  # numbers of z that matter
-    free: Indices = static()  # and of those that are unknown at the start
-    shifted: Labels = static()  # names of what the user says to move
+    kept: Indices = static()  # indices of relevant entries of z
+    free: Indices = static()  # indices of unknown entries at the start
+    shifted: Labels = static()  # names of coordinates with a given shift
 
     @property
     def sizes(self) -> Float[np.ndarray, "states"]:
-        """Sizes of coordinates and speeds."""
+        """Return sizes of coordinates and speeds."""
         return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
 
     @property
     def is_unknown(self) -> Bool[np.ndarray, "all_unknowns"]:
-        """Which of the states at which pieces begin, and the period, are solved for."""
+        """Return which of the states at the starts of pieces, and whether the period, are solved for."""
         at_start = [k in self.free for k in range(len(self.sizes))]
         return np.array([*at_start, *[True] * len(self.sizes) * (self.pieces - 1), self.until is not None])
 
     def split(self, z: States) -> tuple[Array, Array]:
-        """q and u."""
+        """Return q and u."""
         n = len(self.scene.coordinate_names.entries)
         return z[:n], z[n:]
 
@@ -195,7 +197,7 @@ class _Shooting(eqx.Module):
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options).nan_if_failed()
 
     def moved(self, k, z: States, t, period) -> States:
-        """f_k."""
+        """Return f_k."""
         part = period / self.pieces
         motion = self.motion(t + k * part, z, (t + (k + 1) * part)[None])
         return jnp.concatenate([motion.q_end, motion.u_end])
@@ -205,22 +207,21 @@ class _Shooting(eqx.Module):
         return event_values(self.scene, motion_at(self.scene, t, *self.split(z), inputs_at(self.inputs, t)))
 
     def constraints(self, t, z: States) -> tuple[Array, Array]:
-        """g and phi with their slopes by z."""
+        """Return g and phi with their derivatives with respect to z."""
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, t, *self.split(z), inputs_at(self.inputs, t))
         rows = np.concatenate([at.g, at.phi])
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
     def aligned(self, there: States, here: States) -> States:
-        """Return the state `there`, with the signs of its quaternions chosen to bring it nearest to `here`.
-        """
+        """Return the state `there`, with the signs of its quaternions chosen to be nearest to `here`."""
         for first, _ in self.scene.coordinates.quaternions:
             part = slice(first, first + 4)
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
         return there
 
     def pieces_of(self, x: Unknowns) -> tuple[Float[Array, "pieces states"], Scalar]:
-        """Return states at which pieces begin, and the period."""
+        """Return the states at the starts of pieces, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
     def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
@@ -237,7 +238,7 @@ class _Shooting(eqx.Module):
         return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
 
     def slopes(self, t, x: Unknowns) -> tuple[Array, Array, Array]:
-        """df_k/dz_k, df_k/dT, and f_k."""
+        """Return df_k/dz_k, df_k/dT, and f_k."""
         zs, period = self.pieces_of(x)
 
         def of_piece(k, z):
@@ -250,7 +251,7 @@ class _Shooting(eqx.Module):
         return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
 
     def look(self, t, x: Unknowns) -> tuple[Array, Array, tuple[Array, Array]]:
-        """R, dR/dx, and df_k/dz_k with f_k."""
+        """Return R, dR/dx, and df_k/dz_k with f_k."""
         D, of_period, ends = self.slopes(t, x)
 
         def linear(change):
@@ -260,8 +261,8 @@ class _Shooting(eqx.Module):
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
-        """Return the eigenvalues of the product M_n .. M_1, largest first. Its factors come from df_k/dz_k
-        and f_k. If the period is unknown, the eigenvalue of motion along the orbit is omitted.
+        """Return the eigenvalues of the product M_n .. M_1, largest first, from df_k/dz_k and f_k. If the
+        period is unknown, the eigenvalue of motion along the orbit is omitted.
         """
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
@@ -277,7 +278,7 @@ class _Shooting(eqx.Module):
         M = jnp.linalg.solve(L @ following, L @ D @ B)
         cyclic = jnp.zeros((n, count, n, count), M.dtype).at[(np.arange(n) + 1) % n, :, np.arange(n)].set(M)
         roots = jnp.linalg.eigvals(jnp.reshape(cyclic, (n * count, -1)))
-        # of the n roots that belong to one multiplier, one lies in this sector; its bounds are those of no real multiplier
+        # of the n roots of one multiplier, one lies in this sector; its bounds contain no real multiplier
         beyond = jnp.mod(jnp.angle(roots) - 0.1, 2 * np.pi) >= 2 * np.pi / n
         found = (roots**n)[jnp.argsort(beyond, stable=True)[:count]]
         found = jnp.where(jnp.abs(found.imag) < 1e-9 * jnp.abs(found), found.real, found)
@@ -312,8 +313,8 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R, its derivatives and the multipliers of one scene as functions of z, which holds the unknowns of a
-    periodic motion and one varying parameter.
+    """R, its derivatives and the multipliers of one scene as functions of z, the unknowns of a periodic
+    motion and one varying parameter.
     """
 
     what, modes = "periodic motions", "multipliers"
@@ -340,13 +341,13 @@ class OrbitEquations(Motions):
 
     @staticmethod
     def eigenvalues(look: Look, tangent: Vector) -> Modes:
-        """Multipliers."""
+        """Return the multipliers."""
         return look.small[0]
 
 
 @compiled_quickly
 def _looked(problem: _Shooting, vary: Labels, t, numbers: Unknowns) -> tuple[Array, Array, Array]:
-    """R, its slopes by all numbers, and the multipliers."""
+    """Return R, its derivatives with respect to all numbers, and the multipliers."""
     x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
     moved = lambda values: replace(problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True))))  # noqa: E731
     R, J, (D, ends) = moved(parameters).look(t, x)

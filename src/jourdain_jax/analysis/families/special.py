@@ -1,12 +1,13 @@
-"""Special points between two neighbours of a curve: where a smooth test changes its sign.
+"""Special points between two neighbours of a curve, where a smooth test function changes its sign.
 
-fold of a named unknown     t_k = 0                       t: tangent
-branch point                det (U'J; t) = 0              U: the rows that J holds independently, carried on from the neighbour
-zero eigenvalue             s = 0, real
-pair on the imaginary axis  Re s = 0, complex
-double root                 (s_a - s_b)^2 = 0             a pair of real ones becomes complex, or the reverse
+    fold of a named unknown     t_k = 0                       t: tangent
+    branch point                det (U'J; t) = 0              U: the independent rows of J, continued
+    zero eigenvalue             s = 0, real
+    pair on the imaginary axis  Re s = 0, complex
+    double root                 (s_a - s_b)^2 = 0             a pair of real ones becomes complex, or the reverse
 
-Where a test keeps its sign and nearly vanishes by the parabola through three neighbours, it is looked at there: it may change its sign twice within a step.
+If a test function keeps its sign but nearly vanishes by the parabola through three neighbours, it is
+evaluated there: it may change its sign twice within a step.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,13 +20,13 @@ from jourdain_jax.analysis.families.curve import Point
 from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import are_partners
 
-SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalues, that is not round-off
+SURE = 1e-7  # relative to 1 + |s|: a larger real part, or distance of two eigenvalues, is not round-off
 
 
 @dataclass(frozen=True)
 class Test:
-    """A function that changes its sign at special points of one kind, and the magnitude above which its value
-    is reliable.
+    """A test function that changes its sign at special points of one kind, and the magnitude above which its
+    value is reliable.
     """
 
     kind: str
@@ -40,8 +41,9 @@ class Test:
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Return the place where a test nearly vanishes without changing its sign; None if it changes its sign.
-    The place is found by a parabola through the values f at three neighbours, of which the second is at zero.
+    """Return where a test function nearly vanishes without changing its sign; None if it changes its sign.
+    The position is found by a parabola through the values f at three neighbours, of which the second is at
+    zero.
     """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
@@ -55,8 +57,8 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
-    """Return the tests between two neighbouring points: of folds of the named unknowns, of branch points, and
-    of eigenvalues.
+    """Yield the tests between two neighbouring points: for folds of the named unknowns, for branch points,
+    and for eigenvalues.
     """
     held = len(here.z) - 1
     U = np.linalg.svd(here.look.J)[0][:, :held]
@@ -82,8 +84,7 @@ def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
     """Return unit tangents of the two curves that cross at a branch point: a and a' in its null space with l
     . R_zz a a = 0.
 
-    R_zz is a central difference of J. Only one of the left null vectors l gives a quadratic form that is not
-    zero.
+    R_zz is a central difference of J. Only one of the left null vectors l gives a nonzero quadratic form.
     """
     look = equations(z)
     U, _, V = np.linalg.svd(look.J)

@@ -27,8 +27,8 @@ def matched(before: Modes, now: Modes) -> Modes:
 
 
 def surely_matched(before: Modes, now: Modes) -> bool:
-    """Return whether every eigenvalue moved by less than half of its distance to the nearest other one, apart
-    from its complex partner.
+    """Return whether every eigenvalue moved by less than half of its distance to the nearest other one,
+    excluding its complex partner.
     """
     columns = range(len(now))
     beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
@@ -42,10 +42,11 @@ def are_partners(before, now, k: int, j: int) -> bool:
 
 
 def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
-    """Return names of the columns: those of the user, of the scene, or numbers."""
+    """Return names of the columns: the user's, the scene's, or numbers."""
     named = getattr(scene, "mode_names", None)
     names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
     if len(names) != len(values):
-        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(values)} "
-            "modes")
+        raise ValueError(
+            f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes"
+        )
     return names
