@@ -210,7 +210,7 @@ INERTIAS = {
     "jj.fit(disc, jj.Experiment(TS, {'lean': TS}, 0.1, start={}), {'disc': possible})": "entry 11 of its inertia is made of `mass`, `radius`",
     "inertia(free={'moments': None})": "`free` has `moments` and the possible inertia of `body`, which determines `moments`",
     "inertia(free={'moments': lambda scene: scene.moments})": "a function for `moments` and the possible inertia",
-    "inertia(moments=(0.1, 0.1, 0.3))": "has the moments of inertia 0.1, 0.1, 0.3 kg m ... , which, with its products, no body",
+    "inertia(moments=(0.1, 0.1, 0.3))": "no body of nonzero thickness has the moments of inertia of body ... 0.1, 0.1, 0.3 kg m",
     "inertia(lambda s: jnp.array([0.0, 0.0, 1.0]) * s.moments[0])": "entry 11 of its inertia, 0 kg m ... , is not a parameter; give its parameters ranges",
     "inertia(lambda s: jnp.array([1.0, 1.5, 1.0]) * s.moments[0])": "moments about axes 1 and 2 are different multiples of `moments`",
     "inertia(lambda s: s.moments**2)": "entry 11 of its inertia is made of `moments`, expected one parameter times a constant",

@@ -152,7 +152,7 @@ NOISE: dict[str, str] = {
         "correlation time of channel `x` is None in one run and given in another"
     ),
     "jj.fit(cart, run(correlation_time=0.1), 'mass', loss=jj.huber())": "a robust loss assumes independent samples",
-    "jj.log_likelihood(cart, run(correlation_time=None))": "the correlation time of channel `x` is None, but a likelihood needs to know it",
+    "jj.log_likelihood(cart, run(correlation_time=None))": "the correlation time of channel `x` is None, but a likelihood needs it",
 }
 
 PRIORS: dict[str, str] = {

@@ -200,8 +200,8 @@ def test_names_that_no_data_tell_stand_in_the_report(tmp_path, drawn):
     fit = jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia", "mass"))
     fit.report(tmp_path / "fit.html", data, profiles=("mass",))
     text = (tmp_path / "fit.html").read_text(encoding="utf-8")
-    assert "`inertia` and `mass` do not show separately" in text
-    assert any(text.get_text() == "the data do not tell" for text in drawn[0].axes[0].texts)
+    assert "`inertia` and `mass` are not determined separately" in text
+    assert any(text.get_text() == "not determined" for text in drawn[0].axes[0].texts)
     assert "profile flat" in text
     assert list(sections(tmp_path / "fit.html")["What informs which unknown"]) == ["unknown", "offset"]
 
@@ -220,11 +220,11 @@ def test_report_answers_what_it_cannot_write(fitted, tmp_path):
     fit, data = fitted
     with pytest.raises(ValueError, match=r"is a \.html file"):
         fit.report(tmp_path / "fit.pdf")
-    with pytest.raises(ValueError, match="expected those of the fit"):
+    with pytest.raises(ValueError, match="expected the fit's"):
         fit.report(tmp_path / "fit.html", [data, data])
     with pytest.raises(ValueError, match="differ from those of the fit"):
         fit.report(tmp_path / "fit.html", measured(7))
-    with pytest.raises(ValueError, match="computed from the runs that were fitted"):
+    with pytest.raises(ValueError, match="computed from the fitted runs"):
         fit.report(tmp_path / "fit.html", profiles=True)
 
 
@@ -291,7 +291,7 @@ def test_profiles_answer_wrong_names_and_other_data():
         fit.profiles(data, "ofset")
     with pytest.raises(ValueError, match="differ from those of the fit"):
         fit.profiles(run(noise=9))
-    with pytest.raises(ValueError, match="expected those of the fit"):
+    with pytest.raises(ValueError, match="expected the fit's"):
         fit.profiles(run(unknown=()))
 
 

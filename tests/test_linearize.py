@@ -218,7 +218,7 @@ def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve()
     assert in_jit.pivot < 1e-12
     assert in_jit.code == 6
     assert np.isnan(in_jit.A).all()
-    with pytest.raises(ValueError, match="do not follow from its rows at this state"):
+    with pytest.raises(ValueError, match="are not determined by its constraints at this state"):
         linearize(scene, state, (), privileged=("heading_rate", "steer_rate"))
 
 

@@ -32,7 +32,7 @@ def test_planned_covariance_is_that_of_a_fit():
 def test_what_a_plan_will_not_tell_is_named():
     found = jj.planned_information(Cart(damping=0.0), plan(), ("mass", "stiffness"))
     (sentence,) = found.not_identifiable
-    assert "do not show separately" in sentence
+    assert "are not determined separately" in sentence
     assert sentence in str(found)
     assert [row.split()[-1] for row in str(found).splitlines()[2:4]] == ["-", "-"]
     assert not jj.planned_information(Cart(damping=0.0), plan(), "mass").not_identifiable

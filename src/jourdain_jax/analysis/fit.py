@@ -138,52 +138,60 @@ def fit(
     shooting: MultipleShooting | None = None,
     **by_name: Unpack[FitFields],
 ) -> Fit:
-    """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
+    """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their
+    sensors, from measurements.
 
     **Arguments**
-    - `scene`: its parameters are fixed, or first guesses where they are free.
-    - `data`: one run or several, each with its own times, channels, start and inputs.
-    - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
-      is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
-      `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
-      `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. The name of a body, with
-      `possible_inertia()`, frees its moments of inertia. Unknowns in `unknown_start`, sensors and actuators
-      of the runs are free as well.
-    - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
-      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` is
-      the number of guesses that led to it.
-    - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
-      starts of their own, and continuity between them is an equation. The objective is unchanged.
 
-    By name (`by_name`): - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the
-    largest count as zero (`Information`). Keep it well above the relative accuracy of the simulation. -
-    `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many
-    sigmas, and no unknown by more than about this fraction. `max_iterations` (50): the largest number of
-    steps over each span. - `loss`: `huber()` or `student_t()` for data with outliers (default: least
-    squares). - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid
-    for white noise. "runs": the differences between at least five runs (the cluster sandwich), valid for any
-    noise within a run, even if the scene is not quite right; unknowns of single runs still assume white noise
-    within the run. - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`,
-    `max_steps`. Stop events do not cut a run: all given samples count, and `Fit.warnings` names events that
-    the fitted motion meets before a sample. Give samples up to the event of the real motion; if the fitted
-    motion decided, estimates whose motion ends early would have fewer residuals.
+    - `scene`: its parameters are fixed, or first guesses if they are free.
+    - `data`: one run or several, each with its own times, channels, start and inputs.
+    - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive
+      if the parameter is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the
+      scene ties a parameter to others: `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass *
+      scene.radius**2}`. The measured sigmas of a bicycle are such priors:
+      `free=measured_bicycle("Browser").prior`; for parameters that were measured together, use
+      `joint_normal(means, covariance)`. The name of a body, with `possible_inertia()`, frees its moments of
+      inertia. Unknowns in `unknown_start`, sensors and actuators of the runs are free as well.
+    - `guesses`: number of first guesses, fitted as a batch: the scene's and the runs', and others on a Latin
+      hypercube over the bounds of all unknowns, or within a factor of five of a `positive()` one. The lowest
+      minimum counts; `Fit.agreeing` is the number of guesses that led to it.
+    - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic
+      motions: the runs are fitted in pieces with their own starts, and continuity between them is an
+      equation. The objective is unchanged.
+
+    By name (`by_name`):
+
+    - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the largest count as zero
+      (`Information`). Keep it well above the relative accuracy of the simulation.
+    - `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many
+      sigmas, and no unknown by more than about this fraction.
+    - `max_iterations` (50): the largest number of steps over each span.
+    - `loss`: `huber()` or `student_t()` for data with outliers (default: least squares).
+    - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white
+      noise. "runs": the differences between at least five runs (the cluster sandwich), valid for any noise
+      within a run, even if the scene is not quite right; unknowns of single runs still assume white noise
+      within the run.
+    - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`.
+
+    Stop events do not cut a run: all given samples count, and `Fit.warnings` names events that the fitted
+    motion meets before a sample. Give samples up to the event of the real motion; otherwise estimates whose
+    motion ends early would have fewer residuals.
 
     If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans
     (unless `shooting` is given): the first 1/32 of each run, then more of it, as far as the fitted motion
     follows the data, with the first guess as a weak prior whose sigma is its own size. This also fits
-    unstable motions that no first guess would follow to their end. The lower minimum counts; `Fit.grown`
-    tells whether it came from growing spans.
+    unstable motions that no first guess would follow to their end. The lower minimum counts; `Fit.grown` is
+    True if it came from growing spans.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals, residuals, the fitted scene, and
-    sentences on undetermined combinations. Given sigmas count as known; where they are None, or under a
-    robust loss, intervals are those of Student's t. An unknown at its bound has a one-sided interval, by
-    profile likelihood. `converged` is False where no minimum was found. Runs of equal structure share one
-    compiled program, whatever their number and lengths; time and memory are proportional to the number of
-    runs.
+    sentences on undetermined combinations. Given sigmas count as known; if they are None, or under a robust
+    loss, intervals are those of Student's t. An unknown at its bound has a one-sided interval, by profile
+    likelihood. `converged` is False if no minimum was found. Runs of equal structure share one compiled
+    program, independent of their number and lengths; time and memory are proportional to the number of runs.
 
     **Raises** ValueError for names, shapes or numbers that do not fit, for no or too many unknowns, and for a
-    start that contradicts the constraints; DifferentiationModeError inside `jit`, `vmap` or a derivative,
-    since steps are chosen outside of compiled code.
+    start that contradicts the constraints. Raises DifferentiationModeError inside `jit`, `vmap` or a
+    derivative, since steps are chosen outside of compiled code.
 
     **Examples**
 
@@ -191,11 +199,10 @@ def fit(
         motion = jj.simulate(truth, start, ts=ts)
         data = jj.Experiment(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
         found = jj.fit(jj.models.ChaplyginSleigh(), data, free={"offset": jj.bounds(0.05, 1.0)})
-        print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
+        print(found)                                              # estimates with 95 % intervals, and undetermined combinations
         found["offset"].value, found.scene.offset                 # near 0.25 m
     """
-    guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: how many first guesses to "
-        "begin from")
+    guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: the number of first guesses")
     check_shooting(shooting)
     return _fit(replace(_asked(scene, free, by_name, "fit"), guesses=guesses, shooting=shooting), data)
 
@@ -206,12 +213,13 @@ def fit_batch(
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **by_name: Unpack[FitFields],
 ) -> Fit:
-    """Fit many repeats of one experiment as one batch.
+    """Return the fits of many repeats of one experiment, computed as one batch.
 
-    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and `by_name` as in `fit`.
+    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and
+    `by_name` as in `fit`.
 
     **Returns** a `Fit` whose arrays have the leading axis. A repeat that fails, or has fewer samples than
-    unknowns, has `converged` False and does not affect the others. **Raises** as `fit`.
+    unknowns, has `converged` False and does not affect the others. **Raises** errors as in `fit`.
     """
     return _fit(_asked(scene, free, by_name, "fit_batch"), data, repeats=True)
 
@@ -253,7 +261,8 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     problem = Problem(asked, runs, unknowns, members) if asked.shooting is None else Piecewise(asked, runs, unknowns)
     found = shot(problem, theta) if isinstance(problem, Piecewise) else minimum(problem, theta)
-    if problem.failed or not found.steps.all():  # no step shows whether starts go along with the unknowns
+    # without a step it is unknown whether starts can move with the unknowns
+    if problem.failed or not found.steps.all():
         check_starts(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
     if isinstance(problem, Piecewise):
@@ -293,7 +302,8 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
-    """Return which repeats have as many measured values as unknowns; ValueError where none has."""
+    """Return which repeats have at least as many measured values as unknowns. Raises ValueError if none has.
+    """
     known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
     each, sigmas = sum(counts) + np.count_nonzero(unknowns.prior_weight), len({name for run in runs for name in run.unknown_sigma})
@@ -323,6 +333,6 @@ def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.
         unknowns=problem.unknowns,
         work_out=partial(statistics, problem, found, at_bounds),
     )
-    if problem.with_memory:  # its motions are needed, in the context that is here
+    if problem.with_memory:  # it needs motions, in the present context
         told.statistics  # noqa: B018
     return told

@@ -1,9 +1,10 @@
 """A fit as one self-contained HTML file: texts, tables and figures.
 
-An interval from noise that is taken as white, but is AR(1) noise of correlation r_1, is too narrow by about sqrt((1 + r_1) / (1 - r_1)) where sensitivities
-change slowly: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series Analysis, 3rd ed. (1994), section 2.1.5.
+If AR(1) noise of correlation r_1 is assumed white, intervals are too narrow by about sqrt((1 + r_1) / (1 -
+r_1)), for slowly changing sensitivities: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series Analysis,
+3rd ed. (1994), section 2.1.5.
 
-Its figures: data beside prediction with errors, how well each unknown is known, and its profile.
+Figures: data and prediction with errors, the interval of each unknown, and its profile.
 """
 
 import html
@@ -41,14 +42,15 @@ def data_and_prediction(caption: str, label: str, one: Prediction, component: in
 
 
 def interval_widths(fit: Estimates) -> str:
-    """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on an axis of powers of ten."""
+    """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on a logarithmic
+    axis.
+    """
     names, narrowest, widest = fit.labels[:40], 1e-4, 100.0  # unknowns in one figure; per cent
     values, low, high = (np.asarray(x[: len(names)], float) for x in (fit.values, fit.low, fit.high))
     half = np.maximum(high - values, values - low)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 100 * half / np.abs(values)
-    told, words = np.isfinite(half), ["one-sided" if bound else "the data do not "
-        "tell" for bound in fit.at_bound]
+    told, words = np.isfinite(half), ["one-sided" if bound else "not determined" for bound in fit.at_bound]
     for i in np.flatnonzero(told):
         words[i] = f"{values[i]:.4g} {fit.units[i]}".strip() + (f" ± {half[i]:.2g}" if share[i] < 1000 else "")
 
@@ -122,9 +124,9 @@ def fit_page(
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]
     if profiles:
         about = (
-            "The rise of the sum of squares when one unknown is held and all others are fitted again. The "
-            "interval ends where it passes 3.84 (red, dashed). Grey: the parabola of the standard error; "
-            "where both differ, trust the profile."
+            "The rise of the sum of squares when one unknown is fixed and all others are fitted again. The "
+            "interval ends where it passes 3.84 (red, dashed). Grey: the parabola of the standard error; if "
+            "both differ, trust the profile."
         )
         figures = [profile(one, float(fit[one.name].standard_error)) for one in profiles.values()]
         sections.append(Section("Profile likelihood", about, list(map(str, profiles.values())), figures))
@@ -135,8 +137,8 @@ def fit_page(
         sections.append(_predicted("Data (dots) and prediction (line)", "", fitted, units, "run"))
     if held_out:
         about = (
-            "These runs had no part in the fit. Shared unknowns are held at their estimates; start values "
-            "that are unknown, and numbers of sensors of each run, are fitted to the run itself."
+            "These runs were not fitted. Shared unknowns are fixed at their estimates; unknown start values, "
+            "and each run's numbers of sensors, are fitted to the run itself."
         )
         sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
     sections += [_whiteness(fit, fitted), _way(fit)]
@@ -150,7 +152,7 @@ def _informed(shares: Informed) -> Section:
     )
     shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # of which it is drawn where they inform
     columns = {f"run {run}": shares.of_runs[:, run] for run in shown} | shares.of_channels | {"priors": shares.of_priors}
-    rows = [("unknown", *columns, "half of what the best run tells")]
+    rows = [("unknown", *columns, "half of the best run's share")]
     for i, name in enumerate(shares.labels):
         run, begin, end = shares.half(i)
         rows.append((name, *(f"{100 * share[i]:.1f} %" for share in columns.values()), f"run {run}, {begin:.3g} to {end:.3g} s"))
@@ -179,8 +181,9 @@ def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, st
 
 
 def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
-    about = "Of residuals from which the memory of the noise was taken out, where that was estimated or stated."
-    rows = [("channel", "correlation of neighbours", "white ones hardly exceed", "white", "correlation time", "intervals too narrow by")]
+    about = "For residuals without the correlation of the noise, if that was estimated or given."
+    rows = [("channel", "correlation of neighbours", "limit for white "
+                                                     "ones", "white", "correlation time", "intervals too narrow by")]
     for name, (rho, limit) in fit.autocorrelation.items():
         white = abs(rho) <= limit
         time = f"{float(fit.correlation_time[name]):.3g} s" if name in fit.correlation_time else "-"
@@ -190,14 +193,18 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
         narrow = "-" if white or rho < 0 else f"about {np.sqrt((1 + rho) / (1 - min(rho, 0.999))):.2g}"
         rows.append((name, f"{rho:.3f}", f"{limit:.3f}", "yes" if white else "NO", time, narrow))
     if any(row[3] == "NO" for row in rows):
-        allowed = "" if fit.errors == "sigmas" else " Those given here come from how much the runs differ, and allow for it."
+        allowed = "" if fit.errors == "sigmas" else (
+            " Those given here are based on differences between runs, and allow for it."
+        )
         about = f"Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in the last column.{allowed} {about}"
     return Section("Are the residuals white?", about, table(rows))
 
 
 def _way(fit: Estimates) -> Section:
-    told = fit.agreement if fit.guesses > 1 else "one first guess was tried; `guesses=30` would show how many lead here"
-    rows = [("what is minimised", "steps tried", "F at first", "F at last")]
+    told = fit.agreement if fit.guesses > 1 else (
+        "one first guess was tried; `guesses=30` would show how many lead here"
+    )
+    rows = [("objective", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
     return Section("The way to the minimum", told, table(rows))
 

@@ -1,8 +1,8 @@
 """Results of fits: estimates, the reasons to doubt them, and further calls (profiles, predictions, plans).
 
-A fit as text: what `print` shows of one, and of a batch.
+The text that `print` shows of a fit or of a batch.
 
-Why estimates of a fit, or their intervals, should not be relied on, in words.
+Warnings: reasons not to rely on estimates or intervals.
 """
 
 import os
@@ -22,24 +22,33 @@ from jourdain_jax.scene.printing import table
 
 
 def warnings_of(fit: Estimates) -> Sentences:
-    """Return warnings of a fit of one experiment, the most serious reason first, one sentence each."""
+    """Return warnings of a fit of one experiment, one sentence each, the most serious first."""
     if not np.isfinite(fit.chi_square):
-        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is not a number any more
+        # sigmas: the square overflows
+        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
-        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with "
-            "`simulate`", *fit.events_met)
+        return ("the motion fails at the first guess, so that there is nothing to fit; examine it with "
+                "`simulate`", *fit.events_met)
     return (*_of_the_minimum(fit), *fit.impossible, *fit.events_met, *fit.oddities, *fit.too_narrow, *_of_the_data(fit), *_of_residuals(fit))
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
-    """Warn if the minimum is not a true one, or if bounds or missing degrees of freedom determine it."""
+    """Yield warnings if the minimum is not a true one, or if bounds or missing degrees of freedom determine
+    it.
+    """
     if fit.stuck:
-        yield "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+        yield (
+            "no step improves the fit, but this is no minimum: nearby the motion fails, or is rougher than "
+            "its tolerance; use another first guess"
+        )
     elif fit.shooting is not None and fit.shooting.continuity > 1:
         jump = float(fit.shooting.continuity)
-        yield f"pieces of runs do not join: states jump by up to {jump:.2g} tolerances of the simulation; take shorter pieces, or start nearer"
+        yield (
+            f"pieces of runs do not join: states jump by up to {jump:.2g} tolerances of the simulation; take "
+            "shorter pieces, or a closer first guess"
+        )
     elif not fit.converged:
-        yield "no minimum was found; raise `max_iterations`, or start nearer to it"
+        yield "no minimum was found; raise `max_iterations`, or use a closer first guess"
     if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
         verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
         yield f"{', '.join(names)} {verb}; standard errors are meaningless: widen the bounds"
@@ -51,8 +60,8 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
 
 
 def _of_the_data(fit: Estimates) -> Iterator[str]:
-    """Warn of duplicate channels, of a minimum found from one first guess only, and of priors that the data
-    contradict.
+    """Yield warnings of duplicate channels, of a minimum found from only one first guess, and of priors that
+    the data contradict.
     """
     first: dict[bytes, str] = {}
     for run, of_run in enumerate(fit.residuals):
@@ -60,21 +69,23 @@ def _of_the_data(fit: Estimates) -> Iterator[str]:
             counted = np.round(r[np.isfinite(r)], 6)
             here = f"`{name}` of run {run}"
             there = first.setdefault(counted.tobytes(), here)
-            if here != there and len(np.unique(counted)) > 3:  # different residuals that two channels may share by chance
+            # so many different residuals are equal in two channels only by chance
+            if here != there and len(np.unique(counted)) > 3:
                 yield f"{there} and {here} hold equal numbers: counted as two measurements, they make intervals too narrow; omit one"
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
         yield f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds"
     for name, far in zip(fit.labels, fit.from_prior, strict=True):
-        if abs(far) > 4.0:  # standard deviations: an estimate that lies further from its prior is no chance
+        if abs(far) > 4.0:  # standard deviations: a larger distance from the prior is significant
             yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: check the prior, the data and the scene"
 
 
 def _of_residuals(fit: Estimates) -> Iterator[str]:
-    """Warn of residuals that are larger or smaller than sigmas allow, or not white."""
-    sizes, sure = _sizes_of_residuals(fit), 5.0  # standard deviations: a mean square that is further from 1 is no chance
+    """Yield warnings of residuals that are larger or smaller than sigmas allow, or not white."""
+    # standard deviations: a larger deviation of a mean square from 1 is significant
+    sizes, sure = _sizes_of_residuals(fit), 5.0
     coloured = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
     if large := [size for size in sizes if size.least > _by_chance(size.narrow, sure)]:
-        why = "a local minimum (start nearer), a wrong scene, or sigmas that are too small"
+        why = "a local minimum (use another first guess), a wrong scene, or sigmas that are too small"
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
     def larger(channels: list[str]) -> float:
@@ -108,23 +119,23 @@ class _Size(NamedTuple):
     """The mean square of the residuals of some channels, in sigmas."""
 
     channels: list[str]
-    named: str  # as a sentence continues; empty where these are all channels
-    least: float  # where they determined no unknown that others may have determined
-    narrow: float  # standard deviation of that, of normal residuals
-    most: float  # where they determined all of them
+    named: str  # for the sentence; empty for all channels
+    least: float  # if they determined only their own unknowns
+    narrow: float  # its standard deviation for normal residuals
+    most: float  # if they determined all unknowns
     wide: float
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return the difference of a mean square from 1 in standard deviations, computed from its cube root,
-    which is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
+    """Return the mean square that lies this many standard deviations from 1, computed by its cube root, which
+    is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Return the size of the residuals of all channels with known sigmas, and the size for each of these
-    channels. Under a robust loss they come from medians.
+    """Return the size of the residuals of all channels with known sigmas, and of each of these channels.
+    Under a robust loss they are based on medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
@@ -144,7 +155,9 @@ def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[
     for normal residuals; `robust`: computed from their median.
     """
     degrees = max(squares.size - determined, 1)
-    if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
+    # the median of w^2 is 0.4549 for a normal w; its relative standard deviation for n residuals is 2.33 /
+    # sqrt(n)
+    if robust:
         return float(np.median(squares)) / 0.4549, 2.33 / degrees**0.5
     return float(np.sum(squares)) / degrees, (2 / degrees) ** 0.5  # chi-square has mean n and variance 2 n
 
@@ -154,7 +167,7 @@ def text(fit: Estimates) -> str:
     """Return the text of a fit of one experiment: estimates with intervals, warnings, undetermined
     combinations, residuals by channel.
     """
-    most = 8  # combinations of unknowns that are told poorly, pairs that correlate, pieces of runs
+    most = 8  # printed combinations of unknowns, correlated pairs, pieces of runs
     lines = [
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in "
         f"{int(fit.steps)} steps; {int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square "
@@ -196,7 +209,7 @@ def _row(name: str, e, remark: str) -> Labels:
 
 
 def batch_text(fit: Estimates) -> str:
-    """Return the text of many fits: mean and spread of the estimates that converged."""
+    """Return the text of many fits: mean and spread of the converged estimates."""
     good = np.asarray(fit.converged)
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
     for name, e in fit.estimates.items():
@@ -213,8 +226,8 @@ class Fit(Estimates):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene;
     `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; the following describes
-    one fit.
+    From `fit_batch`, every array has a leading axis `repeats`, also the arrays of `scene`; the following
+    describes one fit.
     """
 
     @property
@@ -224,7 +237,7 @@ class Fit(Estimates):
 
     @property
     def warnings(self) -> Sentences:
-        """Return all reasons to doubt estimates or intervals, the most serious first, one sentence each."""
+        """Return all reasons to doubt estimates or intervals, one sentence each, the most serious first."""
         return warnings_of(self)
 
     def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
@@ -232,9 +245,9 @@ class Fit(Estimates):
         gives the range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted again,
         and whether it is "bounded", "one-sided" or "flat". `data`: the runs of the fit.
 
-        This takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or
-        errors="runs", the rise is scaled accordingly. Raises ValueError for a batch, a failed fit, and other
-        data than the fit's; KeyError for names that were not estimated.
+        This takes some ten fits per name. For estimated sigmas, a robust loss or errors="runs", the rise is
+        scaled accordingly. Raises ValueError for a batch, a failed fit, and other data than the fit's;
+        KeyError for names that were not estimated.
         """
         self._check_one()
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
@@ -243,11 +256,11 @@ class Fit(Estimates):
         return profiles(*fitted, as_names(names) or of_all, errors, of_rise)
 
     def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
-        """Predict `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the unit of the
-        channel) and `r_squared`.
+        """Return predictions of `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the
+        unit of the channel) and `r_squared`.
 
         Shared unknowns keep their estimates; unknown start values, and the numbers of each run's sensors, are
-        fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit its
+        fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit the
         scene or whose motion fails.
         """
         self._check_one()
@@ -265,13 +278,13 @@ class Fit(Estimates):
         """Write this fit as one self-contained HTML file: estimates, warnings, undetermined combinations,
         correlations, residuals, the path to the minimum.
 
-        - `data`: the fitted runs; their samples are drawn beside the prediction, with R^2 = 1 - sum
-          (prediction - value)^2 / sum (value - mean)^2. The report shows which run, channel and time span
-          informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
-        - `held_out`: other runs, which are predicted as by `predict`.
+        - `data`: the fitted runs; their samples are drawn with the prediction, with R^2 = 1 - sum (prediction
+          - value)^2 / sum (value - mean)^2. The report shows the share of each run, channel and time span in
+          the information on each unknown: a_k^2 / sum a^2, a = C J', of the variance of the estimate.
+        - `held_out`: other runs, predicted as by `predict`.
         - `profiles`: True or names, to compute them now; or the result of `profiles`.
-        - `units`: channel -> its unit, for labels, such as `{"x": "m"}`, since a scene states units of
-          parameters only.
+        - `units`: channel -> unit, for labels, such as `{"x": "m"}`, since a scene states units only of
+          parameters.
 
         Raises ValueError for a path that is no .html file, a batch or a failed fit, and other data than the
         fit's.
@@ -284,12 +297,12 @@ class Fit(Estimates):
         if runs and shapes(run.values for run in runs) != shapes(self.residuals):
             raise ValueError(
                 f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected "
-                f"those of the fit: {shapes(self.residuals)}"
+                f"the fit's: {shapes(self.residuals)}"
             )
         if not runs and profiles and not isinstance(profiles, Mapping):
-            raise ValueError("profiles are computed from the runs that were fitted; give these as `data`")
+            raise ValueError("profiles are computed from the fitted runs; give these as `data`")
         along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
-        shares = informed(*taken_up(self, runs), 24) if runs else None  # unknowns of which the report says what informs them
+        shares = informed(*taken_up(self, runs), 24) if runs else None  # at most this many unknowns
         page = fit_page(self, of_fitted(self, runs) if runs else (), shares, self.predict(others) if others else (), along, units or {})
         with open(path, "w", encoding="utf-8") as file:
             file.write(page)

@@ -1,28 +1,31 @@
 """Information of measurements about the unknowns: covariance, and undetermined combinations.
 
-    J_s = d r / d (theta / size),  an arrow of own unknowns x_i of each run and shared ones s      residuals r in units of sigma
-    own        U S V' of a run's own columns; directions V_0 with S <= cutoff (the largest) do not show even where s is known
-    shared     U S V' of the columns of s with those of all x_i projected out; rank: singular values above cutoff (the largest)
-    covariance of s          size V_1 S_1^-2 V_1' size                    over the directions V_1 that show
-               of x_i, x_j   delta_ij (T_i' T_i)^+ + G_i cov(s) G_j',     x_i = - G_i s where the run's own columns are fitted
+    J_s = d r / d (theta / size)    an arrow of own unknowns x_i and shared ones s; r in units of sigma
+    own        U S V' of a run's own columns; directions V_0 with S <= cutoff (the largest) are undetermined
+    shared     U S V' of the columns of s after projecting out those of all x_i
+    rank       number of singular values above cutoff (the largest)
+    covariance of s          size V_1 S_1^-2 V_1' size                    over the determined directions V_1
+               of x_i, x_j   delta_ij (T_i' T_i)^+ + G_i cov(s) G_j',     x_i = - G_i s for fitted own columns
 
-An unknown with a part in the remaining directions V_0 has no standard error and no interval: one that moves by sqrt(cutoff) of its size, or by a tenth of what
-would be its standard error, while all unknowns move along V_0 by about their sizes.
-Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
+An unknown with a part in the remaining directions V_0 has no standard error and no interval. It has a part if
+it changes by sqrt(cutoff) of its size, or by a tenth of its standard error, when all unknowns change along
+V_0 by about their sizes. Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and
+3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 
-Numbers that depend on the estimates of a fit: their estimates, standard errors and intervals, to first order.
+Numbers that depend on the estimates of a fit have estimates, standard errors and intervals to first order:
 
     y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
 
-A number can be determined although its parts are not: it has a standard error where g has no part in the
-directions that do not show.
-Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
+A number can be determined although its parts are not: it has a standard error if g has no part in
+undetermined directions. Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973),
+section 6a.2 (the delta method).
 
-Poorly determined combinations of unknowns ("sloppy" directions), in words.
+Poorly determined combinations of unknowns ("sloppy" directions):
 
-C_rel = C_ij / (size_i size_j),      C_rel v = s^2 v:      the unknowns may change together along d theta_i/size_i = s v_i, s being one standard error
+    C_rel = C_ij / (size_i size_j),      C_rel v = s^2 v:      d theta_i/size_i = s v_i is one standard error
 
-The size of an unknown is its magnitude; near zero, its typical change (`Range`). Source: R. N. Gutenkunst et al., PLoS Computational Biology 3 (2007) e189.
+The size of an unknown is its magnitude; near zero, its typical change (`Range`). Source: R. N. Gutenkunst et
+al., PLoS Computational Biology 3 (2007) e189.
 """
 
 from collections.abc import Callable
@@ -48,25 +51,26 @@ class Information:
     """
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
-    hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # of each member, orthonormal
-    least_part: Float[np.ndarray, "*members unknowns"]  # of theta / size along such a direction: with less, an unknown has no part in it
-    rank: Int[np.ndarray, "*members"]  # directions that show
+    hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # undetermined directions of each member, orthonormal
+    # of theta / size along such a direction, above which an unknown has a part in it
+    least_part: Float[np.ndarray, "*members unknowns"]
+    rank: Int[np.ndarray, "*members"]  # number of determined directions
     identifiable: Bool[np.ndarray, "*members unknowns"]
-    standard_errors: Float[np.ndarray, "*members unknowns"]  # NaN where not identifiable
+    standard_errors: Float[np.ndarray, "*members unknowns"]  # NaN if not identifiable
     shared: Float[np.ndarray, "*members shared shared"]
-    own: Float[np.ndarray, "*members runs own own"]  # covariance where the shared unknowns are known
+    own: Float[np.ndarray, "*members runs own own"]  # covariance for known shared unknowns
     follow: Float[np.ndarray, "*members runs own shared"]  # G
-    estimated: Int[np.ndarray, "unknowns"]  # their places among those of all runs
+    estimated: Int[np.ndarray, "unknowns"]  # their indices among the unknowns of all runs
 
     @property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
-        """The covariance of all unknowns, in their units; NaN where not identifiable."""
+        """Return the covariance of all unknowns, in their units; NaN if not identifiable."""
         both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
         return np.where(both, self.whole_covariance, np.nan)
 
     @property
     def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
-        """The covariance of all unknowns, in their units, along the directions that show."""
+        """Return the covariance of all unknowns, in their units, along the determined directions."""
         runs, m, p = self.follow.shape[-3:]
         G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)], axis=-2)
         whole = G @ self.shared @ np.swapaxes(G, -1, -2)
@@ -80,10 +84,10 @@ class Information:
         return replace(self, **{name: np.asarray(x[0]) for name, x in vars(self).items() if name not in ("hidden", "estimated")})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
-        """Compute the covariance of the shared unknowns from the differences between runs: C (sum g g') C n /
-        (n - 1). C is the previous covariance and g are the scores of the n runs.
+        """Return the information with the covariance of the shared unknowns from the differences between
+        runs: C (sum g g') C n / (n - 1). C is the previous covariance and g are the scores of the n runs.
 
-        The runs' own unknowns change with the shared ones; the variance due to their own noise stays. Source:
+        The runs' own unknowns follow the shared ones; the variance due to their own noise is kept. Source:
         K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
         """
         runs = scores.shape[-2]
@@ -93,14 +97,15 @@ class Information:
 
 
 def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[np.ndarray, "*members places"]:
-    """Return variances of shared unknowns and of the runs' own ones, from the blocks of an `Information`."""
+    """Return variances of shared unknowns and of the runs' own unknowns, from the blocks of an `Information`.
+    """
     of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", follow, shared, follow)
     return np.concatenate([np.diagonal(shared, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)
 
 
 def students_t_95(degrees):
-    """Return the 97.5 % quantile of Student's t with one degree of freedom or more; beyond 1e7 it is that of
-    a normal distribution.
+    """Return the 97.5 % quantile of Student's t with at least one degree of freedom; beyond 1e7, of a normal
+    distribution.
     """
     return stdtrit(np.clip(degrees, 1.0, 1e7), 0.975)
 
@@ -109,8 +114,8 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     """Return the information of an arrow in units of sigma.
 
     `size`: magnitude of each unknown, in its unit; `estimated`: indices of unknowns; `bound`: (members,
-    indices), True where an unknown is held at its bound; `fails`: (members,), True where nothing is known;
-    `cutoff`: singular values below this fraction of the largest count as zero.
+    indices), True for an unknown fixed at its bound; `fails`: (members,), True for a failed motion; `cutoff`:
+    singular values below this fraction of the largest count as zero.
     """
     (runs, m, p), held = arrow.counts, np.ones(size.shape, bool)
     held[:, estimated] = bound[:, estimated]
@@ -120,7 +125,7 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     inverse = np.where(shows, 1 / np.where(shows, S, 1.0), 0.0)[..., None]
     turned = np.swapaxes(U, 2, 3) @ scaled.local[..., m:-1]
     follow, own = V @ (inverse * turned), V @ (inverse**2 * Vt)  # G: x = - G s
-    # what the runs' own unknowns cannot take up
+    # remainder after the runs' own unknowns
     left = np.where(shows[..., None], 0.0, turned).reshape(len(size), runs * m, p)
     left = np.concatenate([left, scaled.shared[..., :-1]], axis=1)
     _, S_s, Vt_s = np.linalg.svd(left, full_matrices=left.shape[1] < p)
@@ -153,15 +158,15 @@ def least_move(cutoff: float, largest):
     """Return the movement, in standard errors, below which an unknown does not count as part of an
     undetermined direction.
 
-    If J has an error of cutoff * (largest singular value), such a direction turns by this many standard
-    errors.
+    An error of cutoff * (largest singular value) in J rotates such a direction by this many standard errors.
     """
-    return np.maximum(0.1, cutoff * largest)  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
+    # standard errors: an unknown that moves this far along an undetermined direction has a part in it
+    return np.maximum(0.1, cutoff * largest)
 
 
 def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Return orthonormal undetermined directions that leave held unknowns unchanged. `own`: V' of each run,
-    which may also contain determined directions.
+    possibly with determined directions.
     """
     (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
     apart = np.zeros((len(runs), count, m))
@@ -169,15 +174,15 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
     of_own = np.pad(apart.reshape(len(runs), count * m), ((0, 0), (p, 0)))
     of_shared = np.concatenate([shared, -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), count * m)], axis=1)
     _, S, Vt = np.linalg.svd(np.where(held, 0.0, np.concatenate([of_own, of_shared])), full_matrices=False)
-    return Vt[S > 1e-6]  # directions of held places alone are none
+    return Vt[S > 1e-6]  # directions of held unknowns alone are excluded
 
 
 def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Sentences:
-    """Describe each undetermined direction in words. `directions`: orthonormal rows, each with changes of
+    """Return a sentence on each undetermined direction. `directions`: orthonormal rows, each with changes of
     theta divided by the sizes of its entries; parts below `least_part` count as zero.
 
     The basis is chosen (row-reduced form) so that each direction has one unknown of its own. Changes are
-    relative, `d theta / theta`, where the unknown is not zero.
+    relative, `d theta / theta`, for nonzero unknowns.
     """
     relative = np.abs(values) > 1e-3 * np.abs(size)
     basis = _reduced(np.asarray(directions), least_part) * size / np.where(relative, values, 1.0)
@@ -187,29 +192,36 @@ def hidden_combinations(directions, least_part, size, values, labels: Labels) ->
 
 
 def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels) -> str:
-    """Describe the direction in words. `power`: the exponent of an unknown that occurs in a product of powers
-    which is constant along all directions, or None.
+    """Return a sentence on the direction. `power`: whether an unknown may occur in a product of powers that
+    is constant along all directions.
     """
-    involved, close = np.flatnonzero(row), 0.01  # how far an exponent may be from a multiple of one half, and two changes from being equal
+    # tolerance of exponents to multiples of one half, and of equal changes
+    involved, close = np.flatnonzero(row), 0.01
     if len(involved) == 1:
-        return f"`{labels[involved[0]]}` does not show in any channel"
+        return f"no channel depends on `{labels[involved[0]]}`"
     names = " and ".join(f"`{labels[i]}`" for i in involved)
     changes = " : ".join(f"d {labels[i]}/{labels[i]}" if relative[i] else f"d {labels[i]}" for i in involved)
-    text = f"{names} do not show separately: no channel changes along {changes} = {' : '.join(f'{row[i]:.3g}' for i in involved)}"
+    text = (
+        f"{names} are not determined separately: no channel changes along {changes} = "
+        f"{' : '.join(f'{row[i]:.3g}' for i in involved)}"
+    )
     own, *others = involved
     exponents = -row[others] / row[own]
     if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < close):
         of_own = ["" if abs(e - 1) < close else f"^{e:.3g}" for e in exponents]
-        return f"{text}; what shows is {', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
+        return (
+            f"{text}; determined is "
+            f"{', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
+        )
     moved = np.where(relative, row * values, row)[involved]
     if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < close * abs(moved[0]):
-        return f"{text}; what shows is their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
+        return f"{text}; determined is their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
     return text
 
 
 def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
-    """Return the reduced row-echelon form with the largest pivots. Parts below `least_part`, in rows of
-    length one, are noise and become zero.
+    """Return the reduced row-echelon form with the largest pivots. Parts below `least_part`, in rows of unit
+    length, are noise and become zero.
     """
     rows, free = rows.copy(), list(range(len(rows)))
     for _ in range(len(rows)):
@@ -222,8 +234,8 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
 
 
 def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], shared: Float[np.ndarray, "*repeats shared"]):
-    """Return y and its derivatives with respect to the shared unknowns, of one fit or of each fit of a batch.
-    Raises ValueError where the function does not return numbers.
+    """Return y and its derivatives with respect to the shared unknowns, for one fit or each fit of a batch.
+    Raises ValueError unless the function returns numbers.
     """
 
     def of(shared):
@@ -275,11 +287,11 @@ def standard_errors(
 def weak_combinations(
     covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: Labels
 ) -> Labels:
-    """Return the directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
+    """Return the directions with a relative standard error of at least 0.1, weakest first, one sentence each.
 
-    They concern the unknowns that runs share, if there are any.
+    They concern the shared unknowns, if there are any.
     """
-    some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # unknowns that are looked at
+    some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # examined unknowns
     shared = [i for i in some if not labels[i].startswith("run ")]
     some = np.array(shared) if shared else some
     scale = np.abs(sizes[some])
@@ -291,7 +303,7 @@ def weak_combinations(
         if spread < 0.1:
             break
         change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
-        # of the largest entry of a direction: what is less is omitted
+        # relative to the largest entry of a direction: smaller ones are omitted
         parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * largest(directions[:, k]))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
         *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]

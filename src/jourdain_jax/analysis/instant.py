@@ -1,10 +1,10 @@
 """A motion at one instant with its derivatives, for linearisation, steady motions and families.
 
-    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: parameters that vary, where some do
+    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: closures;  p: varying parameters
 
-The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are requested;
-others are zero. It follows from t, q and the
-independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
+The scalar program of a class of scenes gives du/dt of its independent speeds and of requested ones; others
+are zero. It depends only on t, q and the independent speeds: a dependent speed enters only phi. Scenes
+without such a program use dense matrices.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -59,7 +59,7 @@ class Places(NamedTuple):
 
 
 def places_of(scene: Scene) -> Places:
-    """Return the places for a scene."""
+    """Return the positions for a scene."""
     n, m, geometric = len(scene.coordinate_names.entries), len(scene.speed_names.entries), len(names_of_position_rows(scene))
     of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
     return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
@@ -70,8 +70,8 @@ def _ranges(*counts: int) -> list[np.ndarray]:
 
 
 class Sloped:
-    """Values of nodes v, their Jacobian D and, if requested, another matrix, as a function of numbers that
-    may be traced. It runs as machine code or on NumPy.
+    """Values of nodes v, their Jacobian D and optionally another matrix, as a function of numbers that may be
+    traced. Runs as machine code or on NumPy.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Sloped:
         return differentiable(*self._parts)
 
     def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
-        """v, D and the other matrix; NaN where a guard is not positive."""
+        """Return v, D and the other matrix; NaN if a guard is not positive."""
         xp = array_module(numbers)
         found = (self._traced if xp is jnp else self._known)(numbers)
         *values, guards = (found[which] for which in self._which)
@@ -114,7 +114,7 @@ class ByProgram:
     def __init__(self, scene: Scene, program: Lowered, asked: Indices, varied: Indices = ()) -> None:
         rows = row_program(scene)
         if rows is None:
-            raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program")
+            raise NotLowered(f"the constraints of `{type(scene).__name__}` have no scalar program")
         graph, of, n, m = Graph(), program.traced, len(program.coordinates), len(program.speeds)
         first = sum(np.size(leaf) for leaf in jax.tree.leaves(scene))
         given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
@@ -137,12 +137,12 @@ class ByProgram:
         self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
 
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
-        """v, D and the mass matrix of a scene at an instant."""
+        """Return v, D and the mass matrix of a scene at an instant."""
         return self.of(numbers_of(scene, t, q, u, f))
 
 
 def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
-    """Return all numbers in a row: parameters, t, q, u, inputs."""
+    """Return all numbers as one vector: parameters, t, q, u, inputs."""
     xp = array_module((scene, t, q, u, f))
     parts = [*jax.tree.leaves(scene), t, q, u, f]
     return xp.concatenate([xp.ravel(xp.asarray(x, real_type())) for x in parts])
@@ -150,14 +150,14 @@ def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
 
 @dataclass(frozen=True)
 class ByMatrices:
-    """v, D and the mass matrix from a scene's own matrices, differentiated by JAX. Accelerations are those of
-    the speeds that must be constant.
+    """v, D and the mass matrix from a scene's dense matrices, differentiated by JAX, with accelerations of
+    the speeds `constant`.
     """
 
     constant: Indices
 
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
-        """v, D and the mass matrix of a scene at an instant."""
+        """Return v, D and the mass matrix of a scene at an instant."""
         return _by_matrices(scene, self.constant, t, q, u, f)
 
 
@@ -192,8 +192,7 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Return names of the coordinates without influence on accelerations; for a quaternion, names of its
-    parts.
+    """Return names of the coordinates that do not affect accelerations; for a quaternion, names of its parts.
     """
     return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
 
@@ -204,12 +203,12 @@ def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
     return {entry for name in names for entry in groups.get(name, (name,))}
 
 
-by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` if there is none
+by_program = once_per_class(ByProgram)  # of a class of scenes; raises `NotLowered` if there is none
 
 
 def on_rows(scene: Scene) -> np.ndarray:
-    """Return the coordinates on which geometric rows and unit norms depend at some probed state. Coordinates
-    that cancel there are omitted, even if they occur in the graph.
+    """Return the coordinates on which geometric constraints and unit norms depend at some probed state.
+    Coordinates that cancel there are omitted, even if they occur in the graph.
     """
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
@@ -225,8 +224,8 @@ def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: S
 
 
 def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy,
-    operation by operation.
+    """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy, one
+    operation at a time.
     """
     if jax.config.jax_enable_x64 and is_made(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
@@ -244,5 +243,5 @@ def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int])
 
 
 def is_made(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Return whether machine code of the nodes is made."""
+    """Return whether the nodes can be compiled to machine code."""
     return not ffi.reason_against() and not unsupported(graph, nodes)

@@ -1,22 +1,26 @@
-"""Which rows are holonomic: one by one by Frobenius' criterion, all together by the growth of the admissible velocities.
+"""Holonomic constraints: single rows by Frobenius' criterion, all together by the growth of the admissible
+velocities.
 
-A row `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 = d - alpha . nu`. By itself
-it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the velocities that w admits (Frobenius).
+A row `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 = d -
+alpha . nu`. By itself it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on
+the velocities that w admits (Frobenius).
 
-Rows together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1, D_k]` grow to
-a last dimension; the motion stays on a manifold of that dimension. Time counts as one more coordinate with the field `(1, X_0)`
-where the rows or rates depend on time or are not homogeneous; its dimension is omitted from the growth
-vector.
+All rows: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1,
+D_k]` grow to a final dimension; the motion stays on a manifold of that dimension. If constraints or rates
+depend on time or are not homogeneous, time counts as an additional coordinate with the field `(1, X_0)`; its
+dimension is omitted from the growth vector.
 
-`[X, Y] = DY X - DX Y` along the fields. A bracket of brackets needs the derivative of such a derivative: taken by eighth-order central differences
-(to about 1e-11), because every further derivative doubles what is evaluated.
-Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems VII (1994).
+`[X, Y] = DY X - DX Y` along the fields. Brackets of brackets need derivatives of derivatives: taken by
+eighth-order central differences (to about 1e-11), because every further derivative doubles the cost. Source:
+Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems
+VII (1994).
 
-Rows and coordinate rates as linear functions of the speeds, and how they change with time and coordinates; at many points, on NumPy.
+Constraints and coordinate rates are linear functions of the speeds,
 
     A u + d = 0,   qdot = N u + nu,          and their derivatives in x = (t, q)
 
-From the scene's scalar graph, on which derivatives are sparse: nothing is compiled for it.
+evaluated at many points on NumPy, from the scene's scalar graph with its sparse derivatives, without
+compilation.
 """
 
 from collections.abc import Callable
@@ -36,7 +40,7 @@ Both = tuple[np.ndarray, np.ndarray]
 
 
 class RowsOverStates:
-    """The rows and rates of a scene as functions of points x = (t, q)."""
+    """The constraints and rates of a scene as functions of points x = (t, q)."""
 
     def __init__(self, scene: Scene):
         self.scene, self.traced = scene, traced_scene(scene)
@@ -52,7 +56,7 @@ class RowsOverStates:
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
         """Return values at the points for the speeds u, and their derivative as a function of directions. The
-        speeds matter only where rows are nonlinear in them.
+        speeds matter only for nonlinear constraints.
 
         `x`, `u` and the directions have a leading axis of points.
         """
@@ -69,8 +73,8 @@ class RowsOverStates:
         return self._arranged(value, u, 1.0), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
-        """Return the rows and the frame as arrays whose last axis is that of the points; `time`: the rate of
-        the time coordinate.
+        """Return the rows and the frame as arrays whose last axis counts the points; `time`: the rate of the
+        time coordinate.
         """
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
@@ -96,8 +100,8 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
     domain.
 
     The criterion is the largest value of the two-form dw on unit velocities that w admits, over all states,
-    divided by the size of w and of its derivatives. It is infinite for rows that are nonlinear in the speeds,
-    since these are no differential forms.
+    divided by the size of w and of its derivatives. It is infinite for rows nonlinear in the speeds, which
+    are no differential forms.
     """
     names = structure_of(scene).row_names
     if not names:
@@ -117,7 +121,7 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
     """Return the largest value of dw on unit velocities that w admits, w F = a, divided by the size of w. The
     last axis of `da` and `dF` are directions in (t, q).
 
-    dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x)      of fields X = F x, Y = F y, x and y being constant
+    dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x) of fields X = F x, Y = F y with constant x and y
     """
     U, S, Vt = np.linalg.svd(F, full_matrices=False)
     kept = 1e-12 * S[0] < S
@@ -135,10 +139,10 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
     """Return the growth vector of the admissible velocities at generic states, from brackets of at most
     `depth` fields, and whether it is closed (longer brackets add nothing, or all dimensions are reached). It
-    is empty for rows nonlinear in the speeds.
+    is empty for constraints nonlinear in the speeds.
 
     The larger of the results at two random states counts. A bracket is a new direction if its new part
-    exceeds 1e-6 (1e-2 in single precision) of the terms of which it consists.
+    exceeds 1e-6 (1e-2 in single precision) of its terms.
     """
     structure = structure_of(scene)
     if not structure.affine:
@@ -149,12 +153,12 @@ def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def reachable(scene: Scene) -> int:
-    """Return the number of coordinates less the unit norms, which hold by themselves."""
+    """Return the number of coordinates minus the number of unit norms, which always hold."""
     return len(scene.coordinate_names) - len(scene.coordinates.quaternions)
 
 
 def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
-    """Dimensions at one state, and whether they stopped growing."""
+    """Return the dimensions at one state, and whether they stopped growing."""
     tolerance = 1e-6 if real_type() == jnp.float64 else 1e-2
     x = np.concatenate([t[None], q]) if fields.with_time else q
     generators = np.eye(structure_of(fields.scene).degrees_of_freedom + fields.with_time)
@@ -180,8 +184,8 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
-    """Extend an orthonormal basis by the vectors among the values that are independent of it, largest first.
-    Return the basis and the indices of these vectors.
+    """Return an orthonormal basis extended by the independent vectors among the values, largest first, and
+    the indices of these vectors.
     """
     chosen: list[int] = []
     while len(chosen) < len(values):
@@ -197,9 +201,10 @@ def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple
 
 
 def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return brackets `[X, [Y, ...]]` at points x, and the sizes of the terms of which they consist.
+    """Return brackets `[X, [Y, ...]]` at points x, and the sizes of their terms.
 
-    `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of X, Y, ...
+    `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of
+    X, Y, ...
     """
     together = 256  # points
     pieces = [(x[i : i + together], parts[i : i + together]) for i in range(0, len(x), together)]
@@ -208,7 +213,9 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 
 
 def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `_brackets`, from the generators at these points and their derivatives `along` directions."""
+    """Return the result of `_brackets`, from the generators at these points and their derivatives `along`
+    directions.
+    """
     first = np.einsum("bng,bg->bn", here, parts[:, 0])
     if parts.shape[1] == 1:
         return first, largest(first, 1)
@@ -223,7 +230,7 @@ def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Call
 
 
 def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Return derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
+    """Return the derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     step = STEP[x.dtype.name]
     steps = step * np.array([1, 2, 3, 4, -1, -2, -3, -4], x.dtype)
@@ -241,12 +248,13 @@ class _Fields:
 
     def __init__(self, scene: Scene, with_time: bool, u):
         self.scene, self.with_time, self.u, self.rows = scene, with_time, np.asarray(u, float), RowsOverStates(scene)
-        # places in (1, u)
+        # indices in (1, u)
         self.free = [0, *(1 + i for i in structure_of(scene).independent)]
         self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return values at many points, and derivatives as a function of one direction for each."""
+        """Return values at many points, and a function of one direction per point that returns derivatives.
+        """
         first = 1 - self.with_time
         padded = lambda a: np.pad(a, ((0, 0), (first, 0)))  # noqa: E731
         (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
@@ -265,6 +273,6 @@ class _Fields:
         return (F @ C)[:, first:, first:], along
 
     def _solved(self, a: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """`-a_z^-1 right`, a_z: of the dependent speeds."""
+        """Return `-a_z^-1 right`, with a_z for the dependent speeds."""
         a_z = a[:, :, self.dependent]
         return -np.linalg.solve(a_z, right) if a_z.shape[1] == a_z.shape[2] else -np.linalg.pinv(a_z, rcond=1e-12) @ right

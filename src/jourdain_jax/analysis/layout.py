@@ -1,21 +1,24 @@
 """The layout of a vector of unknowns, and the scene, starts and sensors for such a vector.
 
-Shared unknowns are parameters of the scene, second moments and shears of bodies (`body_inertia`), and numbers of sensors. Parameters may follow from them
-(`ties`).
+Shared unknowns are parameters of the scene, second moments and shears of bodies (`body_inertia`), and numbers
+of sensors. Other parameters may depend on them (`ties`).
 
-The inertia of one body by second moments that are not negative, in a scene that has a parameter for each of its moments of inertia.
+The inertia of one body, in a scene with a parameter for each moment of inertia, is expressed by second
+moments that are not negative:
 
     I_ij = c_k p_k                                    every entry of the body's inertia matrix is a parameter p_k, times a constant c_k, or zero
     I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0     S: second moments of the mass about its centre;    L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-A body has such an inertia, and every body's inertia is one. I is linear in D, so that a flat body, which has a D of zero, is at a bound like any other. Moments
-of inertia about two axes that have one parameter are equal, and so are two of D. Which parameters these are is found by differentiating the inertia matrix.
+Exactly the possible inertias have this form. I is linear in D, so that a flat body, with a zero D, is at an
+ordinary bound. Moments of inertia about two axes with one parameter are equal, and so are the two D. These
+parameters are found by differentiating the inertia matrix.
 
-Parameters that follow from others in a fit: two equal wheels, an inertia that a shape and a mass give.
+Ties, parameters that depend on others in a fit (two equal wheels, an inertia given by a shape and a mass):
 
-    p = f(scene)      f: plain JAX, of the scene with the unknowns in their places and the parameters tied before this one
+    p = f(scene)      f: plain JAX, of the scene with the unknowns and the parameters tied before
 
-A function is traced when it is handed over, and ties are compared by what they compute: a new lambda in every call is the same tie.
+A function is traced when it is passed, and ties are compared by their computation: a new lambda in every call
+is the same tie.
 """
 
 import math
@@ -43,24 +46,23 @@ _OTHERWISE = "give its parameters ranges or ties of their own, or make its inert
 
 @dataclass(frozen=True)
 class PossibleInertia:
-    """The value of `possible_inertia`."""
+    """Marker returned by `possible_inertia`."""
 
 
 def possible_inertia() -> PossibleInertia:
-    """Free the inertia of a body, restricted to possible values: `free={"rear frame":
+    """Return a marker that frees the inertia of a body, restricted to possible values: `free={"rear frame":
     jj.possible_inertia()}`, with the name of the body.
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-    In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments
+    Instead of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments
     D (kg m^2) and shears l as unknowns, `"rear frame second moment[0]"` and `"rear frame shear[0]"`.
     Principal moments of inertia are then positive, and each is at most the sum of the other two. `Fit.tied`
-    has moments and products with standard errors and intervals to first order, except where D is at its
-    bound, that is, where the body is flat. Two axes that share one parameter, as those of a wheel do, share
-    one D.
+    has moments and products with standard errors and intervals to first order, except for a flat body, with D
+    at its bound. Two axes that share one parameter, as for a wheel, share one D.
 
     The scene must have a parameter for each of the three moments, and for none, one or all of the products.
-    Otherwise, and where the first guess is no inertia of a body with a thickness, `fit` raises ValueError.
+    Otherwise, or if no body of nonzero thickness has the inertia of the first guess, `fit` raises ValueError.
     Source: P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3 (2018) 60, for
     possible inertias.
     """
@@ -69,10 +71,10 @@ def possible_inertia() -> PossibleInertia:
 
 @dataclass(frozen=True)
 class Entry:
-    """A parameter that is an entry of an inertia matrix, but for a constant."""
+    """A parameter that equals an entry of an inertia matrix up to a constant factor."""
 
     name: str
-    index: Indices  # in the parameter, where that is an array
+    index: Indices  # in the parameter, if it is an array
     row: int
     column: int
     factor: float  # entry = factor * parameter
@@ -80,27 +82,28 @@ class Entry:
 
 @dataclass(frozen=True)
 class BodyInertia:
-    """Which parameters of a scene are the inertia of a body; hashable."""
+    """The parameters of a scene that are the inertia of a body; hashable."""
 
     body: str
-    entries: tuple[Entry, ...]  # the first of each parameter
-    axes: Indices  # which of D belongs to an axis
-    products: Indices  # which of l12, l23, l13 there are
+    entries: tuple[Entry, ...]  # the first entry of each parameter
+    axes: Indices  # index of D for each axis
+    products: Indices  # indices of the existing l12, l23, l13
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Names of the entries of D and of l."""
+        """Return names of the entries of D and of l."""
         return f"{self.body} second moment", f"{self.body} shear"
 
     def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:
-        """Return D and l for a scene's parameters; NaN where no body with a thickness has such moments."""
+        """Return D and l for a scene's parameters; NaN if no body of nonzero thickness has such moments."""
         value = {(entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index] for entry in self.entries}
         of_axis = {self.axes[entry.row]: value[entry.row, entry.row] for entry in self.entries if entry.row == entry.column}
         I = jnp.diag(jnp.stack([of_axis[k] for k in self.axes]))
         for i, j in (_PRODUCTS[k] for k in self.products):
             I = I.at[i, j].set(value[i, j]).at[j, i].set(value[i, j])
         S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
-        # L diag(D)^1/2, from the last row up, since it is upper triangular: the factor of S with its rows and columns the other way round
+        # L diag(D)^1/2 is upper triangular: the lower factor of S with reversed rows and columns, reversed
+        # back
         A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
         D = jnp.diag(A) ** 2
         l = [A[i, j] / A[j, j] for i, j in (_PRODUCTS[k] for k in self.products)]
@@ -151,9 +154,9 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
     if not all_finite(found.numbers(scene)[0]):
         moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
         raise ValueError(
-            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which, "
-            "with its products, no body with a thickness has: principal ones must be positive, each less "
-            "than the sum of the other two; of a flat body, give the largest a little less than that sum"
+            f"no body of nonzero thickness has the moments of inertia of body `{name}` of "
+            f"`{type(scene).__name__}`, {moments} kg m^2 with its products: principal ones must be positive, "
+            "each less than the sum of the other two; for a flat body, reduce the largest slightly"
         )
     return found
 
@@ -222,8 +225,8 @@ class Tie:
 
 
 def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
-    """Return a parameter as a function of the scene, which has the first guesses. Raises ValueError where the
-    function returns no allowed value.
+    """Return a parameter as a function of the scene, which has the first guesses. Raises ValueError unless
+    the function returns an allowed value.
     """
     leaves, treedef = jax.tree.flatten(scene)
     expected = jnp.shape(getattr(scene, name))
@@ -249,7 +252,8 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
     return found
 
 
-Kind = Literal["scene", "inertia", "start", "sensor"]  # a parameter, of a body's inertia, an initial value, of a sensor or an actuator
+# parameter; inertia of a body; initial value; number of a sensor or an actuator
+Kind = Literal["scene", "inertia", "start", "sensor"]
 
 
 @dataclass(frozen=True)
@@ -258,14 +262,14 @@ class Place:
     vector of unknowns.
     """
 
-    name: str  # of a sensor's or actuator's: "gyro.gain"
+    name: str  # for a sensor or actuator: "gyro.gain"
     shape: Shape
     begin: int
     kind: Kind
 
     @property
     def end(self) -> int:
-        """One past the last."""
+        """Return the end of the range."""
         return self.begin + math.prod(self.shape)
 
     def of(self, vector):
@@ -277,10 +281,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and shapes of the shared unknowns and of those of each run, and the dependent parameters;
+    """Names and shapes of the shared unknowns and of the unknowns of each run, and the dependent parameters;
     hashable.
 
-    A single run has no unknowns of its own, unless it is cut into pieces: all its unknowns are shared.
+    A single run has only shared unknowns, unless it is cut into pieces.
     """
 
     shared: tuple[Place, ...]
@@ -290,23 +294,24 @@ class Layout:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Numbers of shared unknowns, and of those of each run."""
+        """Return the numbers of shared unknowns, and of unknowns of each run."""
         return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
 
     @property
     def parameters(self) -> set[str]:
-        """Names of the parameters that differ from those of the scene."""
+        """Return names of the parameters that differ from the scene's."""
         return {place.name for place in self.shared if place.kind == "scene"} | set(self.following)
 
     @property
     def following(self) -> Labels:
-        """Names of the dependent parameters: moments of inertia of bodies, and tied ones."""
+        """Return names of the dependent parameters: moments of inertia of bodies, and tied ones."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
 
     def scene(self, scene: Scene, shared: Float[Entries, "*members shared"]) -> Scene:
         """Return the scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
-        found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))  # which leaf each parameter is
+        # with the index of each parameter's leaf
+        found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))
         for place in self.shared:
             if place.kind == "scene":
                 found[getattr(names, place.name)] = place.of(shared)
@@ -317,7 +322,7 @@ class Layout:
                 own = jnp.broadcast_to(found[leaf], value.shape + jnp.shape(leaves[leaf]))
                 found[leaf] = own.at[(..., *entry.index)].set(value)
         for tie in self.ties:
-            # a member's parameters have its axes in front, those that all share have none
+            # parameters of members have leading axes, shared ones have none
             function, axes = tie.value, [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
             for _ in shared.shape[:-1]:
                 function = jax.vmap(function, in_axes=(axes,))
@@ -330,7 +335,7 @@ class Layout:
 
     @property
     def numbers(self) -> bool:
-        """Whether sensors or actuators have any."""
+        """Return whether sensors or actuators have unknown numbers."""
         return any(place.kind == "sensor" for place in (*self.shared, *self.local))
 
     def known(self, *vectors) -> dict[str, Array | np.ndarray]:
@@ -338,7 +343,7 @@ class Layout:
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:
-        """Return names of the unknowns of a kind, with their indices in the vectors of shared unknowns and of
+        """Return names of the unknowns of a kind, with their values in the vectors of shared unknowns and of
         a run.
         """
         return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)

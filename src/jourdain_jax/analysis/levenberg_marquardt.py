@@ -1,18 +1,21 @@
 """Levenberg-Marquardt within bounds, for expensive residuals: one simulation with all its derivatives per
 trial step.
 
-minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
-step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
-patience   where F is large, and has not become far smaller within so many steps, no more are tried: the member has neither converged nor is it stuck
-converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size
+    minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
+    step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J
+               steps end at bounds, and the other unknowns are solved again
+    patience   if F is large, and has not decreased much within so many steps, the member ends
+    converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown
+               by more than that fraction of its size
 
-Bounds end steps, since a bijection onto their inside never reaches them: of ten fits whose damping is zero, seven by its logarithm had not converged in 256
-steps, and all ten do in 4 here. The method of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be differentiated with
-respect to the starts of all others. It has no bounds. It evaluates residuals and derivatives one after the other.
+Steps end at bounds, since a transformation onto the interior never reaches them: of ten fits with zero
+damping, seven with its logarithm had not converged in 256 steps, and all ten converge in 4 here. The method
+of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be differentiated
+with respect to the starts of all others. It has no bounds. It evaluates residuals and derivatives separately.
 
-Several problems of one shape (`members`) go side by side; ended ones cost nothing.
-Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum slopes in place of
-values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
+Several problems of one shape (`members`) run as a batch; finished ones cost nothing. Source: D. W. Marquardt,
+SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum
+slopes instead of values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 """
 
 from collections.abc import Callable
@@ -29,14 +32,16 @@ LEAST = 1e-9  # damping lambda
 
 @dataclass
 class Linearised(ByMember):
-    """Value and slopes at some theta, of each member."""
+    """Value and derivatives at some theta, for each member."""
 
-    cost: PerMember  # F; not finite where the motion fails
+    cost: PerMember  # F; not finite if the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
-    residuals: np.ndarray  # (members, runs) of those of all samples, not whitened; None where another run had failed
-    sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
-    triangles: Float[np.ndarray, "members runs kinds width width"]  # of [J r]: of channels whose sigma is known, then of each other
-    squares: Float[np.ndarray, "members kinds"]  # sums of squared residuals of these
+    # (members, runs) of residuals of all samples, not whitened; None if another run had failed
+    residuals: np.ndarray
+    sigma: Float[np.ndarray, "members channels"]  # of channels with estimated noise
+    # of [J r]: first for channels with known sigma, then for each other channel
+    triangles: Float[np.ndarray, "members runs kinds width width"]
+    squares: Float[np.ndarray, "members kinds"]  # sums of their squared residuals
 
 
 @dataclass(frozen=True)
@@ -46,22 +51,22 @@ class Control:
     tolerance: float
     most_steps: int
     cutoff: float
-    patience: int = 2**31  # steps within which F is to fall to a quarter of what it was
-    near: float = 0.0  # F below which it may fall as slowly as it does
+    patience: int = 2**31  # steps within which F must fall to a quarter
+    near: float = 0.0  # F below which it may fall more slowly
 
 
 @dataclass
 class Minimum(ByMember):
-    """The end, or the present state, of the minimisation of each member."""
+    """The final or present state of the minimisation of each member."""
 
     theta: ByUnknown
     at: Linearised
     going: Flags
     converged: Flags
-    stuck: Flags  # no step lowers F, however short, and this is no minimum
+    stuck: Flags  # no step lowers F, but this is no minimum
     steps: Members  # tried
-    grown: Flags  # whether it was found over growing spans
-    trace: np.ndarray  # (members,) of tuples of (what was minimised, F at first and after each step tried)
+    grown: Flags  # whether growing spans found it
+    trace: np.ndarray  # (members,) of tuples of (objective, F initially and after each tried step)
 
     @staticmethod
     def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
@@ -73,18 +78,18 @@ class Minimum(ByMember):
         return Minimum(theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), none.copy(), trace)
 
     def here(self) -> tuple[Members, Arrow, ByUnknown]:
-        """Return the members that go, with their linearised problems and unknowns."""
+        """Return the running members, with their linearised problems and unknowns."""
         here = np.flatnonzero(self.going)
         return here, self.at.arrow if here.size == self.going.size else self.at.arrow.of(here), self.theta[here]
 
     def arrived(self, here: Members, done: Flags) -> np.ndarray:
-        """End the converged members, and return those that try a step."""
+        """Stop the converged members, and return those that try a step."""
         self.converged[here[done]], self.going[here[done]] = True, False
         self.steps[here[~done]] += 1
         return here[~done]
 
     def go(self, here: Members, end: ByUnknown, trial: Linearised, better: Flags) -> None:
-        """Accept the step where it is better."""
+        """Accept the steps that are `better`."""
         self.theta[here[better]] = end[better]
         self.at = self.at.replaced(here, trial, better)
         for b in here.tolist():
@@ -92,7 +97,7 @@ class Minimum(ByMember):
             self.trace[b] = ((what, (*costs, float(self.at.cost[b]))),)
 
     def give_up(self, members) -> None:
-        """End members for which no step is found."""
+        """Stop members for which no step was found."""
         self.stuck[members], self.going[members] = True, False
 
     def lowest(self) -> "Minimum":
@@ -104,27 +109,28 @@ class Minimum(ByMember):
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":
-        """Return all members, with the `other` minima where these are lower; and the steps."""
+        """Return all members, with the `other` minima if these are lower, and their step counts."""
         found = self.replaced(members, other, other.at.cost < self.at.cost[members])
         found.steps[members] = other.steps
         return found
 
     def continued(self, members: Members, new: "Minimum") -> "Minimum":
-        """Return all members, with repeated results for these; steps add up."""
+        """Return all members, with the results of a continued minimisation for these; steps add up."""
         return self.replaced(members, new.after(self, members), np.ones(len(members), bool))
 
     def after(self, before: "Minimum", members: Members) -> "Minimum":
-        """Return these members, with steps and trace of the earlier attempt."""
+        """Return these members, with steps and trace of the earlier attempt added."""
         return replace(self, steps=before.steps[members] + self.steps, trace=before.trace[members] + self.trace, grown=before.grown[members])
 
 
 def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: returns value and derivatives for the members at
-    these numbers; `what`: the name of the objective in the trace.
+    """Return the minimum from `theta`. `evaluate(theta, members)` returns value and derivatives for the
+    members at these numbers; `what`: the name of the objective in the trace.
     """
     way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta))), what)
     full = np.ones(len(theta))
-    damping, growth, fall = 1e-3 * full, 4.0 * full, 10.0 * full  # factors by which it grows after a step that failed, and falls after a good one
+    # factors of growth after a failed step, and of decrease after a good one
+    damping, growth, fall = 1e-3 * full, 4.0 * full, 10.0 * full
     for _ in range(control.most_steps):
         here, arrow, x = way.here()
         if not here.size:
@@ -144,11 +150,12 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         trial, promised = evaluate(x + d, here), slope - 0.5 * change
         gained = fallen(way.at.cost[here], trial, d, slope, promised, control)
         better = np.isfinite(gained) & (gained > 1e-4 * promised)
-        # damping rises where steps overshoot: where residuals stay large, undamped ones go back and forth
-        # along what shows least
+        # damping rises after overshooting: with large residuals, undamped steps oscillate along poorly
+        # determined directions
         by = np.where(gained > 0.9 * promised, 1 / fall[here], np.where(gained < 0.6 * promised, 3.0, 1.0))
         damping[here] = np.maximum(damping[here] * np.where(better, by, growth[here]), LEAST)
-        # after a step that failed it falls slowly: in a curved valley every other step would fail; it grows twice as much after each further one
+        # decrease slowly after a failed step: in a curved valley every other step would fail; growth doubles
+        # with each failure
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], 10.0), 2.0)
         growth[here] = np.where(better, 4.0, 2 * growth[here])
         way.go(here, x + d, trial, better)
@@ -162,9 +169,9 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
 def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> PerMember:
     """Return the decrease of F along a step d.
 
-    Near the minimum, errors of the simulation hide small changes of F: F jumps where a motion takes one step
-    more. There the decrease is computed from the slopes of F at both ends of the step, of which the first is
-    given.
+    Near the minimum, errors of the simulation hide small changes of F: F jumps when a motion takes another
+    step. There the decrease is computed from the derivatives of F at both ends of the step; the first is
+    `slope`.
     """
     found = before - trial.cost
     by_slopes = 0.5 * (slope - np.einsum("bi,bi->b", trial.arrow.gradient, d))
@@ -187,7 +194,8 @@ def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
 
 def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: float) -> np.ndarray:
     """Return the damped step within the bounds."""
-    # an unknown whose bound is above zero shrinks to a tenth at most in one step: with far smaller masses and lengths, motions take long
+    # an unknown with a bound above zero shrinks at most to a tenth per step, since motions with tiny masses
+    # and lengths take long
     g, low = arrow.gradient, np.where(unknowns.low > 0, np.maximum(unknowns.low, 0.1 * theta), unknowns.low)
     held = unknowns.fixed | ((theta <= unknowns.low) & (g >= 0)) | ((theta >= unknowns.high) & (g <= 0))
     moved = np.zeros(theta.shape)
@@ -203,6 +211,6 @@ def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: flo
 
 
 def is_small(change, size, d, control: Control) -> Flags:
-    """Return which steps end a minimisation."""
+    """Return which steps are small enough to stop."""
     small = change <= control.tolerance**2
     return small & (np.abs(d) <= control.tolerance * size).all(axis=1) if small.any() else small

@@ -1,18 +1,17 @@
 """Predictions of a scene for measurements, and their likelihood.
 
-r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
+    r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))      (white noise)
 
-Oddities of measurements that are not errors: inputs that are not sampled where a run needs them, and angles
-that jump by a turn.
+Oddities of measurements that are no errors: inputs without samples over the whole run, and angles that jump
+by a turn.
 
-The information of a planned run: the Fisher information of a planned experiment, differentiable with respect
-to its start and inputs.
+The Fisher information of a planned experiment, differentiable with respect to its start and inputs:
 
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior,     cov(theta) >= F^-1 (Cramer and Rao)
 
-Unknown start values are among theta; log det F of those unknowns that are requested is that of their block of
-F^-1, all others being estimated with them.
-Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
+theta includes unknown start values; log det F of some unknowns is computed from their block of F^-1, with all
+others estimated as well. Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs,
+with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -63,11 +62,11 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentenc
 
 
 def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: float) -> Iterator[str]:
-    """Yield sentences for inputs whose samples do not cover a run, and for gaps in a log.
+    """Yield sentences on inputs whose samples do not cover a run, and on gaps in a log.
 
-    The last interval may be a jump, as for commands that are held; then the interval before it counts.
+    The last interval may be a jump, as for held commands; then the previous interval counts.
     """
-    intervals, beyond = np.diff(ts), 1.5  # intervals, that an end may be away from that of a run
+    intervals, beyond = np.diff(ts), 1.5  # allowed distance of the ends from the run's, in intervals
     spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
     spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > beyond * max(intervals[-2:]) else []
     if spans:
@@ -76,8 +75,9 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
             "repeat that value in its samples, otherwise give more samples, or shorter measurements"
         )
     usual = float(np.median(intervals))
-    (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # intervals that are missing
-    if gaps.size and np.mean(np.abs(intervals / usual - 1) < 0.1) > 0.9:  # share of the others that are nearly equal: those of a log
+    (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # missing intervals
+    # share of nearly equal intervals, as in a log
+    if gaps.size and np.mean(np.abs(intervals / usual - 1) < 0.1) > 0.9:
         k = int(gaps[0])
         more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
         yield (
@@ -87,8 +87,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
 
 
 def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
-    """Yield a sentence for angles that appear wrapped: values in [-pi, pi] or [0, 2 pi], some of whose
-    neighbours differ by nearly one turn.
+    """Yield a sentence on angles that appear wrapped: values in [-pi, pi] or [0, 2 pi] with jumps of nearly
+    one turn between neighbours.
     """
     known, turn = np.isfinite(values), 2 * np.pi
     x, t = values[known], ts[known]
@@ -104,8 +104,8 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
 
 
 _REFUSED = dict.fromkeys(
-    ("start", "t0", "t1", "ts", "inputs", "events", "work"), "each `Experiment` states start, times and "
-        "inputs, and its motion ends with its last sample"
+    ("start", "t0", "t1", "ts", "inputs", "events", "work"),
+        "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
 )
 _REFUSED["retry"] = "its motions are compiled, in one way"
 
@@ -117,8 +117,8 @@ def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Ma
 
 
 def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experiment, ...]:
-    """Return one run or several as a list, checked against the scene. Raises ValueError as `checked` does,
-    and if there is no run.
+    """Return one run or several as a tuple, checked against the scene. Raises ValueError as in `checked`, and
+    if there is no run.
 
     Oddities of a run (`oddities`) cause warnings.
     """
@@ -135,8 +135,8 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
-    """Return the channels whose value is None, which means that it is estimated. Raises ValueError for a
-    channel whose value is None in one run and given in another.
+    """Return the channels whose value is None, and is therefore estimated. Raises ValueError for a channel
+    whose value is None in one run and given in another.
     """
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
@@ -147,7 +147,7 @@ def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Exp
 
 
 def check_known(runs: Sequence[Experiment], what: str) -> None:
-    """Raise ValueError where a sigma, or a number of a sensor or an actuator, is unknown."""
+    """Raise ValueError if a sigma, or a number of a sensor or an actuator, is unknown."""
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but {what} needs the standard deviation of "
@@ -162,8 +162,8 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
     r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas, numbers of sensors and actuators (reverse
-    mode, unless `adjoint` requests another) and known correlation times of the noise. It is -inf where the
-    motion fails. `options`, `by_name`: as of `simulate`. Missing samples (NaN, or an infinite sigma) do not
+    mode, unless `adjoint` requests another) and known correlation times of the noise. It is -inf if the
+    motion fails. `options`, `by_name`: as in `simulate`. Missing samples (NaN, or an infinite sigma) do not
     count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
@@ -174,14 +174,16 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
     scene = as_scene(scene)
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
-        raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to "
-            "know it; give a number in s, or 0 for white noise")
+        raise ValueError(
+            f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs it; give a "
+            "number in s, or 0 for white noise"
+        )
     check_known(runs, "a likelihood")
     return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]))
 
 
 def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
-    """Return the logarithm of the density of the measurements of one run; -inf where its motion fails."""
+    """Return the logarithm of the density of the measurements of one run; -inf if its motion fails."""
     found = jnp.zeros(())
     for name, r in run.residuals(scene, simulate, options).items():
         weight = run.weights[name]
@@ -204,21 +206,22 @@ def mapped(f: Callable, runs: Run, *more: Array) -> Array:
 
 
 Matrix = Float[Array, "unknowns unknowns"]
-_CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: what is less does not show
+_CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: smaller ones count as zero
 
 
 class PlannedInformation(Printed, eqx.Module):
     """The information of planned runs about each unknown. `print` shows the expected standard errors."""
 
     matrix: Matrix  # F, in the units of the unknowns
-    values: Float[Entries, "unknowns"]  # at which it is taken
-    sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
+    values: Float[Entries, "unknowns"]  # at which it is evaluated
+    # of each run and channel: (d y / d theta) / sigma, zero for missing samples
+    sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]
     labels: Labels = static()
     units: Labels = static()
 
     @property
     def covariance(self) -> Matrix:
-        """F^-1, with unbounded entries where a combination of unknowns is not determined."""
+        """Return F^-1, with unbounded entries for undetermined combinations of unknowns."""
         return _inverse(self.matrix)
 
     @property
@@ -228,8 +231,8 @@ class PlannedInformation(Printed, eqx.Module):
         return dict(zip(self.labels, jnp.sqrt(jnp.diagonal(self.covariance)), strict=True))
 
     def log_det(self, names: str | Iterable[str] = ()) -> Scalar:
-        """Return `log det F`, which a plan should make large. With `names`, return it for these unknowns
-        only, with all others estimated as well.
+        """Return `log det F`, which a plan should maximise. With `names`, return it for these unknowns only,
+        with all others estimated as well.
 
         Raises KeyError for names that are not unknown.
         """
@@ -239,13 +242,13 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def not_identifiable(self) -> Labels:
-        """Combinations of unknowns that the planned runs do not determine, one sentence each."""
+        """Return combinations of unknowns that the planned runs do not determine, one sentence each."""
         directions, size = self._hidden
         return hidden_combinations(directions, np.sqrt(_CUTOFF), size, np.asarray(self.values), self.labels)
 
     @property
     def _hidden(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return undetermined directions, in rows, and the sizes by which the unknowns are scaled."""
+        """Return undetermined directions, as rows, and the sizes that scale the unknowns."""
         values = np.abs(np.asarray(self.values))
         size = np.where(values > 0, values, 1.0)
         squares, directions = np.linalg.eigh(np.asarray(self.matrix) * size * size[:, None])
@@ -267,7 +270,7 @@ def _inverse(F: Matrix) -> Matrix:
 
 @compiled
 def _log_det(F: Matrix, places: Indices) -> Scalar:
-    """Return the logarithm of the determinant of this block of the inverse."""
+    """Return the log-determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
@@ -281,17 +284,19 @@ def planned_information(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> PlannedInformation:
-    """Return the information that planned runs will give on the unknowns, evaluated at the values of the
+    """Return the information that planned runs will give about the unknowns, evaluated at the values of the
     scene.
 
     **Arguments**
+
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and
       sensors. Their `values` do not matter, except that NaN marks a missing sample.
-    - `free`, `options`, `by_name`: as of `fit`. Start values in `unknown_start` and estimated numbers of
+    - `free`, `options`, `by_name`: as in `fit`. Start values in `unknown_start` and estimated numbers of
       sensors are unknowns, too, and priors count.
 
-    **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
-    inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
+    **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with
+    respect to parameters, start values and samples of inputs in forward mode (`jax.jacfwd`; second
+    derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
 
     **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and
     correlated noise.
@@ -309,8 +314,10 @@ def planned_information(
     runs = as_runs(scene, plan)
     for run in runs:
         for name in run.unknown_sigma:
-            raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of "
-                "its noise; give a number")
+            raise ValueError(
+                f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; "
+                "give a number"
+            )
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(f"the noise of channel `{name}` has a correlation time, which a plan does not "
                 "support; omit it")
@@ -328,7 +335,7 @@ def planned_information(
 def _sensitivities(
     scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], options: AllOptions, layout: Layout, places: tuple, reference: Reference
 ):
-    """F without priors, and the sensitivities, of unknowns in these places."""
+    """Return F without priors, and the sensitivities, for unknowns with these indices."""
     some, count = np.array(places, int), layout.sizes[0]
 
     def residuals(free_ones: Float[Array, "unknowns"]):

@@ -3,9 +3,10 @@
     x = (independent coordinates, privileged speeds):              dx/dt = A x + B f
     named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f,   M = W' (mass matrix) W
 
-Dependent coordinates and speeds follow from the linearised rows (`tangent.py`). The second form is Appell's equations for the named
-coordinates: the first form with the privileged speeds changed to (pdot, the others), times M.
-Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
+Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second form is
+Appell's equations for the named coordinates: the first form with the privileged speeds changed to (pdot, the
+others), times M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard,
+Multibody System Dynamics 33 (2015) 143.
 """
 
 
@@ -69,13 +70,16 @@ class Linearization(Printed, eqx.Module):
     K: Float[Array, "parts parts"]
     F: Float[Array, "parts inputs"]
     acceleration: Scalar  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
-    residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
-    coupling: Scalar  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
-    pivot: Scalar  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
+    residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both are zero if it is steady
+    # largest coefficient of other coordinates in the second form, relative to those in M, C, K
+    coupling: Scalar
+    # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent speeds or
+    # coordinates
+    pivot: Scalar
     states: Labels = static()  # names of the entries of x
     inputs: Labels = static()
     coordinates: Labels = static()  # names of p
-    about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
+    about: tuple[Scene, State, Float[Array, "inputs"]]  # the linearised scene, state and inputs
 
     def _text(self) -> str:
         if self.A.ndim != 2:
@@ -94,14 +98,14 @@ class Linearization(Printed, eqx.Module):
 
     @property
     def code(self) -> Count:
-        """0, or `SINGULAR_PARTITION` if the privileged speeds and coordinates do not determine the others;
-        then all is NaN.
+        """Return 0, or `SINGULAR_PARTITION` if the privileged speeds and coordinates do not determine the
+        others; then all results are NaN.
         """
         return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
-        """Return the roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. They are
-        differentiable where distinct.
+        """Return the roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Distinct roots are
+        differentiable.
         """
         return _roots(self._companion())
 
@@ -119,11 +123,11 @@ class Linearization(Printed, eqx.Module):
         `small.sensitivities("weave")["c"]`. Of a pair, the eigenvalue above the real axis is taken. Machine
         code computes the derivatives.
 
-        The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep
-        their values, as many as there are freedoms among neighbouring steady motions; default: speeds in the
-        scene's order, for a bicycle `x_rate`. `names`: as of `modes`. At a double root all is NaN, and `code`
-        is not 0. Raises ValueError for an unknown mode and a motion that is not steady; `NotLowered` where
-        the scene has no scalar program.
+        They include the change of the steady motion. `held`: names of coordinates and speeds that keep their
+        values, as many as neighbouring steady motions have freedoms; default: speeds in the scene's order,
+        for a bicycle `x_rate`. `names`: as in `modes`. At a double root all derivatives are NaN, and `code`
+        is not 0. Raises ValueError for an unknown mode and a motion that is not steady; `NotLowered` if the
+        scene has no scalar program.
         """
         found = self.modes(names)
         check_name(mode, dict.fromkeys(found.names), f"no mode `{mode}`")
@@ -133,17 +137,19 @@ class Linearization(Printed, eqx.Module):
     def state_eigenvalues(self) -> Complex[Array, "states"]:
         """Return eigenvalues of A, 1/s, by ascending real part.
 
-        Ignorable coordinates, and speeds that a steady motion may choose freely, have zero eigenvalues. They
-        often form Jordan blocks, whose eigenvalues are sensitive to round-off: an error of 1e-16 may show as
-        1e-8. `eigenvalues` omits them.
+        Ignorable coordinates, and speeds that a steady motion can have at any value, give zero eigenvalues.
+        They often form Jordan blocks, whose eigenvalues are sensitive to round-off: an error of 1e-16 may
+        appear as 1e-8. `eigenvalues` omits them.
         """
         return _roots(self.A)
 
     def _companion(self) -> Float[Array, "modes modes"]:
         k = len(self.coordinates)
         if k == 0:
-            raise ValueError("no coordinates are named, so there is no second-order form; give `coordinates` "
-                "to `linearize`, or use `state_eigenvalues`")
+            raise ValueError(
+                "no coordinates are named, so there is no second-order form; give `coordinates` to "
+                "`linearize`, or use `state_eigenvalues`"
+            )
         lower = -jnp.linalg.solve(self.M, jnp.concatenate([self.K, self.C], axis=1))
         return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
 
@@ -158,33 +164,36 @@ def linearize(
     dependent: str | Labels | None = None,
     privileged: str | Labels | None = None,
 ) -> Linearization:
-    """Linearise the equations of motion about a steady `state`, with the residual of its steadiness.
+    """Return the equations of motion linearised about a steady `state`, with a residual that measures its
+    steadiness.
 
         bicycle = WhippleBicycle()
         small = linearize(bicycle, start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
         small.M, small.C, small.K, small.eigenvalues()
 
     **Arguments**
-    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and
-      `residual` reports how far it is from steady. They are constant along a steady motion if only ignorable
+
+    - `state`: on the constraints. If it is not steady, A, B and M, C, K hold only at this instant, and
+      `residual` measures the deviation. They are constant along a steady motion in which only ignorable
       coordinates move, such as a disc's yaw and spin.
     - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A
-      quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
+      quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body axes.
     - `inputs`: values of the scene's inputs (default: zero), held constant.
-    - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the
-      independent speeds. The default is well conditioned at the state (for a traced state or traced
+    - `dependent`: names of the coordinates determined by the geometric constraints; `privileged`: names of
+      the independent speeds. The default is well conditioned at the state (for a traced state or traced
       parameters, over the scene's domain).
 
-    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` settles the
+    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` chooses the
     backend.
 
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and
     the state. If the privileged speeds do not determine the others, all results are NaN and `code` is not 0:
     name others.
 
-    **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed; at a known
-    state, speeds or coordinates that do not determine the others there.
-    **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction does at rest.
+    **Raises** ValueError for an unknown coordinate or speed; a coordinate that is both named and dependent,
+    or whose rate is no privileged speed; and, at a known state, speeds or coordinates that do not determine
+    the others. **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction
+    does at rest.
     """
     built, scene = scene, as_rolling(scene, "linearize")
     f = as_input_vector(scene, inputs)
@@ -202,20 +211,20 @@ def linearize(
         found = found if chosen == y else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
-            f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at "
-            f"this state (pivot {float(found.pivot):.1e}): choose others by `privileged` or `dependent`, or "
-            "linearize at a nearby state"
+            f"the dependent speeds or coordinates of `{type(scene).__name__}` are not determined by its "
+            f"constraints at this state (pivot {float(found.pivot):.1e}): choose others by `privileged` or "
+            "`dependent`, or linearize at a nearby state"
         )
     return found
 
 
 def _warn_of_loads(scene: Scene, state: State, f) -> None:
-    """Warn where loads have no derivative; traced values are not checked."""
+    """Issue a warning if loads have no derivative; traced values are not checked."""
     if not is_traced((scene, state, f)) and (rough := bent_load(scene, state.t, state.q, state.u, f)):
         text = (
-            f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at "
-            "this state: it has a kink or jumps there, as dry friction does at rest. Linearize at a state "
-            "beside it, or let the load change within a short range, as by `jnp.tanh`"
+            f"the linearization of `{type(scene).__name__}` ignores that {rough} has no derivative at this "
+            "state: it has a kink or jumps there, as dry friction does at rest. Linearize at a state nearby, "
+            "or make the load smooth, as by `jnp.tanh`"
         )
         warn(text, SensitivityWarning)
 
@@ -244,13 +253,15 @@ def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coor
     (S, turned), constant = perturbations(scene), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
-    # slopes along every perturbation (ds, du, df), and all of these from the independent ones
+    # derivatives along every perturbation (ds, du, df), and perturbations as functions of the independent
+    # ones
     along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
     T = eliminated(along[np.concatenate([at.geometric, at.phi])], np.concatenate([kept, count + chosen, count + m + np.arange(len(at.f))]))
     pivots = smallest_pivot(along[at.geometric], others(kept, count)), smallest_pivot(along[at.phi], count + others(chosen, m))
 
-    # rows of A and B: rates of the independent ds in axes that turn with the unperturbed motion, and of the privileged speeds
-    # a turn ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq = (B q0dot) ds
+    # rows of A and B: rates of the independent ds in axes that rotate with the unperturbed motion, and of the
+    # privileged speeds; a rotation ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq =
+    # (B q0dot) ds
     rates = (S + 4 * turned @ q).T[kept] @ (along[at.qdot] @ T - turned @ v[at.qdot] @ T[:count])
     rates = xp.concatenate([rates, along[constant] @ T])
     n = len(kept) + len(y)
@@ -263,8 +274,8 @@ def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coor
 
 
 def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates: Labels):
-    """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass` is that of the
-    privileged speeds.
+    """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass`: for the privileged
+    speeds.
     """
     count, k, xp = len(independent), len(coordinates), array_module(A)
     p = np.array([independent.index(name) for name in coordinates], int)
@@ -281,8 +292,8 @@ def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates:
 
 
 def _relative(neglected, kept):
-    """Return the ratio of the largest neglected entry to the largest kept one; the entry itself where nothing
-    is kept.
+    """Return the ratio of the largest neglected entry to the largest kept one, or the entry itself if all
+    kept ones are zero.
     """
     xp = array_module(kept)
     size = largest(kept)
@@ -311,8 +322,8 @@ def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
 
 
 def _own_rate(scene: Scene, name: str) -> int | None:
-    """Return the index of the speed that is the rate of the perturbation `name`; None where the scene has its
-    own speeds.
+    """Return the index of the speed that is the rate of the perturbation `name`; None for a scene with
+    user-defined speeds.
     """
     if scene.speeds is not None:
         return None
@@ -323,7 +334,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
 def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     """Return the positions in y of the privileged speeds other than the rates of the named coordinates."""
     if len(coordinates) == len(y):
-        return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was
+        return np.zeros(0, int)  # as many as there are freedoms: their rates replace all of y
     own = [_own_rate(scene, name) for name in coordinates]
     beside = [j for j, speed in enumerate(y) if speed not in own]
     if len(beside) + len(coordinates) == len(y):

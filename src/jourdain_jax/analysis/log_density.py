@@ -2,9 +2,10 @@
 
     log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
 
-L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from a fit (`whitened`).
-A correlation time tau stands in theta as arcsin rho, rho = exp(-h / tau), h: the shortest interval, and is even in it (Jeffreys' prior of AR(1) noise).
-Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
+L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from
+a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the shortest
+interval, with a uniform prior (Jeffreys' prior of AR(1) noise). Source: A. Gelman et al., Bayesian Data
+Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -49,24 +50,24 @@ class LogDensity(eqx.Module):
     scene: Scene
     groups: tuple[Run, ...]  # runs of equal structure, stacked
     options: AllOptions
-    fixed: Places  # the first guess, and what is known, of all places of a layout
+    fixed: Places  # first guesses and known values of all entries of a layout
     guess: Float[np.ndarray, "unknowns"]  # in their units
     prior_mean: Places
-    prior_rows: Float[np.ndarray, "places places"]  # of priors: see `Unknowns`
-    prior_height: float  # logarithm of what all priors are at most
+    prior_rows: Float[np.ndarray, "places places"]  # of priors (see `Unknowns`)
+    prior_height: float  # logarithm of the maximum of all priors
     centre: Float[np.ndarray, "unknowns"]
     factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
     labels: Labels = static()
     units: Labels = static()
     layout: Layout = static()
-    runs: tuple[Indices, ...] = static()  # numbers of those of each group
-    places: Indices = static()  # of those unknowns that are no sigmas
-    sigmas: Labels = static()  # channels whose sigma is unknown, which come after those
-    with_memory: Labels = static()  # channels whose correlation time is, last among the unknowns
+    runs: tuple[Indices, ...] = static()  # indices of the runs of each group
+    places: Indices = static()  # indices of the unknowns other than sigmas
+    sigmas: Labels = static()  # channels with unknown sigma, next among the unknowns
+    with_memory: Labels = static()  # channels with unknown correlation time, last among the unknowns
     ranges: tuple[Range, ...] = static()  # of all unknowns
 
     def __call__(self, z: Point) -> Scalar:
-        """Return the logarithm of the density; -inf where the motion fails."""
+        """Return the logarithm of the density; -inf if the motion fails."""
         return _density(self, self._checked(z), Reference(self.scene, self.layout.parameters))
 
     def _at(self, z: Point, reference: Reference) -> Scalar:
@@ -74,7 +75,7 @@ class LogDensity(eqx.Module):
         theta, slopes = self._each(Range.constrain, x), self._each(Range.log_slope, x)
         count, end = len(self.places), len(self.places) + len(self.sigmas)
         known = self.prior_rows @ (theta[:count] - self.prior_mean)
-        # of a sigma: flat in its logarithm, which is x
+        # the prior of a sigma is flat in its logarithm, which is x
         logs = jnp.sum(slopes[:count]) + jnp.sum(slopes[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + self.prior_height - 0.5 * known @ known
         shared, local = self._split(theta)
         scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
@@ -91,7 +92,7 @@ class LogDensity(eqx.Module):
 
     @property
     def initial(self) -> Point:
-        """z at the first guess of all unknowns."""
+        """Return z at the first guess of all unknowns."""
         return self.unconstrain({})
 
     def constrain(self, z: Points) -> Points:
@@ -132,8 +133,10 @@ class LogDensity(eqx.Module):
         """
         of_noise = set(self.sigmas) <= set(fit.sigma) and set(self.with_memory) <= set(fit.correlation_time)
         if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not of_noise:
-            raise ValueError(f"the fit is of {', '.join(fit.labels)}, the density of "
-                f"{', '.join(self.labels)}; give the fit of the same unknowns and data")
+            raise ValueError(
+                f"the unknowns of the fit are {', '.join(fit.labels)}, those of the density "
+                f"{', '.join(self.labels)}; give the fit of the same unknowns and data"
+            )
         for label, error in zip(fit.labels, fit.standard_errors, strict=True):
             if not np.isfinite(error):
                 raise ValueError(
@@ -143,7 +146,7 @@ class LogDensity(eqx.Module):
         noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
         theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
         x = np.array(self._each(Range.unconstrain, jnp.asarray(theta)))
-        x[end:] = np.clip(x[end:], -4.0, 4.0)  # a correlation time may be at an end
+        x[end:] = np.clip(x[end:], -4.0, 4.0)  # a correlation time may be at an end of its range
         slopes = np.exp(-np.asarray(self._each(Range.log_slope, jnp.asarray(x))))
         covariance = np.zeros((len(theta), len(theta)))
         covariance[: fit.values.size, : fit.values.size] = fit.covariance
@@ -190,10 +193,10 @@ def log_density(
     samplers such as those of BlackJAX and NumPyro.
 
     **Arguments**
-    - `scene`, `data`, `free`, `options`, `by_name`: as of `fit`. Unknowns are free parameters, unknown start
-      values, estimated numbers of sensors and actuators, and sigmas that are None, which are named
-      `"lean.sigma"`.
-    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
+
+    - `scene`, `data`, `free`, `options`, `by_name`: as in `fit`. Unknowns are free parameters, unknown start
+      values, estimated numbers of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
+    - Priors: `Normal` if an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
       itself, in the logarithm of a sigma, and in arcsin rho, rho = exp(-h / tau), of an estimated correlation
       time tau, where h is the shortest interval between samples of its channel. A flat prior without bounds
       has no integral: if the data do not determine an unknown, the posterior has none either, and a sampler
@@ -203,13 +206,13 @@ def log_density(
     convert between the vector and the unknowns. It includes the logarithms of the transforms' derivatives. It
     is a pure function: it works under `jit`, `vmap` and `grad`.
 
-    **Raises** ValueError as `fit`.
+    **Raises** ValueError as in `fit`.
 
     **Example**
 
         density = jj.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
         sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
-        draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
+        draws = density.named(positions)["radius"]                               # m, at the sampled positions (draws, unknowns)
     """
     settled = as_fit_options(scene, options, by_name, "log_density")
     scene = as_scene(scene)
@@ -225,7 +228,7 @@ def log_density(
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)
         guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
-    guesses += (intervals / np.log(2)).tolist()  # neighbouring samples correlate by a half
+    guesses += (intervals / np.log(2)).tolist()  # neighbouring samples have a correlation of one half
     places = unknowns.estimated
     size, weights = len(places) + len(guesses), unknowns.prior_weight[unknowns.prior_weight > 0]
     return LogDensity(
@@ -251,14 +254,16 @@ def log_density(
 
 
 def _rms(scene: Scene, groups: Sequence[Run], name: str, options: AllOptions) -> float:
-    """Return the root mean square of a channel's residuals at the first guess, with weights one. It serves as
-    first guess of sigma.
+    """Return the root mean square of a channel's residuals at the first guess, with unit weights, as first
+    guess of sigma.
     """
     of = partial(Run.residuals, scene=scene, simulate=simulate, options=options)
     residuals = [mapped(lambda run: of(run)[name], group) for group in groups]
     samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
     found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))
     if not np.isfinite(found):
-        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has no "
-            "first guess; examine the motion with `simulate`")
+        raise ValueError(
+            f"the motion fails at the first guess, so that the sigma of channel `{name}` has no first guess; "
+            "examine the motion with `simulate`"
+        )
     return max(found, 1e-12)

@@ -1,11 +1,13 @@
 """Predictions of runs cut into pieces, each with its own start, and predictions of whole runs condensed from
 them.
 
-    joined      all starts s_i of pieces are unknowns, continuity is a residual of some width: (x(t_i+1; s_i, theta) - s_i+1) / width
-    condensed   continuity is solved for, to first order:   ds_i+1 = A_i ds_i + B_i dtheta + c_i,     c_i = x(t_i+1; s_i, theta) - s_i+1
-                ds_i = L_i (dx_0, dtheta) + g_i             leaves the unknowns of a fit without pieces, x_0: those of the start of the run
+    joined      all starts s_i of pieces are unknowns; residuals (x(t_i+1; s_i, theta) - s_i+1) / width
+    condensed   continuity is solved for, to first order:
+                ds_i+1 = A_i ds_i + B_i dtheta + c_i,     c_i = x(t_i+1; s_i, theta) - s_i+1
+                ds_i = L_i (dx_0, dtheta) + g_i           x_0: start of the run
 
-Once pieces join (c = 0), residuals and derivatives are those of the whole run. Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102.
+Once pieces join (c = 0), residuals and derivatives equal the whole run's. Source: H. G. Bock, in: Modelling
+of Chemical Reaction Systems (1981) 102.
 """
 
 import itertools
@@ -29,24 +31,27 @@ from jourdain_jax.analysis.unknowns import Places, Unknowns
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A fit by multiple shooting: its pieces, and how well they join."""
+    """Pieces of a fit by multiple shooting, and their continuity."""
 
-    pieces: tuple[int, ...]  # of each run
-    continuity: Float[np.ndarray, ""]  # the largest jump from one piece to the next, in tolerances of the options, atol + rtol |x|
-    sizes: Float[np.ndarray, "states"]  # of coordinates, speeds, and what low-passes of sensors give
-    nodes: tuple[Float[np.ndarray, "nodes states"], ...]  # states (q, u, y) at which the pieces of each run meet
+    pieces: tuple[int, ...]  # number for each run
+    # the largest jump between neighbouring pieces, in tolerances of the options, atol + rtol |x|
+    continuity: Float[np.ndarray, ""]
+    sizes: Float[np.ndarray, "states"]  # of coordinates, speeds, and states of low-pass filters of sensors
+    nodes: tuple[Float[np.ndarray, "nodes states"], ...]  # states (q, u, y) at the joints of each run
 
 
 @dataclass
 class _Standing(ByMember):
-    """The location of the pieces of all members, and the results there."""
+    """The current unknowns of the pieces of all members, and the results there."""
 
-    local: Float[np.ndarray, "members pieces states_and_own"]  # unknowns of each piece, with its node
-    theta: Float[np.ndarray, "members places"]  # those of the whole runs
-    rows: np.ndarray  # (members, runs) of [J g r] of the whole runs: r will have changed by g, to first order, once pieces join
+    # unknowns of each piece, with its start state (node)
+    local: Float[np.ndarray, "members pieces states_and_own"]
+    theta: Float[np.ndarray, "members places"]  # unknowns of the whole runs
+    # (members, runs) of [J g r] of the whole runs: r changes by g, to first order, when pieces join
+    rows: np.ndarray
     slopes: Float[np.ndarray, "members pieces states_and_own unknowns"]  # L
     gaps: Float[np.ndarray, "members pieces states_and_own"]  # g
-    jumps: Float[np.ndarray, "members pieces states"]  # from the piece before
+    jumps: Float[np.ndarray, "members pieces states"]  # from the previous piece
 
 
 class Piecewise(Problem):
@@ -59,17 +64,18 @@ class Piecewise(Problem):
         scene, layout, shooting = asked.scene, unknowns.layout, asked.shooting
         assert shooting is not None
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs]
-        self.states = max(of_runs)  # of a node; zero where a run has fewer low-passes than another
+        self.states = max(of_runs)  # length of a node, zero-padded for runs with fewer low-pass filters
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
         of_each = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
         parts = tuple(itertools.chain(*of_each))
         if len(parts) == len(runs):
             raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or "
                 "omit `shooting`")
-        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # of each piece
+        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # run of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
-        # numbers of sensors are the same in all pieces: these places of a piece, and its node, are decided by the piece before
+        # numbers of sensors are equal in all pieces: these unknowns of a piece, and its node, are determined
+        # by the previous piece
         self._carried = np.array([k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)], int)
         self._decided = np.concatenate([self._carried, self.own + np.arange(self.states)])
         self._states_of = np.array(of_runs)[self.run_of]
@@ -90,7 +96,7 @@ class Piecewise(Problem):
         return Unknowns(self._layout, pieces, guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening)
 
     def measure(self, node_sizes: Float[np.ndarray, "states"]) -> None:
-        """Takes these as the sizes of the numbers of nodes."""
+        """Set the sizes of the entries of nodes."""
         self.node_sizes = node_sizes
         self.pieces.unknowns = self._unknowns(len(self.follows))
 
@@ -100,7 +106,7 @@ class Piecewise(Problem):
 
     def _each(self, of_runs: np.ndarray, later, first_node, later_node, carried: bool = True) -> np.ndarray:
         """Return the unknowns of all pieces from those of whole runs; `later`: the start values of later
-        pieces; `carried`: without shared unknowns.
+        pieces; `carried`: whether shared sensor numbers are copied to all pieces.
         """
         shared, own = self.unknowns.split(of_runs)
         own = own[..., self.run_of, :]
@@ -152,7 +158,7 @@ class Piecewise(Problem):
     # Condensed. -----------------------------------------------------------------------------------------------------
 
     def put(self, theta: np.ndarray) -> ByUnknown:
-        """Place the pieces of all members here; return the unknowns of the whole runs."""
+        """Set the unknowns of the pieces of all members; return the unknowns of the whole runs."""
         shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
         slopes, jumps = np.zeros((*local.shape, self.own + self.shared)), np.full((*local.shape[:2], self.states), np.inf)
@@ -160,7 +166,7 @@ class Piecewise(Problem):
         return whole.copy()
 
     def put_nodes(self, theta: ByUnknown, found: Shot) -> None:
-        """Puts the pieces where another fit of the same runs ended."""
+        """Set the pieces to the end of another fit of the same runs."""
         self.measure(found.sizes)
         whole = self.spread(theta)
         local = self.pieces.unknowns.split(whole)[1]  # a view
@@ -168,7 +174,7 @@ class Piecewise(Problem):
         self.put(whole)
 
     def told(self) -> Shot:
-        """Return how well the pieces join at their location."""
+        """Return the pieces and their continuity."""
         nodes = self.at.local[0, :, self.own :]
         return Shot(
             pieces=tuple(np.bincount(self.run_of).tolist()),
@@ -178,12 +184,12 @@ class Piecewise(Problem):
         )
 
     def keep(self, member: int) -> None:
-        """Keeps this one of all members alone."""
+        """Keep only this member."""
         self.at = self.at.of([member])
 
     def evaluated(self, theta: ByUnknown, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of whole runs. The starts of pieces move along with the unknowns, to first order, until
-        the pieces join.
+        """Yield [J r] of whole runs. The starts of pieces follow the unknowns, to first order, until the
+        pieces join.
         """
         failed = np.zeros(len(members), bool)
         for _ in range(8):
@@ -232,8 +238,8 @@ class Piecewise(Problem):
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
-        """Return the largest factor by which small changes of the unknowns grow after the first joint,
-        measured in the sizes of states and unknowns.
+        """Return the largest factor by which small changes of the unknowns grow after the first joint, in
+        sizes of states and unknowns.
         """
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
@@ -242,8 +248,8 @@ class Piecewise(Problem):
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """Return a context in which the objective may be evaluated at other unknowns. When it is left, the
-        pieces are as before.
+        """Return a context in which the objective may be evaluated at other unknowns; on exit the pieces are
+        restored.
         """
         kept = self.at.of(np.arange(len(self.at.theta)))
         yield
@@ -262,8 +268,8 @@ class Piecewise(Problem):
         return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
 
     def _move(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Flags:
-        """Move the pieces of some members to other unknowns. Return which members do not fail there; the
-        failing ones stay.
+        """Move the pieces of some members to other unknowns. Return which members do not fail there; failing
+        ones do not move.
         """
         m, M = self.own, self.own + self.states
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)
