@@ -89,7 +89,7 @@ def stacked_parameters(scene) -> str:
         return ""
     return (
         f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than the "
-        f"default; for many scenes use `jax.vmap`, or `rollout` with `parameters={name: values}`"
+        f"default; for many scenes use `jax.vmap`, or `rollout` with `parameters={{name: values}}`"
     )
 
 
