@@ -165,14 +165,14 @@ FITS = {
     "tied(lambda scene: 'heavy')": "returns ... heavy ... , expected a number",
     "jj.fit(sleigh, data, free={'inertia': lambda scene: scene.mass})": "nothing is free",
     "event(events={'bufer': (0.9, 0.003)})": "names `bufer`, which is not an event of the scene; did you mean `buffer`",
-    "event(events={'buffer': (0.9, 0.003), 'far': (1.0, 0.003)})": "`events` names `buffer`, `far`, but a motion stops at the first",
+    "event(events={'buffer': (0.9, 0.003), 'far': (1.0, 0.003)})": "`events` names `buffer`, `far`, but a motion stops at its first",
     "event(events={'buffer': 0.9})": "event `buffer` was given 0.9, expected (time, sigma)",
     "event(events={'buffer': (0.0, 0.003)})": "the time of event `buffer` is 0.0 s, expected a time after the start",
     "event(events={'buffer': (0.9, 0.0)})": "sigma of channel `buffer` must be above zero",
     "event(events={'x': (0.9, 0.003)}, values=np.ones(8))": "`x` is both a channel and an event",
     "event(sensors={'buffer': 'x'})": "`buffer` is an event, whose time has no sensor",
     "jj.fit(Stopped(), stopped(values=np.ones(8)), ('mass',), shooting=jj.MultipleShooting(pieces=2))": (
-        "run 0 gives the time of its event `buffer`, which `shooting` does not use"
+        "run 0 has a measured time of its event `buffer`, which `shooting` does not use"
     ),
     "jj.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), process_noise={'x_rate': 0.1})": (
         "run 0 gives the time of its event `buffer`, which the filter does not use"

@@ -112,7 +112,7 @@ SENSORS: dict[str, str] = {
     "jj.Sensor(gain=jj.Estimate())": "`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate(1.0)`",
     "jj.Sensor(delay=jj.Estimate(0.1))": "`delay` of `Sensor` is to be estimated, but has no upper limit; give `range=jj.bounds",
     "jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0)))": "`delay` of `Sensor` may fall to -1 s, expected a range that begins at zero",
-    "jj.Sensor(lag=jj.Estimate((0.1, 0.2)))": "`lag` of `Sensor` is to be estimated from 2 guesses, expected one number",
+    "jj.Sensor(lag=jj.Estimate((0.1, 0.2)))": "`lag` of `Sensor` has 2 guesses, expected one number",
     "jj.Estimate(np.inf)": "`guess` of `Estimate` is inf, expected a finite number",
     "jj.Estimate(1.0, range=(0.0, 1.0))": "`range` of `Estimate` is a tuple, expected `bounds",
     "jj.Estimate(1.0, per_run=1)": "`per_run` of `Estimate` is an int, expected True or False",
@@ -136,7 +136,7 @@ SENSORS: dict[str, str] = {
     "jj.log_likelihood(cart, shown(gain=gain))": "`gyro.gain` is to be estimated, but a likelihood needs its value",
     "with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1))": "command of input `push` of run 0 of `Cart` ends at 1 s, before",
     "with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0]))": "is sampled from 1700000000 to 1700000004 s, but the run is from 0 to 4 s, where the input",
-    "jj.fit(cart, shown(), {'mass': jj.Estimate(per_run=True)})": "`free` asks for a `mass` of each run, but all runs share the scene",
+    "jj.fit(cart, shown(), {'mass': jj.Estimate(per_run=True)})": "`free` has a `mass` for each run, but all runs share the scene",
     "jj.fit(cart, shown(), {'mass': jj.Estimate((1.0, 2.0))})": "first guess of `mass` has shape (2,), expected ()",
     "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.Sensor('x', gain=gain)}, inputs={'push': jj.Actuator(command, gain=gain)}))": (
         "has a channel and an input `push`, both with an estimated gain; give the channel another name"

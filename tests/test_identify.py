@@ -524,7 +524,7 @@ def test_start_values_that_depend_on_each_other_are_refused():
         return Experiment(data.ts, data.values, SIGMA, start=start, **options)
 
     # y_rate follows from the offset, which is to change
-    with pytest.raises(ValueError, match=r"the start of run 0 no longer meets the constraints when the unknowns change.*`blade`"):
+    with pytest.raises(ValueError, match=r"the start of run 0 violates the constraints when the unknowns change.*`blade`"):
         fit(TRUTH, run(consistent), ("offset",))
     with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*violates constraint `blade`"):
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))

@@ -235,7 +235,7 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
     assert near["late.lag"].low > 0.0
-    assert near.warning.startswith("the interval of `late.lag` is too narrow, and others may be, too: up to a bound nearby")
+    assert near.warning.startswith("the interval of `late.lag` is too narrow, and others may be: up to a nearby bound")
 
 
 def test_other_numbers_of_a_sensor_compile_nothing(compilations):

@@ -182,8 +182,7 @@ def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, st
 
 def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
     about = "For residuals without the correlation of the noise, if that was estimated or given."
-    rows = [("channel", "correlation of neighbours", "limit for white "
-                                                     "ones", "white", "correlation time", "intervals too narrow by")]
+    rows = [("channel", "correlation of neighbours", "white limit", "white", "correlation time", "intervals too narrow by")]
     for name, (rho, limit) in fit.autocorrelation.items():
         white = abs(rho) <= limit
         time = f"{float(fit.correlation_time[name]):.3g} s" if name in fit.correlation_time else "-"

@@ -1,18 +1,19 @@
 """The objective of a fit: whitened and weighted residuals of all runs, with derivatives.
 
-F = sum rho(w) + sum n log sigma + |M (theta - mean) / s|^2 / 2        w: whitened residuals (see `correlated_noise`)
+F = sum rho(w) + sum n log sigma + |M (theta - mean) / s|^2 / 2 w: whitened residuals (see `correlated_noise`)
 
-sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors; M: see `joint_prior`
+sigma^2 = mean w^2 of each channel of unknown sigma; mean, s: of priors; M: see `joint_prior`
 
-How much a residual counts: by its square, or less where it is far out.
+Losses: a residual counts by its square, or less if it is an outlier.
 
-minimise sum rho(r)       weights w = rho'(r) / r: a weighted least-squares problem with the same gradient, sqrt(w) r and sqrt(w) J
-Huber        rho = r^2/2 for |r| <= k, k |r| - k^2/2 beyond          w = min(1, k / |r|)
-Student-t    rho = (nu + 1)/2 log(1 + r^2/nu)                        w = (nu + 1) / (nu + r^2)
+minimise sum rho(r) weights w = rho'(r) / r: a weighted least-squares problem with the same gradient, sqrt(w)
+r and sqrt(w) J Huber rho = r^2/2 for |r| <= k, k |r| - k^2/2 beyond w = min(1, k / |r|) Student-t rho = (nu +
+1)/2 log(1 + r^2/nu) w = (nu + 1) / (nu + r^2)
 
-Covariance: K^2 (J'J)^-1 sum psi^2 / (n - p) / mean(psi')^2,   K = 1 + p var(psi') / (n mean(psi')^2)     psi = rho'; n residuals, p unknowns
-J'J from the weighted J'WJ, divided by the mean weight.
-Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), section 7.6; K. L. Lange, R. J. A. Little and J. M. G. Taylor, JASA 84 (1989) 881.
+Covariance: K^2 (J'J)^-1 sum psi^2 / (n - p) / mean(psi')^2, K = 1 + p var(psi') / (n mean(psi')^2) psi =
+rho'; n residuals, p unknowns J'J from the weighted J'WJ, divided by the mean weight. Source: P. J. Huber and
+E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), section 7.6; K. L. Lange, R. J. A. Little and J. M. G.
+Taylor, JASA 84 (1989) 881.
 """
 
 import math
@@ -39,13 +40,13 @@ Samples = Float[np.ndarray, "*samples"]
 
 @dataclass(frozen=True)
 class Loss:
-    """`huber(k)` or `student_t(degrees)`; with an infinite parameter, least squares."""
+    """A loss, `huber(k)` or `student_t(degrees)`. With an infinite parameter it is that of least squares."""
 
     kind: str
     parameter: float
 
     def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
-        """Return sum of rho over the last axis."""
+        """Return the sum of rho over the last axis."""
         k = self.parameter
         if math.isinf(k):
             return 0.5 * np.einsum("...i,...i->...", r, r)
@@ -55,17 +56,16 @@ class Loss:
         return np.sum(inside * (np.minimum(abs(r), np.finfo(float).max / max(k, 1.0)) - 0.5 * inside), axis=-1)
 
     def weight(self, r: Samples) -> Samples:
-        """w(r)."""
+        """Return w(r)."""
         k = self.parameter
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Samples):
-        """Return rows times the roots of their weights."""
+        """Return `rows`, each multiplied by the root of its weight."""
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:
-        """Return the factor of the covariance (J'WJ)^-1, from residuals that have determined `determined`
-        unknowns.
+        """Return the factor of the covariance (J'WJ)^-1, for residuals that determined `determined` unknowns.
         """
         if not np.isfinite(bend := self.bend(r)):
             return bend
@@ -74,14 +74,14 @@ class Loss:
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
     def bend(self, r: Residuals) -> float:
-        """Return the factor that turns (J'WJ)^-1 into the inverse second derivative of F; infinite where F is
-        not convex in the residuals.
+        """Return the factor from (J'WJ)^-1 to the inverse second derivative of F; infinite if F is not convex
+        in the residuals.
         """
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
 
     def _slope(self, r: Residuals) -> Residuals:
-        """psi'."""
+        """Return psi'."""
         k = self.parameter
         return (k + 1) * (k - r**2) / (k + r**2) ** 2 if self.kind == "student-t" else (np.abs(r) <= k).astype(float)
 
@@ -90,8 +90,8 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 
 def huber(k: Number = 1.345) -> Loss:
-    """Count residuals beyond `k` sigmas by their magnitude in place of their square: `jj.fit(...,
-    loss=jj.huber())`. The default keeps 95 % of the efficiency.
+    """Return a loss that counts residuals beyond `k` sigmas by magnitude instead of by square: `jj.fit(...,
+    loss=jj.huber())`. The default has 95 % of the efficiency of least squares for normal noise.
 
     Raises ValueError unless k is positive and finite.
     """
@@ -99,8 +99,8 @@ def huber(k: Number = 1.345) -> Loss:
 
 
 def student_t(degrees: Number = 4.0) -> Loss:
-    """Assume noise with the tails of Student's t, so that outliers hardly count. `degrees`: of freedom, fewer
-    for heavier tails. Sigma is then the scale of the noise.
+    """Return the loss for noise distributed as Student's t, under which outliers hardly count. Fewer
+    `degrees` of freedom mean heavier tails. Sigma is then the scale of the noise.
 
     Raises ValueError unless the degrees are positive and finite.
     """
@@ -117,30 +117,28 @@ def _positive(x: Number, name: str, function: str) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """Arguments of a fit, without its data, stored with the result so that it can be resumed."""
+    """The arguments of a fit without its data, stored in the result so that the fit can be resumed."""
 
     scene: Scene  # with the first guesses
     free: Mapping | tuple[str, ...]
     options: AllOptions
     loss: Loss
     control: Control
-    errors: str  # whence standard errors come: "sigmas" or "runs"
-    guesses: int  # first guesses to try
+    errors: str  # source of standard errors: "sigmas" or "runs"
+    guesses: int  # number of first guesses to try
     shooting: MultipleShooting | None
 
 
 @dataclass(frozen=True)
 class Span(ByMember):
-    """The first part of all runs. For undetermined unknowns the first guess is a weak prior, with its own
-    size as standard deviation.
-    """
+    """The first part of all runs. The first guess is a weak prior with its own size as standard deviation."""
 
-    shares: PerMember  # of the span of each run, from its start: samples beyond do not count
+    shares: PerMember  # of the duration of each run, from its start; later samples do not count
     begun: Places  # first guesses
 
 
 class Problem:
-    """The objective of a fit over its runs: residuals with derivatives, for any members at any values of the
+    """The objective of a fit over its runs: residuals with derivatives, for any members and values of the
     unknowns. `repeats`: the number of repeats of the experiment, or None.
     """
 
@@ -148,24 +146,28 @@ class Problem:
         self.asked, self.runs, self.unknowns, self.single, self.count = asked, runs, unknowns, repeats is None, repeats or 1
         self.scene, self.loss = asked.scene, asked.loss
         self.groups = [Group(asked.scene, runs, indices, unknowns.layout, asked.options, repeats) for indices in grouped(runs)]
-        self.group_of = {run: group for group in self.groups for run in group.runs.tolist()}  # the runs of equal structure that a run belongs to
-        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
+        # run -> its group of runs of equal structure
+        self.group_of = {run: group for group in self.groups for run in group.runs.tolist()}
+        # channels with estimated sigma
+        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
-        self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])  # sigma of each of these: of one that is met exactly
+        # lower limit of these sigmas, reached by an exact fit
+        self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
-        self.tau = np.zeros((self.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
-        self.failed = False  # whether a motion has
+        # s, of these channels; initially as for white noise
+        self.tau = np.zeros((self.count, len(self.with_memory)))
+        self.failed = False  # whether any motion has failed
 
     def one(self, x: np.ndarray) -> np.ndarray:
-        """Return values with an axis of members without it if there are no repeats."""
+        """Return values without their axis of members if the experiment has no repeats."""
         return np.asarray(x[0]) if self.single else x
 
     def taus(self, members: np.ndarray) -> np.ndarray:
-        """Correlation times of some members, (members, channels with memory), s."""
+        """Return the correlation times of some members, (members, channels with memory), s."""
         return self.tau[members % self.count]
 
     def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
-        """Samples of each of these channels that are not missing, in all runs."""
+        """Return the number of samples that are not missing in each of these channels, over all runs."""
         found = np.zeros((self.count, len(names)))
         for k, name in enumerate(names):
             for weights in (group.weights[name] for group in self.groups if name in group.weights):
@@ -173,32 +175,32 @@ class Problem:
         return found[members % self.count]
 
     def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of all runs of some members, some lanes at a time."""
+        """Yield [J r] of all runs of some members, batch by batch."""
         for group in self.groups:
             yield from group.evaluate(*self.unknowns.split(theta), members)
 
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
-        """Return the objective and its arrow for some members, over all runs or over a span of them."""
+        """Return the objective and its arrow matrix for some members, over all runs or a span of them."""
         return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
-        """Return the minimum of some members, from theta. `control`: replaces that of the fit."""
+        """Return the minimum for some members, starting from theta. `control` replaces the fit's own."""
         evaluate = lambda x, here: self.linearised(x, members[here], span and span.of(here))  # noqa: E731
         return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
 
     def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
-        """Return the minimum over all unknowns but one, which is held at this value. It is accurate to one
-        per cent of a standard error.
+        """Return the minimum over all unknowns but one, held at this value. It is accurate to one per cent of
+        a standard error.
         """
         unknowns, control, fixed = self.unknowns, self.asked.control, self.unknowns.fixed.copy()
         begin = np.clip(theta, unknowns.low, unknowns.high)
         begin[0, place], fixed[place] = value, True
-        # standard errors: tolerance where the value of F matters, not the place
+        # tolerance in standard errors: the value of F matters here, not the location of the minimum
         roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
         return minimise(lambda x, _: self.linearised(x, np.array([member])), begin, replace(unknowns, fixed=fixed), roughly)
 
     def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: np.ndarray, span: Span | None = None) -> Linearised:
-        """Return the objective from evaluated residuals, with these correlation times."""
+        """Return the objective for evaluated residuals and these correlation times."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
@@ -218,7 +220,8 @@ class Problem:
                         costs[b, j] = self.loss.value(r)
                 for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain, strict=True):
                     kept[place] = one[:, -1]
-                if count == 1 and runs > 1 and not math.isfinite(triangles[b, j].sum()):  # whatever the other runs say
+                # one failed run makes the objective infinite
+                if count == 1 and runs > 1 and not math.isfinite(triangles[b, j].sum()):
                     triangles.fill(np.nan)
                     break
             cost = costs.sum(axis=1)
@@ -234,8 +237,8 @@ class Problem:
         return Linearised(cost, whole, kept, sigma, triangles, squares)
 
     def joined(self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None) -> tuple[Arrow, np.ndarray | float]:
-        """Return the arrow of triangles (members, runs, kinds, width, width) with these sigmas (members,
-        kinds) and all priors, and the contribution of the priors to F.
+        """Return the arrow matrix for triangles (members, runs, kinds, width, width), these sigmas (members,
+        kinds) and all priors; and the contribution of the priors to F.
         """
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]
@@ -252,7 +255,7 @@ class Problem:
         return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
-        """Return the shares of the span over which the mean squared residual is at most `most` times that of
+        """Return for which shares of the span the mean squared residual is at most `most` times that of
         noise.
         """
         good = np.isfinite(at.cost)
@@ -267,8 +270,8 @@ class Problem:
         return found
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
-        """Set unknown correlation times to the maximum of the restricted likelihood. Return the largest
-        change of rho, the correlation over one shortest interval.
+        """Maximise the restricted likelihood over unknown correlation times. Return the largest change of
+        rho, the correlation over one shortest interval.
         """
         evaluated, ends = list(self.evaluated(theta, members)), np.array([correlation_limits(self.runs, name) for name in self.with_memory])
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
@@ -282,7 +285,7 @@ class Problem:
         return changed
 
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray) -> tuple[np.ndarray, Linearised]:
-        """Return the terms of the restricted likelihood, to be minimised."""
+        """Return the terms of the negative restricted log likelihood."""
         at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
             np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], taus[b]))
@@ -292,10 +295,10 @@ class Problem:
         """Return the contribution of estimated correlation times to each squared standard error C, (members,
         unknowns), relative to C; and the variance of log C.
 
-        Moments are taken over the restricted likelihood of each correlation time, with weights that are even
-        in arcsin rho (Jeffreys' prior of AR(1) noise). The total variance is the mean of C plus the variance
-        of the estimates, both over the correlation time. `of`: returns standard errors and changes of the
-        estimates from an arrow. The result is zero if no correlation time is estimated.
+        Moments are taken over the restricted likelihood of each correlation time, with weights uniform in
+        arcsin rho (Jeffreys' prior of AR(1) noise). The total variance is the mean of C plus the variance of
+        the estimates, both over the correlation time. `of` returns standard errors and changes of the
+        estimates for an arrow matrix. The result is zero if no correlation time is estimated.
         """
         members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
@@ -305,7 +308,7 @@ class Problem:
             low, high = correlation_limits(self.runs, name)
             interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
-            # in standard deviations of arcsin rho: 1 / sqrt(samples) without unknowns
+            # nodes in standard deviations of arcsin rho, which are 1 / sqrt(samples) without unknowns
             nodes = angle(taus[:, k])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
             inside = (nodes >= angle(low)) & (nodes <= angle(high))
             found = []
@@ -325,13 +328,13 @@ class Problem:
 
     @property
     def samples(self) -> int:
-        """Number of samples of channels with known sigma, in one repeat."""
+        """Return the number of samples of channels with known sigma, in one repeat."""
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
         """Return the residuals of a run by channel in units of sigma, (members, *samples); NaN for missing
-        samples, and where another run failed. `white`: return whitened residuals.
+        samples, and for members with another failed run. `white`: return whitened residuals.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
@@ -347,7 +350,8 @@ class Problem:
         return parts
 
     def kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
-        """Return [J r] of lanes of a run: first of all channels with known sigma, then of each other channel.
+        """Return [J r] of a batch of one run: first for all channels with known sigma, then for each other
+        channel.
         """
         if not self.estimated:
             return [whole]
@@ -357,8 +361,8 @@ class Problem:
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
-    """Return [J r] from [J g r] for pieces of a run that do not join yet. g is the first-order change of r
-    when they are joined.
+    """Return [J r] from [J g r] for pieces of a run with gaps. g is the first-order change of r from closing
+    the gaps.
     """
     if rows.shape[-1] == unknowns + 1:
         return rows
@@ -366,5 +370,5 @@ def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
 
 
 def _with(taus: np.ndarray, k: int, values: np.ndarray) -> np.ndarray:
-    """Return the correlation times with those of one channel changed."""
+    """Return the correlation times with new values for channel `k`."""
     return np.where(np.arange(taus.shape[1]) == k, values[:, None], taus)

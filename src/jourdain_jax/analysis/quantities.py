@@ -1,8 +1,7 @@
-"""Channels that are functions of a `Motion`: traced by every fit, and equal if they compute equal values.
+"""Channels that are functions of a `Motion`: traced once, and equal if they compute equal values.
 
-A function is traced where it is handed over. Captured values become arguments, and the operations are
-compared by value: a new lambda that
-does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.
+Captured values become arguments, and operations are compared by value. A new lambda with the same operations
+is therefore the same channel, compiled once. A function whose globals have changed is a new channel.
 
 Instruments for accelerations and forces: accelerometers on bodies, load cells under contacts.
 
@@ -10,12 +9,12 @@ Instruments for accelerations and forces: accelerometers on bodies, load cells u
 
 Source: D. H. Titterton and J. L. Weston, Strapdown Inertial Navigation Technology, 2nd ed. (2004), section 3.
 
-The stop event that ended a run, at a time that was observed: one measured value more.
+A measured time of the stop event that ended a run:
 
-r = (t_event - value) / sigma        t_event: when the motion stops there; its derivatives are those of `simulate`
+    r = (t_event - value) / sigma        t_event: time at which the motion stops there; as in `simulate`
 
-The events of a scene stop its motion, so that a run has one. It is kept as a channel whose only value is at the last sample of the run: the first one that is
-not before the event.
+A motion stops at its first event, so a run has one. It is stored as a channel with one value, at the last
+sample of the run: the first sample that is not before the event.
 """
 
 from abc import abstractmethod
@@ -47,10 +46,10 @@ OverTimes = Float[Array, "times 3"]
 
 
 class Channel(eqx.Module):
-    """A function of a motion as it was when it was given."""
+    """A function of a motion, as it was when traced."""
 
-    operations: Call = static()  # on what it closes over and the numbers of a motion
-    held: tuple[Array, ...]  # what it closes over
+    operations: Call = static()  # functions of captured values and of the numbers of a motion
+    held: tuple[Array, ...]  # captured values
     shape: Shape = static()
 
     def __call__(self, motion: Motion) -> Array:
@@ -59,8 +58,8 @@ class Channel(eqx.Module):
 
 
 def channel(function: Callable, scene: Scene) -> Channel:
-    """Return a channel as a function of a motion of this scene. It is traced again if it is new or if values
-    that it reads have changed.
+    """Return a channel for a function of a motion of this scene. The function is traced again only if it or
+    the values that it reads have changed.
     """
     now = now_read_by(function)
     if now is None:
@@ -83,9 +82,13 @@ def _traced(function: Callable, scene: Scene) -> Channel:
     try:
         closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
     except TypeError as error:
-        advice = "write it with `jax.numpy`, without `if` of numbers of the motion, and return one array of numbers"
-        raise ValueError("a function of `sensors` cannot be called with a motion "
-            f"({str(error).splitlines()[0]}); {advice}") from error
+        advice = (
+            "write it with `jax.numpy`, without `if` on numbers of the motion, and return one array of "
+            "numbers"
+        )
+        raise ValueError(
+            f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}"
+        ) from error
     if not hasattr(shape, "shape"):
         raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of "
             "numbers; return one array")
@@ -101,39 +104,38 @@ def _kind(scene: Scene):
 
 @once_per_class
 def motion_shape(scene: Scene) -> Motion:
-    """Return a motion of this scene with shapes in place of numbers."""
+    """Return the shapes of a motion of this scene."""
     scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), scene)
     q, u = (jax.ShapeDtypeStruct((len(names),), real_type()) for names in (scene.coordinate_names, scene.speed_names))
     return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
 
 
 class Instrument(eqx.Module):
-    """An instrument with three components that depend on the accelerations of a scene."""
+    """An instrument with three components that depend on accelerations of a scene."""
 
     @abstractmethod
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise ValueError, with the names of channel and run, where the scene lacks the measured quantity.
-        """
+        """Raise ValueError, naming channel and run, if the scene lacks the measured quantity."""
 
     @abstractmethod
     def over_times(self, motion: Trajectory) -> OverTimes:
-        """What it shows at all times of one motion."""
+        """Return the readings at all times of one motion."""
 
 
 class Accelerometer(Instrument):
     """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2. At
-    rest it is g upwards.
+    rest it points up and has the magnitude of g.
 
         imu = jj.Sensor(jj.Accelerometer("frame", (0.3, 0.0, 0.1)), bias=jj.Estimate((0.0, 0.0, 0.0)))
         jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2
 
-    - `body`: its name. `point`: where it sits, in m, in the body's frame, from its mass centre.
+    - `body`: name of the body. `point`: position from its mass centre, in the body's frame, m.
     - `gravity`: g in m/s^2, in the inertial frame.
 
-    A channel of shape (times, 3). It uses the scene's accelerations at the states of the motion, not
+    Its channel has shape (times, 3). Accelerations are computed from the equations of motion, not by
     differences.
 
-    **Raises** ValueError for anything but a name, or three components.
+    **Raises** ValueError unless `body` is a name, and `point` and `gravity` have three components.
     """
 
     body: str = static()
@@ -143,17 +145,15 @@ class Accelerometer(Instrument):
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
         check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
-        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice="give three components "
-            "in the body's frame, m")
+        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice=
+            "give three components in the body's frame, m")
         self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise ValueError, with the names of the `channel` and the run (`where`), if the scene has no such
-        body.
-        """
+        """Raise ValueError, naming the `channel` and the run (`where`), if the scene has no such body."""
         bodies = motion_shape(scene).bodies
-        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, "
-            "which is not there")
+        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} is on body `{self.body}`, "
+                                      "which does not exist")
 
     def over_times(self, motion: Trajectory) -> OverTimes:
         """Return the readings at all times of one motion."""
@@ -174,12 +174,13 @@ class LoadCell(Instrument):
 
         jj.Experiment(ts, {"plate": force}, 2.0, start=start, sensors={"plate": jj.LoadCell("front")})                # force: (times, 3), N
 
-    - `contact`: its name.
+    - `contact`: name of the contact.
 
-    A channel of shape (times, 3): two components along the tangents of the ground, then the one along its normal, as `Trajectory.contact_forces` has them.
+    Its channel has shape (times, 3): two components along the tangents of the ground, then one along its
+    normal, as in `Trajectory.contact_forces`.
 
-    **Raises** ValueError for anything but a name; with a scene, for a contact that is not there, or whose
-    force the rows do not determine.
+    **Raises** ValueError unless `contact` is a name; with a scene, if the contact does not exist or the
+    constraints do not determine its force.
     """
 
     contact: str = static()
@@ -189,12 +190,12 @@ class LoadCell(Instrument):
         self.contact = contact
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise ValueError, with the names of the `channel` and the run (`where`), if the scene has no such
-        contact or its force is not determined.
+        """Raise ValueError, naming the `channel` and the run (`where`), if the scene has no such contact or
+        its force is not determined.
         """
         determined = _determined(scene)
         check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact "
-            f"`{self.contact}`, which is not there")
+                                             f"`{self.contact}`, which does not exist")
         if not determined[self.contact]:
             raise ValueError(
                 f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not "
@@ -209,42 +210,44 @@ class LoadCell(Instrument):
 
 @once_per_values
 def _determined(scene: Scene) -> dict[str, bool]:
-    """Contact -> whether its force is determined at a state of the scene."""
+    """Map each contact to whether its force is determined at a state of the scene."""
     t, q, u = (x[0] for x in sample_states(scene, 1))
     return {name: bool(force.determined) for name, force in contact_forces(scene, t, q, u, accelerations(scene, t, q, u)).items()}
 
 
-LATEST = 4.0  # times the observed time: where a motion meets the event later than that, or another one before, it fails
+LATEST = 4.0  # times the observed time: a motion fails if it reaches the event later, or another event first
 
 
 class StopEvent(eqx.Module):
-    """An event of a scene, by name, whose time was measured."""
+    """A stop event of a scene, by name, whose time was measured."""
 
     name: str = static()
 
     @staticmethod
     def of(scene: Scene, name: str, where: str) -> "StopEvent":
-        """ValueError where the scene has no such event."""
+        """Return the event called `name`. Raises ValueError if the scene has no such event."""
         if name not in (names := names_of_events(scene)):
             has = nearest(name, names) if names else "it has no stop events."
             raise ValueError(f"`events` of {where} names `{name}`, which is not an event of the scene; {has}")
         return StopEvent(name)
 
     def time(self, motion: Callable, t0, span) -> Scalar:
-        """Return the time at which the motion stops at the event, NaN if it does not. `motion`: simulated
-        with its events; `span`: from the start to the observed time.
+        """Return the time at which the motion stops at the event, NaN if it does not. `motion` simulates with
+        events; `span`: from the start to the observed time.
         """
         found = motion((t0 + LATEST * span)[None])
         return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)
 
 
 def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
-    """Return times, values and sigmas of a run up to its event, whose time is one more channel (a vector for
-    repeats). Raises ValueError for impossible times.
+    """Return times, values and sigmas of a run up to its event, whose time becomes another channel (a vector
+    for repeats). Raises ValueError for impossible times.
     """
     if len(events) > 1:
-        raise ValueError(f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at "
-            "the first of its events; give that one")
+        raise ValueError(
+            f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at its first "
+            "event; give only that one"
+        )
     ((name, given),) = events.items()
     if name in values:
         raise ValueError(f"`{name}` is both a channel and an event; give the channel another name, with a "
@@ -261,7 +264,8 @@ def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
     after = ts[kept] > at[..., None]
 
     def until(x):
-        if x.ndim <= axis or x.shape[axis] != len(ts):  # of another shape: that is said once the scene is known
+        # wrong shapes are reported later, by a check with the scene
+        if x.ndim <= axis or x.shape[axis] != len(ts):
             return x
         part = x[:, kept] if axis else x[kept]
         return array_module(x).where(after.reshape(after.shape + (1,) * (x.ndim - after.ndim)), np.nan, part)

@@ -1,4 +1,4 @@
-"""The kind of system, in one table: freedoms, constraints, rank, integrability, growth, cyclic and ignorable
+"""A report on the kind of system: freedoms, constraints, rank, integrability, growth, cyclic and ignorable
 coordinates.
 """
 
@@ -28,15 +28,14 @@ AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", 
 
 @dataclass(frozen=True, repr=False)
 class Report(Printed):
-    """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)`
-    shows a table.
+    """Facts about a scene, found at random and symmetric states of its domain; `print(report)` shows a table.
 
-    Integrability of rows, one by one and taken together: eqs. (5)-(9) and Frobenius' theorem. Privileged
+    Integrability of constraints, singly and together: eqs. (5)-(9) and Frobenius' theorem. Privileged
     velocities: (25)-(31). Cyclic coordinates: (42).
 
-    A cyclic coordinate is one whose rate is not privileged and on which no equation depends. An ignorable
-    coordinate is one on which no acceleration depends; in a system without rows this includes every
-    coordinate that the Lagrangian does not contain.
+    The rate of a cyclic coordinate is not privileged, and no equation depends on the coordinate. No
+    acceleration depends on an ignorable coordinate; without constraints, every coordinate that is absent from
+    the Lagrangian is ignorable.
     """
 
     scene: str
@@ -44,35 +43,35 @@ class Report(Printed):
     speeds: Labels
     degrees_of_freedom: int
     rows: Labels
-    rank: int  # of the rows at generic states
-    redundant_rows: Labels  # may be omitted together; the others keep the rank at every probed state
-    integrable_rows: Labels  # holonomic by themselves
-    nonholonomic_rows: Labels  # by themselves
+    rank: int  # of the constraints at generic states
+    # constraints that may be omitted together without loss of rank at any probed state
+    redundant_rows: Labels
+    integrable_rows: Labels  # each holonomic by itself
+    nonholonomic_rows: Labels  # each nonholonomic by itself
     frobenius_violations: dict[str, float]  # relative
-    growth_vector: tuple[int, ...]  # empty for rows nonlinear in the speeds
-    closed: bool  # further brackets bring nothing new
+    growth_vector: tuple[int, ...]  # empty for constraints nonlinear in the speeds
+    closed: bool  # whether further brackets add nothing
     bracket_depth: int
     holonomic_rows_together: int | None  # None where the growth vector is not closed
-    rheonomic: bool  # anything depends on time by itself
-    depends_on_time: Labels  # what: rows, poses, inertias, coordinate rates, loads, potential
-    affine: bool  # rows are linear or affine in the speeds
-    cyclic_coordinates: Labels  # of dependent rates; they appear in no equation
+    rheonomic: bool  # whether anything depends explicitly on time
+    depends_on_time: Labels  # which of: rows, poses, inertias, coordinate rates, loads, potential
+    affine: bool  # whether constraints are linear or affine in the speeds
+    cyclic_coordinates: Labels  # their rates are dependent, and no equation contains them
     ignorable_coordinates: Labels  # no privileged acceleration depends on them
     privileged_velocities: Labels
     privileged_by_user: bool
-    lowering: str  # operations of the scalar program, and whether and how it is integrated, or why there is none
+    lowering: str  # number of operations of the scalar program and how it is integrated, or why there is none
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
-    rank_losses: Labels  # probed configurations where the rows lose rank
-    rank_at_start: int | None  # at the given start, or at the scene's example where that has another rank; None otherwise
+    rank_losses: Labels  # probed configurations at which the constraints lose rank
+    # at the given start, or at the scene's example if its rank differs; otherwise None
+    rank_at_start: int | None
     events: Labels  # names
-    domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
+    domain: dict[str, tuple[float, float]]  # of the probed states, as declared by the scene
     conventions: str
 
     def as_dict(self) -> dict:
-        """Return the report as a dictionary for programs: the fields by name, with None for values that are
-        not finite.
-        """
+        """Return the fields by name, as plain data; None replaces values that are not finite."""
         facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         facts["domain"] = {name: list(bounds) for name, bounds in self.domain.items()}
         facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
@@ -153,10 +152,13 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[s
     """Report freedoms, constraints, rank, redundancy, integrability, growth vector, cyclic and ignorable
     coordinates of a scene.
 
-    `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
-    compared with that at generic states (default: the scene's example, where some configurations lose rank). `print(report(scene))` shows a table;
-    `as_dict()` is for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
-    angles): a property of all of them counts as general. A DifferentiationModeError where numbers are traced.
+    `depth` is the largest number of fields in a bracket of the growth vector. `start`: a state, or named
+    values as for `jj.start`, at which the rank is compared with generic states (default: the scene's example,
+    if some configurations lose rank). `print(report(scene))` shows a table; `as_dict()` returns plain data.
+
+    All properties are found numerically, at random states of the scene's `domain` and at symmetric
+    configurations (zero and right angles); a property of all of them counts as general. Raises
+    DifferentiationModeError for traced numbers.
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)
@@ -180,7 +182,7 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[s
         growth_vector=growth,
         closed=closed,
         bracket_depth=depth,
-        # relations that the coordinate rates contain by themselves are no rows
+        # relations that are built into the coordinate rates are not constraints
         holonomic_rows_together=min(reachable(scene) - growth[-1], structure.rank) if closed else None,
         depends_on_time=structure.timed,
         cyclic_coordinates=cyclic_coordinates(scene),

@@ -1,29 +1,29 @@
 """Resumed fits: at the minimum, along a profile, and for other runs.
 
-Predictions of a fit for other runs.
+Predictions for other runs.
 
-error = prediction - value,    rms^2 = mean error^2,    R^2 = 1 - sum error^2 / sum (value - mean)^2         over the samples of a channel that are not missing
+error = prediction - value, rms^2 = mean error^2, R^2 = 1 - sum error^2 / sum (value - mean)^2 over all
+available samples of a channel
 
-All that runs share is held at its estimate. Unknowns of a run (start values, numbers of its sensors) are
-fitted to the run itself.
+Shared unknowns are held at their estimates. Unknowns of a run (start values, numbers of its sensors) are
+fitted to that run.
 
-Which samples inform which unknown: of each, the share of what the data tell of it.
+The share of each sample in the information on an unknown.
 
     estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i       C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted
     share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k          w_k: weight of sample k, one over the square of its sigma
 
-It allows for all other unknowns being estimated, too. The shares of all samples add up to one; a prior takes what is missing.
+Shares account for the estimation of all other unknowns. Those of all samples and priors add up to one.
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
 
-How far an unknown may be moved before the data object, all others being fitted again: profile likelihood.
+Profile likelihood: the objective as a function of one unknown, minimised over all others.
 
-    rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, which is held at x; inflation: as of the covariance, for the loss and for sigmas
-    interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom              that are estimated
+    rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, held at x; inflation: as in the covariance, for the loss and for
+    interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom              estimated sigmas
 
-bounded: both ends are found; one-sided: one of them; flat: none, the data do not determine the unknown. From
-the estimate outwards, each point begins where the
-one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25
-(2009) 1923.
+bounded: both ends exist; one-sided: one of them; flat: none, the data do not determine the unknown. Each
+point starts from the solution of its inner neighbour. Correlation times are held. Source: D. J. Venzon and S.
+H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25 (2009) 1923.
 """
 
 from collections.abc import Iterable, Sequence
@@ -47,19 +47,22 @@ from jourdain_jax.scene.printing import Printed
 
 
 def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
-    """Return a `Fit` of one experiment to continue from, with residuals and derivatives computed again.
-    Raises ValueError if `data` are not those of the fit.
+    """Return the problem and minimum of a `Fit` of one experiment, with residuals and derivatives computed
+    again. Raises ValueError if `data` differ from the data of the fit.
     """
     problem = for_runs(fit, data, fit.asked, fit.shooting is not None)
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
-        raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: "
-            f"{', '.join(fit.labels)}")
+        raise ValueError(
+            f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: "
+            f"{', '.join(fit.labels)}"
+        )
     theta[0, unknowns.estimated] = fit.values
     if isinstance(problem, Piecewise) and fit.shooting is not None:
         problem.put_nodes(theta, fit.shooting)
     at = problem.linearised(theta, np.array([0]))
-    sigma = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
+    # as in F; the fit's own sigmas account for its unknowns
+    sigma = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
     for run, residuals in enumerate(fit.residuals):
         again = problem.by_channel(run, at)
         for name, r in residuals.items():
@@ -72,7 +75,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
 
 def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
     """Return the problem of a `Fit` for these runs. Raises ValueError if they do not match the scene.
-    `apart`: separate unknowns of runs from shared ones.
+    `apart`: keep unknowns of runs separate from shared ones.
     """
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
@@ -87,7 +90,7 @@ Samples = Float[np.ndarray, "times *channel"]
 
 @dataclass(frozen=True, repr=False)
 class Prediction(Printed):
-    """A channel of a run as a fit predicts it, in the unit of the channel."""
+    """Measured and predicted values of a channel of a run, in its unit."""
 
     ts: Float[np.ndarray, "times"]  # s
     values: Samples  # measured; NaN where missing
@@ -96,18 +99,18 @@ class Prediction(Printed):
 
     @property
     def error(self) -> Samples:
-        """Prediction less value, in the unit of the channel."""
+        """Return prediction minus value, in the unit of the channel."""
         return self.prediction - self.values
 
     @property
     def rms(self) -> float:
-        """Root mean square of the error, in the unit of the channel."""
+        """Return the root mean square error, in the unit of the channel."""
         return float(np.sqrt(np.nanmean(self.error**2)))
 
     @property
     def r_squared(self) -> float:
-        """Return 1 - sum error^2 / sum (value - mean)^2, each component of the channel about its own mean;
-        NaN where the values do not vary.
+        """Return 1 - sum error^2 / sum (value - mean)^2, with the mean of each component of the channel; NaN
+        for constant values.
         """
         values = np.where(np.isfinite(self.error), self.values, np.nan)
         spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2)
@@ -119,12 +122,12 @@ class Prediction(Printed):
 
 
 def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
-    """Predictions of the runs that a `Fit` was fitted to."""
+    """Return predictions for the runs of a `Fit`."""
     return tuple(_by_channel(fit, run, residuals) for run, residuals in zip(runs, fit.residuals, strict=True))
 
 
 def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
-    """Return predictions of other runs. Raises ValueError if they do not match the scene, or share unknowns
+    """Return predictions for other runs. Raises ValueError if they do not match the scene, or share unknowns
     that the fit did not estimate.
     """
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
@@ -140,7 +143,7 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     if not np.isfinite(at.cost[0]):
         raise ValueError("a motion of the held-out runs fails at the estimates; examine it with `simulate`")
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
-    # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
+    # residuals are in units of sigmas, of which the unknown ones were estimated from these runs
     ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
     residuals = [{name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()} for k in range(len(runs))]
     return tuple(_by_channel(fit, run, r) for run, r in zip(runs, residuals, strict=True))
@@ -157,44 +160,46 @@ def _by_channel(fit: Estimates, data: Experiment, residuals: dict[str, np.ndarra
 
 @dataclass(frozen=True)
 class Informed:
-    """Shares of the samples for some unknowns."""
+    """The shares of all samples in the information on some unknowns."""
 
     labels: Labels
-    of_samples: tuple[dict[str, Float[np.ndarray, "unknowns times"]], ...]  # of each run, by channel: all components of the channel together
+    # of each run, by channel, summed over its components
+    of_samples: tuple[dict[str, Float[np.ndarray, "unknowns times"]], ...]
     times: tuple[Float[np.ndarray, "times"], ...]  # s
 
     @property
     def of_runs(self) -> Float[np.ndarray, "unknowns runs"]:
-        """Share of each run."""
+        """Return the share of each run."""
         return np.stack([sum(share.sum(axis=1) for share in run.values()) for run in self.of_samples], axis=1)
 
     @property
     def of_channels(self) -> dict[str, Float[np.ndarray, "unknowns"]]:
-        """Share of each channel in all runs."""
+        """Return the share of each channel in all runs."""
         names = dict.fromkeys(name for run in self.of_samples for name in run)
         return {name: sum(run[name].sum(axis=1) for run in self.of_samples if name in run) for name in names}
 
     @property
     def of_priors(self) -> Float[np.ndarray, "unknowns"]:
-        """Return the information of priors, without the data."""
+        """Return the share of priors."""
         return 1 - self.of_runs.sum(axis=1)
 
     def half(self, unknown: int) -> tuple[int, float, float]:
         """Return the run with most information on an unknown, and the shortest time span (first and last
-        sample) that holds half of this run's information.
+        sample) with half of this information.
         """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
         total = np.concatenate([[0.0], np.cumsum(told)])
-        last = np.searchsorted(total, total[:-1] + 0.5 * total[-1] * (1 - 1e-9))  # span from each sample on, up to and with sample last - 1
+        # end index of the span that begins at each sample
+        last = np.searchsorted(total, total[:-1] + 0.5 * total[-1] * (1 - 1e-9))
         begins = np.flatnonzero(last < len(total))
         best = begins[np.argmin(ts[last[begins] - 1] - ts[begins])]
         return run, float(ts[best]), float(ts[last[best] - 1])
 
 
 def informed(problem: Problem, found: Minimum, most: int) -> Informed:
-    """Return the shares of information for the first `most` unknowns that have a standard error. They follow
-    from the sigmas alone, without factors for the loss or for estimated sigmas.
+    """Return the shares of information on the first `most` unknowns that have a standard error. They depend
+    on sigmas alone, not on factors for the loss or for estimated sigmas.
     """
     unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
     known = information(at.arrow, unknowns.sizes(theta), unknowns.estimated, unknowns.reached(theta), ~found.going, problem.asked.control.cutoff).only()
@@ -219,18 +224,18 @@ def informed(problem: Problem, found: Minimum, most: int) -> Informed:
 
 @dataclass(frozen=True, repr=False)
 class Profile(Printed):
-    """The rise of the sum of squares along one unknown, and the resulting 95 % interval."""
+    """The rise of the objective along one unknown, and the resulting 95 % interval."""
 
     name: str
     unit: str
     estimate: float
-    values: Float[np.ndarray, "points"]  # increasing, the estimate among them
+    values: Float[np.ndarray, "points"]  # increasing, with the estimate among them
     rise: Float[np.ndarray, "points"]  # zero at the estimate
-    low: float  # ends of the interval; where the data set none, the bound, or infinite
+    low: float  # end of the interval; without an end from the data, the bound or infinity
     high: float
-    is_closed: tuple[bool, bool]  # whether the data set them
+    is_closed: tuple[bool, bool]  # whether the data determine each end
     kind: str  # "bounded", "one-sided" or "flat"
-    notes: Labels  # what else was seen
+    notes: Labels  # other observations
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -241,7 +246,7 @@ class Profile(Printed):
 
 def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
     """Return profiles of the named unknowns. `errors`: standard errors by name, for the first step;
-    `inflation`: the number by which the rise is divided.
+    `inflation`: divisor of the rise.
     """
     unknowns, found = problem.unknowns, {}
     for name in names:

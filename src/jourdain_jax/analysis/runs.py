@@ -1,12 +1,12 @@
 """Runs prepared for a fit: weighted measurements, motions and residuals, grouped by structure and padded to
 one length.
 
-r = (reading - value) / sigma, zero where a sample is missing
+    r = (reading - value) / sigma, zero where a sample is missing
 
-Predictions of a scene for many runs minus their measurements, with derivatives, in one compiled program.
-
-A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
-compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
+Residuals of many runs with derivatives, in one compiled program. Each entry of a batch (`lane` in the code)
+is one run of one member; a member is a repeat of the experiment or a first guess. Runs of equal structure
+share a program, compiled once, and batches have a fixed size, so that memory does not grow with the number of
+runs. Short runs are padded to the length of the longest.
 """
 
 import math
@@ -40,18 +40,19 @@ from jourdain_jax.scene.scene import Scene, state_names
 
 
 class Run(NamedTuple):
-    """A prepared run: its measurements with weights 1 / sigma, zero where a sample is missing."""
+    """A prepared run: measurements with weights 1 / sigma, zero where a sample is missing."""
 
     t0: Float[Entries, ""]
     ts: Times
-    grid: Float[Entries, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is computed there
+    # s, equal intervals; times of the motion if sensors have delays or lags
+    grid: Float[Entries, "grid"] | None
     values: dict[str, Numbers]
     weights: dict[str, Numbers]
     start: dict[str, Numbers]
     inputs: dict | Inputs | None
     sensors: dict[str, Reading]
     drives: dict[str, Drive]
-    correlation_time: dict[str, Float[Entries, ""]]  # s, of channels whose noise has a memory
+    correlation_time: dict[str, Float[Entries, ""]]  # s, of channels with correlated noise
 
     def motion(self, scene: Scene, simulate: Callable, ts, options: AllOptions) -> Trajectory:
         """Return the motion at these times."""
@@ -59,11 +60,11 @@ class Run(NamedTuple):
         for drive in self.drives.values():
             inputs = drive.put_into(inputs)
         if options.backend == "auto" and any(drive.unknown for drive in self.drives.values()):
-            options = replace(options, backend="xla")  # which differentiates with respect to samples
+            options = replace(options, backend="xla")  # this backend differentiates with respect to samples
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
-        """Return `(reading - value) / sigma` by channel, and for a piece of a run also its end state."""
+        """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
@@ -82,14 +83,14 @@ class Run(NamedTuple):
         return found | ended(motion, filters, self.start, ts)
 
     def stops(self, event: StopEvent, name: str, motion: Callable) -> Scalar:
-        """Return the time at which the motion stops at the event of the channel `name`; samples may end long
+        """Return the time at which the motion stops at the event of the channel `name`. Samples may end long
         before it.
         """
         observed = jnp.max(jnp.where(self.weights[name] > 0, self.values[name] - self.t0, 0.0))
         return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))
 
     def at(self, layout: Layout, shared, local) -> "Run":
-        """Return the run with these unknowns."""
+        """Return the run with these values of the unknowns."""
         changed = layout.start(self.start, shared, local)
         if not layout.numbers:
             return self._replace(start=changed)
@@ -98,8 +99,8 @@ class Run(NamedTuple):
 
 
 def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
-    """Return a run with weights. `xp`: NumPy, or `jax.numpy` for traced numbers; `repeats`: values have a
-    leading axis.
+    """Return the run with its weights. `xp`: NumPy, or `jax.numpy` for traced numbers; `repeats`: values have
+    a leading axis.
     """
     weights = {}
     for name, values in data.values.items():
@@ -111,14 +112,16 @@ def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
 
 
 def on_equal_grids(runs: Sequence[Run]) -> list[Run]:
-    """Return the runs on grids of as many intervals as the longest needs."""
+    """Return the runs on grids with the number of intervals that the longest run needs."""
     nodes = [run.start.get(LAST) for run in runs]
     count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
     return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
 
 
 def equal_runs(data: Sequence[Experiment]) -> list[tuple[Indices, Run]]:
-    """Stack runs of equal structure and shapes. Return them with their indices; numbers may be traced."""
+    """Stack runs of equal structure and shapes, and return each stack with the indices of its runs. Numbers
+    may be traced.
+    """
     groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in grouped(data):
         for i in indices:
@@ -141,7 +144,7 @@ def grouped(data: Sequence[Experiment]) -> list[list[int]]:
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
         parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time
-        signals = jax.tree.map(lambda x: None if _is_sampled(x) else x, parts[2:4], is_leaf=_is_sampled)  # without knots
+        signals = jax.tree.map(lambda x: None if _is_sampled(x) else x, parts[2:4], is_leaf=_is_sampled)  # without samples
         arrays, rest = eqx.partition((*parts[:2], signals), is_array)
         kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
@@ -162,8 +165,8 @@ def most_knots(runs: Sequence[Run]) -> list[int]:
 
 
 def filled_up(run: Run, times: int, knots: list[int]) -> Run:
-    """Pad a run to the numbers `times` and `knots`, with an axis of members. Padded entries lie shortly after
-    the end of the run, and do not count.
+    """Pad a run to `times` samples, and its sampled inputs to `knots` samples, with an axis of members.
+    Padding follows shortly after the end of the run and does not count.
     """
     more = times - run.ts.shape[0]
     counts = iter(knots)
@@ -184,16 +187,17 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     return _of_members(run._replace(ts=ts), lambda x: np.pad(x, [(0, 0), (0, more), *[(0, 0)] * (x.ndim - 2)]))
 
 
-Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those requested), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
-_BY_MEMBER = ("values", "weights")  # of a run, which differ by member
+# members (of the requested), runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
+Some = tuple[np.ndarray, np.ndarray, np.ndarray]
+_BY_MEMBER = ("values", "weights")  # fields of a run that differ by member
 
 
 class Group:
     """Runs of equal structure, padded to one length. A lane is one run (by its number in the problem) of one
     member.
 
-    `members`: the number of repeats of the experiment, the leading axis of the values; None: there are no
-    repeats, and all members share the values.
+    `members`: the number of repeats of the experiment, the leading axis of the values; None: all members
+    share the values.
     """
 
     def __init__(self, scene: Scene, data: Sequence[Experiment], indices: list[int], layout: Layout, options: AllOptions, members: int | None):
@@ -214,7 +218,7 @@ class Group:
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
         unknown = [self.channels.get(name, slice(0)) for name in sorted({name for run in data for name in run.unknown_correlation})]
         self._chains = Chains.of(self.weights, self._ts, taus, self.channels, unknown) if taus else None
-        # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
+        # one row of numbers per run: an array argument costs as much as some steps of a motion
         self._common = _rows((scene, options), (1, 1))[0]
         of_members = [self._count if name in _BY_MEMBER else 1 for name in Run._fields]
         self._rows = np.stack([_rows(run, of_members) for run in filled])
@@ -223,15 +227,16 @@ class Group:
         self._run = _program(Reference(scene, layout.parameters), treedef, shapes, layout)
         saved = times if first.grid is None else first.grid.shape[0]
         states = saved * len(state_names(scene)) * 8 * (1 + sum(layout.sizes))
-        # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
+        # bytes of saved states with tangents in one loop: far below the size that XLA compiles into one
+        # function (see `jourdain_jax`)
         self._width, self._fewest = int(min(64, max(1, 2**18 // states))), 1
 
     def places(self, runs: np.ndarray) -> np.ndarray:
-        """Return the places of these runs in the group."""
+        """Return the positions of these runs in the group."""
         return np.searchsorted(self.runs, runs)
 
     def evaluate(self, shared, local, members) -> Iterator[Some]:
-        """Yield [J r] of all lanes, some at a time."""
+        """Yield [J r] of all lanes, batch by batch."""
         first, *chunks = self._chunks(len(members))
 
         def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
@@ -239,7 +244,7 @@ class Group:
             found = self._run(self._common, np.concatenate([rows, local[b, self.runs[j]], shared[b]], axis=1))
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
-        yield lanes(*first)  # compiles, where that is needed
+        yield lanes(*first)  # compiles if necessary
         if not chunks:
             return
         with ThreadPoolExecutor() as pool:
@@ -247,11 +252,11 @@ class Group:
                 yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield the number of lanes of a chunk, with the indices of their members and runs, padded with
-        copies of the last.
+        """Return, for each batch, the number of lanes that count and the indices of their members and runs.
+        The last batch is padded with copies of its last lane.
         """
         count = members * len(self.runs)
-        # of many lanes those that are left last run eight at a time: these cost less than another program for fewer
+        # remaining lanes run eight at a time, which costs less than another program for fewer
         width, self._fewest = self._width, max(self._fewest, min(count, 8))
         while width >= 2 * max(count, self._fewest):
             width = -(-width // 2)
@@ -265,15 +270,14 @@ class Group:
         rows: Float[np.ndarray, "lanes samples width"],
         taus: np.ndarray,
     ) -> np.ndarray:
-        """Return rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s.
-        """
+        """Return whitened rows. `taus`: estimated correlation times, (lanes, channels), s."""
         if self._chains is None:
             return rows
         before, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
     def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: np.ndarray) -> Float[np.ndarray, "lanes"]:
-        """`sum log sqrt(1 - rho^2)` of lanes."""
+        """Return `sum log sqrt(1 - rho^2)` of each lane."""
         if self._chains is None:
             return np.zeros(len(runs))
         _, rho = self._chains.at(self.places(runs), members % self._count, taus)
@@ -287,8 +291,8 @@ class Group:
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
     def by_channel(self, run: int, flat: Float[np.ndarray, "members samples"]) -> dict[str, np.ndarray]:
-        """Return weighted residuals of a run by channel, NaN for missing samples. If `flat` is empty, nothing
-        was computed, and all are NaN.
+        """Return weighted residuals of a run by channel, NaN for missing samples. If `flat` is empty, all are
+        NaN.
         """
         place, found = int(np.searchsorted(self.runs, run)), {}
         for name, where in self.channels.items():
@@ -300,13 +304,13 @@ class Group:
 
 
 def _of_members(run: Run, of: Callable) -> Run:
-    """Return the run with the values that differ by member."""
+    """Return the run with `of` applied to the fields that differ by member."""
     return run._replace(**{name: {channel: of(x) for channel, x in getattr(run, name).items()} for name in _BY_MEMBER})
 
 
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
-    """Return all numbers of some trees in the order of `ravel_pytree`, one row for each member. A tree
-    without an axis of members appears in every row.
+    """Return all numbers of some trees in the order of `ravel_pytree`, one row per member. A tree without an
+    axis of members is repeated in every row.
     """
     parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
     return np.hstack([np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)])
@@ -314,11 +318,11 @@ def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
-    """Compile [J r] of lanes, shape (lanes, samples, local + shared + 1), from the shared numbers and one row
-    of runs and unknowns for each lane.
+    """Compile [J r], shape (lanes, samples, local + shared + 1), as a function of the shared numbers and one
+    row of run numbers and unknowns per lane.
 
-    `reference`: that of the scene; `treedef`, `leaves`: structure of scene, options and run, with shapes in
-    place of arrays.
+    `reference`: the scene's; `treedef`, `leaves`: structure of scene, options and run, with shapes in place
+    of arrays.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
     zeros = [np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype)) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]
@@ -337,7 +341,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    # XLA's newer emitters compile it in twice the time, for a program that is not a faster; from jaxlib
-    # 0.11.1 on there are no others
+    # XLA's newer emitters take twice the time to compile, for a program that is no faster; jaxlib 0.11.1 and
+    # later have no others
     older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
     return jax.jit(jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)

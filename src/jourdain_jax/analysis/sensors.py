@@ -1,25 +1,22 @@
 """Sensors and actuators: models between a motion and its measurements, and between a command and the scene.
 
     sensor      reading(t) = gain y(t - delay) + bias,      lag y' + y = x,      y(t0) = x(t0)      x: a quantity of the motion
-    actuator    input(t) = gain y(t - delay) + bias         the same, of a command; y is its first value until then
+    actuator    input(t) = gain y(t - delay) + bias         the same for a command; y is its first value at all earlier times
 
-Each number is known, or a `jj.Estimate`. Source: L. Ljung, System Identification, 2nd ed. (1999), sections 4.2 and 4.4.
+Each number is known, or a `jj.Estimate`. Source: L. Ljung, System Identification, 2nd ed. (1999), sections
+4.2 and 4.4.
 
-Equal intervals of time, where the motion is computed that late sensors read between.
-
-The reading of a sensor for a quantity known at equal intervals of time: late by a delay, and through a
-first-order low-pass.
-
-    reading(t) = y(t - delay),      lag y' + y = x,      y(t0) = x(t0):      the filter starts at rest
-
-Between the times of the grid, x is the polynomial of degree 5 through the six nearest of them. With intervals h and a motion of angular frequency w its error
-is 0.005 (w h)^6 of the amplitude, in the first and the last two intervals 0.02 (w h)^6. Near a jump J of the slope it is up to 0.18 J h, at the ends 0.26 J h;
-near a jump J of the second derivative 0.032 J h^2, at the ends 0.075 J h^2. The filter acts on that polynomial exactly. With rho = lag / h:
+With a delay or lag, the motion is computed at equal intervals h. Between these times, x is the polynomial of
+degree 5 through the six nearest points. Its error for an angular frequency w is 0.005 (w h)^6 of the
+amplitude, or 0.02 (w h)^6 in the first and last two intervals. Near a jump J of the slope it is up to 0.18 J
+h, at the ends 0.26 J h; near a jump J of the second derivative up to 0.032 J h^2, at the ends 0.075 J h^2.
+The filter is exact for that polynomial. With rho = lag / h:
 
     small rho     y = P + (y_k - P_k) exp(-s / rho),   P = sum_j (-rho)^j p^(j)       (P solves the equation; s: intervals since time k)
-    large rho     y = y_k exp(-s / rho) + integral_0^s exp(-(s - a) / rho) p(a) da / rho       by Gauss-Legendre quadrature: P would lose digits
+    large rho     y = y_k exp(-s / rho) + integral_0^s exp(-(s - a) / rho) p(a) da / rho       by Gauss-Legendre quadrature
 
-Both are smooth in delay and lag, at a lag of zero as well. Source: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions (1964), 25.2 and 25.4.
+Both are smooth in delay and lag, even at a lag of zero. Source: M. Abramowitz and I. A. Stegun, Handbook of
+Mathematical Functions (1964), 25.2 and 25.4.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,10 +45,10 @@ Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
 def intervals(t0, ts: Times, node) -> int:
     """Return the number of equal intervals from the start to the last sample. Equally spaced samples keep
-    their own intervals; otherwise no interval is longer than the median interval of the samples.
+    their intervals; otherwise no interval is longer than the median interval of the samples.
 
-    For traced times only the number of samples is known; there are then two intervals for each sample. For a
-    piece of a run, intervals are counted up to the next `node`, after which the grid continues.
+    If times are traced, only the number of samples is known, and there are two intervals per sample. For a
+    piece of a run, intervals are counted to the next `node`, after which the grid continues.
     """
     if is_traced((t0, ts)):
         return max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
@@ -63,20 +60,21 @@ def intervals(t0, ts: Times, node) -> int:
 
 
 def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
-    """Return the grid of `count` intervals up to the last sample. For a piece it extends by at most one more
-    interval, so that the next `node` is one of its times.
+    """Return the grid of `count` intervals to the last sample. For a piece it extends by at most one more
+    interval, so that the next `node` is a grid time.
     """
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
     xp = array_module((t0, end))
     found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, real_type())
-    return xp.where(xp.arange(count + 1) == until, end, found)  # this one without round-off
+    return xp.where(xp.arange(count + 1) == until, end, found)  # without round-off at this time
 
 
 POINTS = 6  # of the grid, that a polynomial goes through
 _MIDDLE = (POINTS - 1) / 2
-_COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE))  # of powers of the distance from the middle, the highest first, from values
-_LEAST = 1e-3  # of rho, in exp(-s / rho)
+# values -> coefficients, highest power first
+_COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE))
+_LEAST = 1e-3  # lower limit of rho in exp(-s / rho)
 
 
 def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,11 +94,11 @@ def read(
     lag=None,
     begin: Float[Array, "entries"] | None = None,
 ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"]]:
-    """Return the reading at `ts`, and y on the grid, of a quantity with these `values` at the times `grid`
-    (s; six or more, equally spaced). `lag`: None for no lag.
+    """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s; six or more,
+    equally spaced), and y on the grid. `lag`: None for no filter.
 
     Times before the grid count as its first time. `delay`, `lag` in s. `begin`: the initial output of the
-    filter; None: it starts at rest.
+    filter; None: its steady value.
     """
     count, step = grid.shape[0], (grid[-1] - grid[0]) / (grid.shape[0] - 1)
     x = jnp.maximum((ts - delay - grid[0]) / step, 0.0)
@@ -129,7 +127,7 @@ def read(
 
 
 def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho) -> Float[Array, "channel"]:
-    """Return the filter's output `since` intervals after the place `begin`, where it was `y`."""
+    """Return the filter's output `since` intervals after the time `begin`, at which it was `y`."""
     small = rho < 0.2
     quick, slow = jnp.where(small, rho, 0.1), jnp.where(small, 1.0, rho)
     # P = p - rho p' + rho^2 p'' - ...
@@ -147,8 +145,8 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
 
 
 def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
-    """Return the knots of a command that keeps each value until the next one. Each change takes a thousandth
-    of the shortest interval; the middle of the change is at the stated time.
+    """Return times and values of a command that keeps each value until the next sample. Each change takes a
+    thousandth of the shortest interval, with its middle at the stated time.
     """
     half = 0.5e-3 * jnp.min(jnp.diff(ts))
     late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
@@ -156,14 +154,14 @@ def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Ar
 
 
 def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
-    """Return the exact output of the filter at the knots of a command that is linear between knots, or held
-    until the next knot.
+    """Return the exact output of the filter at the samples of a command that is linear between samples, or
+    held until the next sample.
 
-    y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
+        y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
     """
     steps = jnp.diff(ts)
     decay = jnp.exp(-steps / jnp.maximum(lag, _LEAST * steps))
-    behind = 0 * steps if hold else lag * jnp.diff(values) / steps  # of the filter's output on a slope that lasts
+    behind = 0 * steps if hold else lag * jnp.diff(values) / steps  # lag behind a steady slope
     ends = values[:-1] if hold else values[1:]
 
     def next_one(y, here):
@@ -175,7 +173,7 @@ def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
     return jnp.concatenate([values[:1], found])
 
 
-NUMBERS = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}  # and those of an ideal sensor
+NUMBERS = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}  # names, with the values of an ideal sensor
 UNITS = {"gain": "", "bias": "", "delay": "s", "lag": "s"}
 OF_TIME = ("delay", "lag")
 
@@ -188,25 +186,25 @@ class Sensor(eqx.Module):
     - `quantity`: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one
       instant) such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: the coordinate or
       speed with the channel's name.
-    - `gain`, `bias` (in the unit of the channel): one number, or one for each component of a vector channel.
-    - `delay` in s. Every sample that counts must lie at least the largest delay after `t0`, since the motion
-      before the start is unknown.
-    - `lag` in s: time constant of a first-order low-pass filter that starts at rest, with the quantity's
-      value at `t0`.
+    - `gain`, `bias` (in the unit of the channel): one number, or one per component of a vector channel.
+    - `delay` in s. Every sample that counts must come at least the largest delay after `t0`, since the
+      earlier motion is unknown.
+    - `lag` in s: time constant of a first-order low-pass filter, whose initial output is the quantity at
+      `t0`.
 
     Each number may be an `Estimate`. By default an estimated lag is positive, and gain and bias are
     unbounded; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, a motion (or a piece of it, with `shooting`) is computed at equal intervals, 64 or
-    more and none longer than the median interval of the samples, and interpolated by polynomials of degree 5:
-    for intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude. Where the
-    slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h;
-    where its second derivative jumps by J, up to 0.08 J h^2.
+    With a delay or a lag, the motion (or, with `shooting`, a piece of it) is computed at equal intervals, at
+    least 64 and none longer than the median interval of the samples. It is interpolated by polynomials of
+    degree 5. For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude.
+    Near a jump J of the slope (a speed under a force that steps) the error is up to 0.26 J h; near a jump J
+    of the second derivative, up to 0.08 J h^2.
 
-    Inside `jit`, where times are unknown, each interval between samples is halved: take the first sample at
-    or near `t0`.
+    Under `jit`, where times are unknown, each interval between samples is halved: give a first sample at or
+    near `t0`.
 
-    **Raises** ValueError for numbers that are not finite, and delays or lags below zero.
+    **Raises** ValueError for numbers that are not finite, and for negative delays or lags.
     """
 
     quantity: str | Callable | Instrument | None
@@ -237,18 +235,18 @@ class Actuator(eqx.Module):
 
         inputs={"steer_torque": jj.Actuator(jj.Sampled(ts, command), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=jj.Estimate(0.03))}
 
-    - `command`: `Sampled`; before its first sample it has its first value.
-    - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers, or `Estimate`, as of a
+    - `command`: `Sampled`, with its first value at all earlier times.
+    - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers or `Estimate`, as in
       `Sensor`.
+    - `hold`: whether the command keeps each value until the next sample, as in a digital controller;
+      otherwise it is linear between samples. Holding doubles the number of samples, and a motion takes more
+      steps.
 
-    - `hold`: whether the command keeps each value until the next sample, as that of a digital controller
-      does; otherwise it is linear between samples. Each sample then has two knots, and a motion takes as many
-      more steps.
+    The low-pass filter is exact at the samples of the command and linear in between. A held command therefore
+    needs a lag of at least one interval. The output ends with the last sample.
 
-    The low-pass filter is exact at the samples of the command and linear in between, so that a held command
-    needs a lag of at least one interval. It ends with the last sample.
-
-    **Raises** ValueError for a command of another kind, a `hold` that is neither True nor False, numbers that are not finite, and delays or lags below zero.
+    **Raises** ValueError for a command of another type, a `hold` that is neither True nor False, numbers that
+    are not finite, and negative delays or lags.
     """
 
     command: Sampled
@@ -293,7 +291,7 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
     if name not in OF_TIME:
         return
     if isinstance(value.guess, tuple):
-        raise ValueError(f"{where} is to be estimated from {len(value.guess)} guesses, expected one number")
+        raise ValueError(f"{where} has {len(value.guess)} guesses, expected one number")
     if name == "delay" and (value.range is None or not np.isfinite(value.range.high)):
         raise ValueError(f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, "
             "high)`, in s")
@@ -303,25 +301,25 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
 
 
 def default_range(name: str):
-    """Return the range of an estimated number that states none."""
+    """Return the default range of an estimated number."""
     return positive() if name == "lag" else unbounded()
 
 
 class Response(eqx.Module):
-    """The numbers of a sensor or actuator of one run, with first guesses for estimated ones."""
+    """The numbers of a sensor or actuator of one run, with first guesses for the estimated ones."""
 
     numbers: dict[str, Numbers | float]
-    unknown: Labels = static()  # names of numbers that are estimated
-    used: Labels = static()  # names of numbers that are not those of an ideal sensor
+    unknown: Labels = static()  # names of estimated numbers
+    used: Labels = static()  # names of numbers with an effect
 
     @property
     def is_late(self) -> bool:
-        """Return whether it shows a past value."""
+        """Return whether it has a delay or a lag."""
         return any(name in self.used for name in OF_TIME)
 
     @property
     def has_filter(self) -> bool:
-        """Whether it has a low-pass."""
+        """Return whether it has a low-pass filter."""
         return "lag" in self.used
 
     def scaled(self, x):
@@ -331,21 +329,23 @@ class Response(eqx.Module):
 
 
 class Reading(Response):
-    """A sensor of one run made ready: its quantity looked up."""
+    """A sensor of one run, with its quantity looked up."""
 
     operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
-    name: str = static()  # of that
+    name: str = static()  # of the coordinate, speed or event
 
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
-        """Return the measured quantity along a motion; `states`: the same motion as bodies, for channels that
-        are functions of them."""
+        """Return the measured quantity along a motion. `states`: the motions of bodies, for functions of a
+        `Motion`.
+        """
         if self.operation is None:
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
     def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
-        """Return the reading at `ts` of a quantity whose values at these times, or on a grid, are `x`; and y
-        on the grid. The filter starts from the initial value (None: at rest)."""
+        """Return the reading at `ts` of a quantity with values `x` at these times or on a grid, and y on the
+        grid. `begin`: initial output of the filter (None: its steady value).
+        """
         y = None
         if grid is not None:
             x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
@@ -358,14 +358,14 @@ def ideal(name: str, event: StopEvent | None = None) -> Reading:
 
 
 class Drive(Response):
-    """An actuator of one run made ready."""
+    """An actuator of one run."""
 
     command: Sampled
-    index: int = static()  # of its input
+    index: int = static()  # of the input
     hold: bool = static()
 
     def signal(self) -> Sampled:
-        """Return the input of the scene."""
+        """Return the scene's input."""
         ts, values = jnp.asarray(self.command.ts), jnp.asarray(self.command.values)
         if self.has_filter:
             values = filtered(ts, values, self.numbers["lag"], self.hold)
@@ -374,7 +374,7 @@ class Drive(Response):
         return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values)))
 
     def put_into(self, inputs) -> Inputs:
-        """Return the inputs with its signal."""
+        """Return `inputs` with this signal."""
         return eqx.tree_at(lambda i: i.channels[self.index], inputs, self.signal())
 
 
@@ -396,5 +396,5 @@ def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Arr
 
 
 def latest(delay: Array | Estimate) -> float:
-    """Return the largest delay that a sensor may have, s."""
+    """Return the largest possible delay of a sensor, s."""
     return float(delay.range.high if isinstance(delay, Estimate) else delay)

@@ -1,20 +1,19 @@
-"""Multiple shooting: the division of a run into pieces with their own starts, joined by continuity.
+"""Multiple shooting: runs are divided into pieces with their own starts, joined by continuity.
 
     piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
-    continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
+    continuity                              x(t_i+1; s_i, theta) = s_i+1                            an equation, not a residual
 
-Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it
-may show, and for it the piece continues beyond
-t_i+1. The output of a sensor's low-pass is part of s.
+With delayed sensors, pieces overlap: a sample belongs to the piece that contains its earliest possible time,
+and that piece extends beyond t_i+1. The output of a sensor's low-pass filter is part of s.
 
-Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
-Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
+Over a short piece a motion depends almost linearly on its unknowns, even if the whole run is chaotic. Source:
+H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder,
+GAMM-Mitteilungen 30 (2007) 376.
 
-Nodes between the pieces of a run: whole states, which the motion of a piece begins from and ends at.
+Nodes are the states s = (q, u, y) between pieces: coordinates, speeds, and filter outputs y.
 
-A node is all coordinates, all speeds, and what the low-pass of each sensor with a lag gives, s = (q, u, y). A piece begins at the nearest state on the
-constraints, and continuity is asked of all numbers of s: it fixes what the constraints leave out, so that no chart of the constraint manifold has to be chosen,
-and none can be singular.
+A piece begins at the nearest state on the constraints, and continuity holds for all numbers of s. It thus
+needs no chart of the constraint manifold, which could be singular.
 """
 
 import math
@@ -35,12 +34,12 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
 Ends = Int[np.ndarray, "ends"]
-NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run that is a piece
+NODE, LAST = "node of a piece", "time of the next node"  # keys in the start of a piece of a run
 
 
 def begin(scene: Scene, start: dict, t0):
-    """Return the beginning for `simulate`: the start of a run, or for a later piece the state at its joint,
-    which `simulate` projects onto the constraints.
+    """Return the initial values for `simulate`: the start of a run, or for a later piece its node, which
+    `simulate` projects onto the constraints.
     """
     if NODE in start:
         q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
@@ -49,11 +48,12 @@ def begin(scene: Scene, start: dict, t0):
 
 
 def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], start: dict, ts: Float[Array, "times"]) -> dict[str, Float[Array, "states"]]:
-    """Return the end state of a piece of a motion with these times; nothing for a whole run."""
+    """Return the end state of a piece; empty for a whole run. `ts`: the times of the motion."""
     if LAST not in start:
         return {}
     last = jnp.argmin(jnp.abs(ts - start[LAST]))
-    return {"~end of a piece": jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}  # among its residuals, after all channels
+    # among the residuals, after all channels
+    return {"~end of a piece": jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,16 @@ class MultipleShooting:
 
         jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
 
-    - `duration`: approximate length of a piece, s: a time over which neighbouring motions diverge by a factor
-      of two to five.
-    - `pieces`: the number of pieces of each run; give one of the two.
+    - `duration`: approximate length of a piece, s. Choose the time over which neighbouring motions diverge by
+      a factor of two to five.
+    - `pieces`: number of pieces of each run; give either this or `duration`.
 
-    Pieces begin at samples; where a sensor has a delay, they overlap by its largest possible value. This
-    serves motions that are unstable or chaotic over the whole run: steps are as for an almost linear problem.
-    The objective and its minimum equal those of a fit without `shooting`.
+    Use it for motions that are unstable or chaotic over the whole run: the steps are those of an almost
+    linear problem. The objective and its minimum equal those of a fit without `shooting`. Pieces begin at
+    samples; if a sensor has a delay, they overlap by its largest possible value.
 
-    **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
+    **Raises** ValueError unless exactly one of the two is given: a positive finite duration, or at least two
+    pieces. Raises it in `fit` for a run with too few samples.
     """
 
     pieces: int | None = None
@@ -78,16 +79,19 @@ class MultipleShooting:
 
     def __post_init__(self):
         if (self.pieces is None) == (self.duration is None):
-            raise ValueError("`MultipleShooting` expects either `pieces` (their number in each run) or "
-                "`duration` (of a piece, in s), such as `duration=0.5`")
+            raise ValueError(
+                "`MultipleShooting` expects either `pieces` (number per run) or `duration` (of a piece, in "
+                "s), such as `duration=0.5`"
+            )
         if self.pieces is not None:
             checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for "
                 "one piece omit `shooting`")
         else:
             number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
             if not (np.isfinite(number) and number > 0):
-                raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite "
-                    "time above zero")
+                raise ValueError(
+                    f"`duration` of `MultipleShooting` is {self.duration} s, expected a positive finite time"
+                )
 
 
 def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
@@ -95,15 +99,18 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
     intervals than pieces, or if an event ended the run.
     """
     if run.ended_by:
-        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does "
-            "not use; omit it, and the samples after it")
+        raise ValueError(
+            f"run {index} has a measured time of its event `{run.ended_by}`, which `shooting` does not use; "
+            "omit it, and the samples after it"
+        )
     ts = np.asarray(run.ts)
     count = len(ts) - 1
     pieces = shooting.pieces
     if pieces is not None:
         if pieces > count:
-            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces of at least "
-                f"one interval each; give at most {count} pieces")
+            raise ValueError(
+                f"run {index} has {len(ts)} samples, too few for {pieces} pieces; give at most {count} pieces"
+            )
         return np.round(np.linspace(0, count, pieces + 1)).astype(int)
     at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
     after = np.clip(np.searchsorted(ts, at), 1, count)
@@ -112,14 +119,14 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
 
 
 def numbers_of_filters(run: Experiment) -> int:
-    """Return the number of states of the low-pass filters of the sensors of a `checked` run."""
+    """Return the number of filter outputs of the sensors of a `checked` run."""
     return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 
 def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
-    """Return, for each channel, the first sample that belongs to each piece, and one past the last sample.
+    """Return, for each channel, the first sample of each piece, and the number of samples.
 
-    A sample at a joint belongs to the later piece. With a delayed sensor, a sample belongs to a later piece
+    A sample at a node belongs to the later piece. With a delayed sensor, a sample belongs to a later piece
     only if that piece began at least the largest delay before the sample.
     """
     ts, found = np.asarray(run.ts, float), {}
@@ -131,8 +138,8 @@ def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
 
 
 def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
-    """Return the pieces of a `checked` run. Each but the first begins at a joint, whose state has `states`
-    numbers; `ends`: their first and last samples.
+    """Return the pieces of a `checked` run. Each but the first begins at a node of `states` numbers; `ends`:
+    their first and last samples.
     """
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
@@ -153,15 +160,16 @@ def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
             sigma={name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
             start=(run.start if begins else {NODE: np.zeros(states)}) | {LAST: np.asarray(run.ts[end])},
             unknown_start=run.unknown_start if begins else {},
-            inputs=_cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),  # a grid may end an interval later
+            # a grid may end one interval later
+            inputs=_cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),
         )
         found.append(piece)
     return found
 
 
 def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
-    """Return the inputs with only the knots about this span. Actuators keep all knots, since their numbers
-    may move them.
+    """Return the inputs with only the samples around this span. Actuators keep all samples, since their
+    unknown delays move them.
     """
     if not isinstance(run.inputs, Inputs):
         return run.inputs
@@ -179,7 +187,7 @@ def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
 
 
 def check_shooting(shooting) -> None:
-    """Raise a ValueError for anything but a `MultipleShooting`."""
+    """Raise ValueError unless `shooting` is a `MultipleShooting` or None."""
     if shooting is not None and not isinstance(shooting, MultipleShooting):
         raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, "
             "`jj.MultipleShooting(pieces=...)`, or None")

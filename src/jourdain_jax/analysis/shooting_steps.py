@@ -1,21 +1,23 @@
-"""The minimum of a fit by multiple shooting: first with gaps between pieces, then without.
+"""Minimisation of a fit by multiple shooting: first with gaps between pieces, then without.
 
-1. nodes from what was measured (`first_nodes`)
-2. the gaps c_i as residuals of a width that falls, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
-3. c_i = 0 as equations, by sequential quadratic programming with the Hessian of Gauss and Newton (the generalised Gauss-Newton method):
-   minimise |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), with ds_i = L_i d + g_i; a full step unless it goes far
+1. first guesses of nodes from measurements (`first_nodes`)
+2. gaps c_i as residuals of decreasing width, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
+3. c_i = 0 as equations, by sequential quadratic programming with the Gauss-Newton Hessian (generalised Gauss-Newton method):
+   minimise |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), with ds_i = L_i d + g_i;
+   steps are full unless residuals change much
 
-Without 2., the minimum is found from 17, 16 and 8 in place of all of 20 first guesses of a chaotic double pendulum (5, 10, 20 s of `bench/identification.py`).
-Converged: the step changes the residuals by at most `tolerance` in all, no unknown by more than that fraction, and pieces join to the simulation's tolerance.
-Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
+With step 2, all 20 first guesses of a chaotic double pendulum lead to the minimum; without it, 17, 16 and 8
+do (5, 10, 20 s of `bench/identification.py`). A fit has converged if a step changes residuals by at most
+`tolerance` in all, no unknown by more than that fraction, and pieces join to the simulation's tolerance.
 
-First guesses of the states between pieces, from measurements there.
+Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P.
+Schlöder, GAMM-Mitteilungen 30 (2007) 376.
 
-A coordinate or speed that a channel shows is that of a parabola through the samples about the node; so is the rate of a coordinate,
-qdot = N(q) u + nu, met by the smallest change of the speeds. Quantities without a channel keep their value at
-the start; coordinates that no geometric row depends on
-continue from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and
-the quantity is y + lag y'.
+First guesses of nodes: a measured coordinate or speed, and the rate of a measured coordinate, come from a
+parabola through the nearest samples. Speeds change as little as possible to satisfy qdot = N(q) u + nu.
+Quantities without a channel keep their value at the start. Coordinates on which no geometric constraint
+depends accumulate their changes along the pieces. Readings are corrected for delay, and for lag by y + lag
+y'.
 """
 
 from dataclasses import replace
@@ -40,7 +42,7 @@ from jourdain_jax.scene.scene import Scene
 def first_nodes(
     scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"]
 ) -> Float[np.ndarray, "pieces states"]:
-    """Return the states at the beginning of all pieces of a run, including the first; q, u: its start."""
+    """Return first guesses of the states at the beginning of all pieces of a run; q, u: its start."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
@@ -72,10 +74,10 @@ def first_nodes(
 
 
 def goes_on(scene: Scene, q: Float[np.ndarray, "coordinates"]) -> np.ndarray:
-    """Return the coordinates on which no geometric row and no unit norm depends, such as headings and
-    distances.
+    """Return the coordinates, such as headings and distances, on which no geometric constraint and no unit
+    norm depends.
     """
-    beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # where no slope vanishes by symmetry
+    beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # no slope vanishes by symmetry here
     return ~np.any(_closures(scene, beside) != 0, axis=0)
 
 
@@ -86,7 +88,7 @@ def _closures(scene: Scene, q):
 
 @eval_numpy
 def _rates(scene: Scene, t, q, u):
-    """qdot and N, at every node."""
+    """Return qdot and N at every node."""
 
     def one(t, q, u):
         return coordinate_rates(scene, t, q, u), jax.jacfwd(coordinate_rates, 3)(scene, t, q, u)
@@ -95,8 +97,8 @@ def _rates(scene: Scene, t, q, u):
 
 
 def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: float) -> tuple[float, float]:
-    """Return value and derivative at a time of the parabola through the nearest samples; NaN if there are
-    fewer than three.
+    """Return value and derivative at a time of the parabola through the nearest samples; NaN for fewer than
+    three.
     """
     there = np.flatnonzero(np.isfinite(x))
     near = there[np.argsort(np.abs(ts[there] - t), kind="stable")[:5]]
@@ -122,7 +124,7 @@ def shot(problem: Piecewise, theta: Places) -> Minimum:
 
 
 def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
-    """First guesses of the unknowns of all pieces, nodes included."""
+    """Return first guesses of the unknowns of all pieces, nodes included."""
     count, coordinates = len(theta), len(problem.scene.coordinate_names)
     places = np.arange(problem.states)
     of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
@@ -144,9 +146,10 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
         here = np.flatnonzero(problem.run_of == run)
         still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(problem.scene, starts[here[0], :coordinates])
         nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(changes[:, here[:-1, None], np.flatnonzero(still)], axis=1)
-    nodes = np.where(failed[..., None] & ~of_y, starts, nodes)  # a piece whose motion fails begins as its run does
+    # a piece whose motion fails begins at the start of its run
+    nodes = np.where(failed[..., None] & ~of_y, starts, nodes)
     local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
-    # sizes: how numbers differ from node to node, and change over a piece
+    # sizes: the spread of numbers over nodes, and their change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
     sizes = np.maximum(sizes, 0.01 * largest(nodes, (0, 1)))
     least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
@@ -163,7 +166,7 @@ def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) ->
 
 
 def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
-    """Set unknown start values of runs to measured ones that lie within their bounds and have no prior."""
+    """Set unknown start values of runs to measured values that lie within their bounds and have no prior."""
     unknowns, scene = problem.unknowns, problem.scene
     low, high = unknowns.low, unknowns.high
     for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):
@@ -192,7 +195,8 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
         here, arrow, x = way.here()
         if not here.size:
             break
-        size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)  # only keeps what is held from being singular
+        # keeps held unknowns from making the system singular
+        size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)
         d = damped_step(arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(problem, control, here))
         length = problem.change(way.at.sigma[here], d, here)
         done = problem.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
@@ -210,7 +214,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """Return the fraction of the largest singular value below which other singular values count as zero. The
-    fraction is smaller if the largest has grown along the motion and the others have not.
+    """Return the fraction of the largest singular value below which singular values count as zero. It is
+    smaller if the largest has grown along the motion and the others have not.
     """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

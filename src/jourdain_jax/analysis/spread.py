@@ -1,36 +1,42 @@
-"""Uncertainty of estimates about a minimum: from given or estimated sigmas, unknown correlation times, or
+"""Uncertainty of estimates at a minimum: from given or estimated sigmas, unknown correlation times, or
 differences between runs.
 
-interval     estimate -+ q e      e: standard error; q: 97.5 % quantile of the normal distribution, or of Student's t where noise is estimated, times the root
-                                  of what correlation times and weights of channels that are estimated add to the variance
-by profile   2 (F - F_min) <= 3.84 f,   3.84 f = w^2 n log(1 + q^2 / n)      n: degrees of freedom; w: e over what F alone foretells, as sigma is estimated in F
-                                                                             from all samples, without allowing for the unknowns
-With one channel of unknown sigma, no prior and a linear motion both are the interval of Student's t of regression.
-Source: F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; D. M. Bates and D. G. Watts, Nonlinear Regression Analysis (1988), section 6.1.
+    interval     estimate -+ q e      e: standard error; q: 97.5 % quantile of the normal distribution, or of Student's t if noise is
+                                      estimated, times the root of the contribution of estimated correlation times and channel weights
+    by profile   2 (F - F_min) <= 3.84 f,   3.84 f = w^2 n log(1 + q^2 / n)      n: degrees of freedom; w: e over the value predicted
+                                      by F alone, in which sigma is estimated from all samples, without allowing for the unknowns
 
-Unknowns at a bound: how far from it each may be, a one-sided limit by profile likelihood; and intervals that bounds make too narrow.
+With one channel of unknown sigma, no prior and a linear motion, both are the interval of Student's t of
+regression. Source: F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; D. M. Bates and D. G. Watts,
+Nonlinear Regression Analysis (1988), section 6.1.
 
-p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 3.84 f      f: see `spread`; 1 where noise is known
-p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
-p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
-beyond      d = b / sqrt(w^2 - b^2 / n),  b = g e:   standard errors that the data would put it beyond its bound      e: as F foretells; w, n: see `spread`
+Unknowns at a bound: a one-sided limit by profile likelihood, and intervals that bounds make too narrow.
 
-What a bound adds to the residuals counts as noise where sigmas are estimated: with N samples, b stays below sqrt(N) however far the bound is; d does not.
-The rise is that at the ends of other intervals. With that of a one-sided limit, 2.71 f, data would choose between two kinds of interval, which together hold a
-truth that is 1.6 standard errors from its bound in 92.5 % of repeats.
-Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins, Physical Review D 57 (1998) 3873, section IV.
+    p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta; the limit is at 2 p = 3.84 f; f = 1 for known noise
+    p is close to g delta + h delta^2 / 2, g: slope of F at the bound, 1 / h: variance of the unknown if it were free
+    p < 0: F is lower away from the bound, a saddle. F is level at the bound if another unknown has the same effect: a delay at zero lag
+    beyond = b / sqrt(w^2 - b^2 / n),  b = g e: standard errors from the bound to the free minimum beyond it; e: as predicted by F
 
-How large noise is that nobody stated: what sigmas are estimated to be, once it is allowed for that their samples determined unknowns as well.
+If sigmas are estimated, residuals caused by a bound count as noise: with N samples, b stays below sqrt(N)
+however far the bound is; `beyond` does not. The rise is the same as for other intervals. With the rise of a
+one-sided limit, 2.71 f, data would choose between two kinds of interval. Together these cover a true value
+1.6 standard errors from its bound in only 92.5 % of repeats.
+
+Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins,
+Physical Review D 57 (1998) 3873, section IV.
+
+Estimated sigmas, corrected for the unknowns that the same samples determine:
 
     sigma_c^2 = sum w^2 / (n_c - p_c),    p_c = tr(C A_c),   A_c = J_c' J_c / sigma_c^2       n_c samples of channel c; C: covariance of all unknowns
-    degrees of freedom of the variance C_ii:   1 / sum_c v_ic^2 / (n_c - p_c),    v_ic = (C A_c C)_ii / C_ii: what channel c adds to it
-    variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    as the weights of channels and priors are estimated, too
+    degrees of freedom of the variance C_ii:   1 / sum_c v_ic^2 / (n_c - p_c),    v_ic = (C A_c C)_ii / C_ii: contribution of channel c
+    variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    since weights are estimated too
 
-With one channel and no prior n - p is left, and intervals are those of Student's t. Under a robust loss the same holds of all samples together, and the factor
-by which their variance is to be multiplied takes the place of sigma^2. Priors and given sigmas count as
-known.
-Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; M. G. Kenward and J. H. Roger,
-Biometrics 53 (1997) 983.
+With one channel and no prior there are n - p degrees of freedom, and intervals are those of Student's t.
+Under a robust loss the same holds for all samples together, with the inflation of the variance in place of
+sigma^2. Priors and given sigmas count as known.
+
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2
+(1946) 110; M. G. Kenward and J. H. Roger, Biometrics 53 (1997) 983.
 """
 
 from collections.abc import Callable, Iterable
@@ -47,7 +53,7 @@ from jourdain_jax.analysis.levenberg_marquardt import LEAST, Linearised, Minimum
 from jourdain_jax.analysis.problem import LEAST_SQUARES, Problem
 
 RISE_95 = 3.841458820694124  # of 2 F
-FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
+FAR_BEYOND = 3.0  # standard errors: an estimate this far beyond its bound is significant
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
@@ -55,7 +61,7 @@ ADVICE = "`Fit.profiles` gives intervals that hold"
 class Rise:
     """The permitted rise of F within an interval."""
 
-    errors: ByUnknown  # standard errors that F alone foretells
+    errors: ByUnknown  # standard errors predicted by F alone
     of_rise: ByUnknown  # f
     wider: ByUnknown  # w
     degrees: ByUnknown  # n
@@ -65,26 +71,28 @@ class Rise:
 class AtBounds:
     """Statistics of unknowns at a bound, for converged fits; NaN for all others."""
 
-    limit: ByUnknown  # infinite where the data give none
-    beyond: ByUnknown  # by how many standard errors the data would put it beyond its bound
+    limit: ByUnknown  # infinite if the data give none
+    beyond: ByUnknown  # distance of the free minimum beyond the bound, in standard errors
     if_free: Rise
-    lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
-    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
+    # by member: F and all unknowns at a lower minimum with one unknown off its bound
+    lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)
+    # by member and unknown at a bound: all unknowns when that one is at its limit
+    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
 
 class Side(NamedTuple):
     """The profile of one unknown to one side of its estimate."""
 
-    end: float  # where F has risen so much; where it has not, the bound, or infinite
-    is_closed: bool  # whether it has
-    at: Minimum | None  # the minimum there; or one that is lower than that of the fit
+    end: float  # value at the permitted rise of F; if F does not rise so far, the bound or infinity
+    is_closed: bool  # whether F reaches the permitted rise
+    at: Minimum | None  # the minimum at the end, or a minimum lower than the fit's
     points: list[tuple[float, float]]  # values of the unknown, and rises of F
-    note: str  # what else was seen
+    note: str  # other observations
 
 
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
-    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1), from a distance
-    `first` on, until F has risen by `end`.
+    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1), starting at the
+    distance `first`, until F has risen by `end`.
 
     All other unknowns start from their values at the previous point. The end is found by the secant method
     for the square root of the rise, which is nearly linear.
@@ -99,10 +107,11 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         rise, where = float(at.at.cost[0] - found.at.cost[b]), f"near {origin + way * delta:.6g}"
         if np.isfinite(rise):
             points.append((origin + way * delta, rise))
-            note = note if at.converged[0] else f"no minimum over the others was found {where}, so that the interval may be too narrow"
+            note = note if at.converged[0] else (
+                f"no minimum over the others was found {where}, so the interval may be too narrow"
+            )
         if rise < -2 * close * end:
-            return Side(bound, False, at, points, f"a lower minimum than the fit lies {where}: fit again "
-                "from there")
+            return Side(bound, False, at, points, f"a lower minimum lies {where}; fit again from there")
         if abs(rise / end - 1) < close:
             return Side(origin + way * delta, True, at, points, note)
         if rise < end:
@@ -123,12 +132,13 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
     if not np.isfinite(outer[1]):
         return Side(bound, False, None, points, "the motion fails "
             f"{where}" if np.isfinite(outer[0]) else note)
-    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: beyond it, "
-        "other unknowns are elsewhere")
+    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: other unknowns change")
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
-    """Return each unknown at a bound is moved away from it, all others following."""
+    """Return the statistics of unknowns at a bound: each is moved away from it, while all others are fitted
+    again.
+    """
     theta, bound = found.theta, problem.unknowns.reached(found.theta)
     told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free(problem, found, bound))
     for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
@@ -137,7 +147,7 @@ def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
 
 
 def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place: int) -> None:
-    """Find out how the objective changes when one unknown leaves its bound."""
+    """Follow the objective as one unknown leaves its bound."""
     bound, limits = found.theta[b, place], problem.unknowns
     inward = 1.0 if bound <= limits.low[place] else -1.0
     error, f, w, n = (x[b, place] for x in vars(told.if_free).values())
@@ -145,7 +155,7 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
     if np.isfinite(error):
         left = w**2 - (slope * error) ** 2 / n
         told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
-    if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
+    if told.beyond[b, place] > FAR_BEYOND:  # the bound is decisive: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
     first = _root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place])
@@ -158,25 +168,27 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
 
 
 def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
-    """Return one sentence for each unknown of the first member that leaves its interval (`reach`) when an
-    unknown at a bound moves to the limit of its own interval.
+    """Return a sentence on each unknown of the first member that leaves its interval (`reach`) when an
+    unknown at a bound moves to its limit.
     """
     sentences = []
     for (_, place), there in told.at_limit.items():
         far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
         if far:
             bounded = labels[int(np.searchsorted(places, place))]
-            sentences.append(f"{_too_narrow(far)}: with `{bounded}` away from its bound, though within its "
-                f"interval, the best fit lies outside; {ADVICE}")
+            sentences.append(
+                f"{_too_narrow(far)}: with `{bounded}` off its bound, within its interval, the best fit lies "
+                f"outside; {ADVICE}"
+            )
     return sentences
 
 
 def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
-    """Return the intervals of the first member that are too narrow, by name. An interval is too narrow if the
-    squares rise less than predicted by `errors`, the standard errors of all free unknowns.
+    """Return sentences on intervals of the first member that are too narrow: the squares rise less than
+    predicted by `errors`, the standard errors of all free unknowns.
 
-    The ends of the intervals of shared unknowns are tested where an interval reaches a bound, or where an
-    unknown may leave its bound.
+    The ends of intervals of shared unknowns are tested if an interval reaches a bound, or if an unknown may
+    leave its bound.
     """
     limits, theta = problem.unknowns, found.theta[0]
     places, labels = limits.estimated, limits.labels
@@ -197,7 +209,7 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
 
     sentences = []
     if names := named(range(len(labels)), to_bounds):
-        why = "and others may be, too: up to a bound nearby, the squares rise less than standard errors predict"
+        why = "and others may be: up to a nearby bound, the squares rise less than standard errors predict"
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
@@ -212,7 +224,7 @@ def _too_narrow(names: list[str]) -> str:
 
 
 def _root(slope: float, curvature: float, end: float) -> float:
-    """delta > 0 with slope delta + curvature delta^2 / 2 = end."""
+    """Solve slope delta + curvature delta^2 / 2 = end for delta > 0."""
     return float(2 * end / (slope + np.sqrt(slope**2 + 2 * curvature * end)))
 
 
@@ -222,14 +234,15 @@ class NoiseLevels:
 
     at: Linearised
     known: Information
-    doubt: ByUnknown  # variance of log C_ii, 2 over its degrees of freedom
-    more: ByUnknown  # what weights that are estimated add to C_ii, relative to it
-    untold: Bool[np.ndarray, "members channels"]  # which channels do not tell their sigma: nothing is taken from them
+    doubt: ByUnknown  # variance of log C_ii: 2 over its degrees of freedom
+    more: ByUnknown  # contribution of estimated weights to C_ii, relative to it
+    # channels that do not determine their sigma, and are not used
+    untold: Bool[np.ndarray, "members channels"]
 
 
 def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
-    """Return sigmas and their statistics at theta. `told_by`: returns the information of an arrow. `of_loss`:
-    returns the factor by which a loss multiplies variances; its arguments are the residuals of one member and
+    """Return sigmas and their statistics at theta. `told_by` returns the information of an arrow matrix.
+    `of_loss` returns the inflation of variances by a loss; its arguments are the residuals of one member and
     the number of unknowns that they determined.
     """
     members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
@@ -241,7 +254,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
     samples = np.concatenate([[[r.size] for r in residuals], problem.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
-    fewest = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
+    fewest = 0.5  # degrees of freedom that a channel needs to determine its sigma
     for _ in range(50):
         left, before = samples - determined, widths.copy()
         untold[:, 1:] |= left[:, 1:] < fewest
@@ -258,7 +271,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     counts = np.s_[:, 0 if unsure else 1 :]
     doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], fewest)[..., None], axis=1)
     at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
-    more, change = 0 * doubt, 0.03  # of sigma^2, for the second derivative of C
+    more, change = 0 * doubt, 0.03  # of sigma^2: increment for the second derivative of C
     for k in range(1, count):
         other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-change, change)]
         ends = [(told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
@@ -274,7 +287,7 @@ def _told_by_kind(
     """
     m, S, G, own = known.follow.shape[-2], known.shared[:, None, None], known.follow[:, :, None], known.own[:, :, None]
     T_o, T_s = T[..., :m], T[..., m:-1]
-    X = T_s - T_o @ G  # own unknowns of a run follow the shared ones, x = - G s
+    X = T_s - T_o @ G  # unknowns of a run follow the shared ones, x = - G s
     p = np.einsum("brkij,brkij->bk", X @ S, X) + np.einsum("brkij,brkij->bk", T_o @ own, T_o)
     Q = np.sum(S @ np.swapaxes(X, -1, -2) @ X @ S, axis=1)  # of all runs
     direct, through = T_o @ own, X @ S @ np.swapaxes(G, -1, -2)
@@ -286,14 +299,14 @@ def _told_by_kind(
 class Spread:
     """Uncertainties of the estimates, of all members."""
 
-    levels: NoiseLevels  # sigmas, and what is known with them
-    known: Information  # the same, or from how much runs differ
+    levels: NoiseLevels  # sigmas, and the information with them
+    known: Information  # the same, or by differences between runs
     quantiles: ByUnknown  # q
     rise: Rise
 
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
-    """Return the uncertainties of estimates; those at a `bound` are held there."""
+    """Return the uncertainties of estimates; unknowns at a `bound` are held there."""
     unknowns, theta, scores, cutoff = problem.unknowns, found.theta, found.at.arrow.scores, problem.asked.control.cutoff
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=cutoff)
@@ -317,7 +330,7 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
 
 
 def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Rise:
-    """Return statistics of each unknown at a `bound`, as if it were free; NaN for others."""
+    """Return the statistics of each unknown at a `bound` as if it were free; NaN for others."""
     told = np.full((4, *bound.shape), np.nan)
     for place in np.flatnonzero(bound.any(axis=0)).tolist():
         others = np.where(np.arange(bound.shape[1]) == place, False, bound)
@@ -327,18 +340,19 @@ def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members p
 
 
 def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
-    """Return the 97.5 % quantile in units of standard errors: normal if the noise is known, else Student's t.
+    """Return the 97.5 % quantile in units of standard errors: normal for known noise, else Student's t.
 
-    Its degrees of freedom are 2 / var(log C), where C is the variance of an estimate as it depends on the
-    estimated correlation times and sigmas. Since C is a mean over correlation times, the factor n / (n - 2)
-    of Student's variance is left out.
+    Its degrees of freedom are 2 / var(log C), for the variance C of an estimate as a function of the
+    estimated correlation times and sigmas. C is a mean over correlation times, so the factor n / (n - 2) of
+    Student's variance is omitted.
     """
-    of_memory = np.minimum(of_memory, 0.5)  # an estimated correlation time leaves four degrees of freedom at least
+    # an estimated correlation time leaves at least four degrees of freedom
+    of_memory = np.minimum(of_memory, 0.5)
     doubt = of_memory + of_sigmas
     return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), 1.959963984540054)
 
 
 def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> ByUnknown:
-    """f; where an unknown has no standard error, the largest of others is taken."""
+    """Return f; for an unknown without standard error, the largest f of the others."""
     f = wider**2 * n * np.log1p(quantiles**2 / n) / RISE_95
     return np.where(np.isfinite(f), f, np.max(f, axis=-1, keepdims=True, where=np.isfinite(f), initial=1.0))

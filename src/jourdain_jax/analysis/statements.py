@@ -1,14 +1,14 @@
-"""Statements of a scene (bodies, loads, potentials, constraints), checked one by one, so that a wrong one is
-named.
+"""Checks of each statement of a scene (bodies, loads, potentials, constraints), which name a wrong one.
 
 inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
                e.e = 1                                                per gravity
-potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i that states a potential V_i
-derivatives    d/ds of every piece along one direction in (parameters, t, q, u): autodiff against central differences; no kink there
+potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i with a potential V_i
+derivatives    d/ds of every statement along one direction in (parameters, t, q, u): autodiff against central differences; no kink
 
-Derivatives of accelerations and constraint forces: whether they exist, forward against reverse mode, against central differences.
+Checks of derivatives of accelerations and constraint forces: existence, forward against reverse mode, and
+central differences.
 
-The result of a verification: comparisons, each with its size, its threshold and its culprit.
+Their results: comparisons, each with size, threshold and culprit.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
 
-# Relative to the size of what is compared, in double and in single precision.
+# relative to the size of the compared quantities, in double and in single precision
 THRESHOLDS = {
     "inertia": (1e-10, 1e-5),
     "potentials": (1e-10, 1e-4),
@@ -55,27 +55,27 @@ THRESHOLDS = {
 
 
 class Check(eqx.Module):
-    """One comparison: its relative size, its threshold, and its subject."""
+    """One comparison: its relative size, threshold and culprit."""
 
     name: str = static()
     value: float
     threshold: float
-    culprit: str = static()  # body, load, row, form or reduction with the largest value
+    culprit: str = static()  # body, load, constraint, form or reduction with the largest value
     note: str = static(default="")
 
     @property
     def passed(self) -> bool:
-        """Whether the value is within its threshold."""
+        """Return whether the value is within its threshold."""
         return bool(self.value <= self.threshold)
 
     def as_dict(self) -> dict:
-        """Return the check for machines; a value that is not finite is None."""
+        """Return the check as plain data; a value that is not finite is None."""
         value = float(self.value) if np.isfinite(self.value) else None
         return vars(self) | {"value": value, "passed": self.passed}
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """Return the check called `name` (a key of `THRESHOLDS`) from one number for each suspect; NaN counts as
+    """Return the check called `name` (a key of `THRESHOLDS`), given one number per suspect. NaN counts as
     larger than any number.
     """
     threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
@@ -106,12 +106,12 @@ def _pushed(f: Callable, arguments, point, direction):
 
 
 def central_difference(along: list, h: float):
-    """Fourth-order central difference from the values at -2h, -h, h, 2h."""
+    """Return the fourth-order central difference for values at -2h, -h, h, 2h."""
     return (along[0] - 8 * along[1] + 8 * along[2] - along[3]) / (12 * h)
 
 
 class Verification(Printed, eqx.Module):
-    """All checks of one state; `print` shows them as a table."""
+    """All checks at one state; `print` shows them as a table."""
 
     scene: str = static()
     checks: tuple[Check, ...]
@@ -120,25 +120,25 @@ class Verification(Printed, eqx.Module):
 
     @property
     def certifies(self) -> bool:
-        """Whether passing means agreement to round-off of double precision. Single precision shows only gross
-        errors.
+        """Return whether passing means agreement to round-off of double precision. Single precision shows
+        only gross errors.
         """
         return all(check.threshold <= THRESHOLDS[check.name][0] for check in self.checks)
 
     @property
     def passed(self) -> bool:
-        """Whether every check passed."""
+        """Return whether every check passed."""
         return all(check.passed for check in self.checks)
 
     def largest(self, *names: str) -> float:
-        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero if
-        there is none.
+        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero
+        without checks.
         """
         values = [check.value for check in self.checks if check.name in names]
         return float(np.max(values)) if values else 0.0
 
     def as_dict(self) -> dict:
-        """Return the result for machines: the largest values by kind, and every check."""
+        """Return the result as plain data: the largest values by kind, and every check."""
         return {
             "max_disagreement": self.largest("reductions", "forms", "Newton"),
             "virtual_power": self.largest("virtual power"),
@@ -166,14 +166,16 @@ class Verification(Printed, eqx.Module):
 def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
     """Return whether accelerations have a derivative along a change of the parameters and coordinates.
 
-    They have none where the change makes dependent rows independent: `(1 - A A+) dA (1 - A+ A)` is not zero.
+    They have none if the change makes dependent constraints independent: `(1 - A A+) dA (1 - A+ A)` is not
+    zero.
 
     **Arguments**
+
     - `direction`: an object of the scene's class whose fields hold the change of each parameter (zero for
       constant ones); `dq`: the change of the coordinates.
     - `inputs`: values of the scene's inputs (default: zero).
 
-    It needs numbers and does not run under jit or vmap.
+    It needs concrete numbers, so it does not run under jit or vmap.
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
         raise ValueError(f"`direction` is {described(direction)}, expected a `{type(scene).__name__}` whose "
@@ -202,9 +204,10 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
     the coordinates, arbitrary in the speeds, and relative to the values in the parameters.
 
-    Returns None where no reduction applies.
+    Returns an empty list if no reduction applies.
     """
-    names = tuple(name for name in names if name != "gibbs-appell")  # its Hessian of a Hessian costs more than all others together
+    # its Hessian of a Hessian costs more than all others together
+    names = tuple(name for name in names if name != "gibbs-appell")
     if not names:
         return []
     generator = np.random.default_rng(seed)
@@ -242,7 +245,7 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
 
 
 def by_reduction(way, scene, t, q, u, equations, rows):
-    """Return one reduction of equations and rows that all share."""
+    """Apply one reduction to shared equations and constraints."""
     return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
 
 
@@ -257,7 +260,7 @@ def _dot(a, b):
 
 
 def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
-    """Return the three checks above; `Z` spans the admissible speeds."""
+    """Return the checks of inertia, potentials and derivatives; `Z` spans the admissible speeds."""
     inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
         check("inertia", inertia, q.dtype),
@@ -324,8 +327,8 @@ def _name(i: int, load: Load) -> str:
 
 
 def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
-    """Return all numbers that the scene states at (t, q, u), by subject."""
-    # poses by themselves: out of a motion they come differentiated once already, and a rule of the user's own may be passed over
+    """Return all quantities that the scene defines at (t, q, u), by subject."""
+    # poses directly: in a motion they are already differentiated once, which may bypass a custom rule
     motion, pose = motion_at(scene, t, q, u, inputs), pose_at(scene, t, q)
     pieces = {"the coordinate rates": coordinate_rates(scene, t, q, u)}
     for name, placed in pose.bodies.items():
@@ -342,13 +345,14 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
     potential = potential_of(scene, pose)
     if potential is not None:
         pieces["the scene's `potential`"] = jnp.asarray(potential)
-    pieces |= {f"row `{name}`": value for name, value in velocity_rows(scene, motion).items()}
-    return pieces | {f"row `{name}` (its position)": value for name, value in position_rows(scene, pose).items()}
+    pieces |= {f"constraint `{name}`": value for name, value in velocity_rows(scene, motion).items()}
+    return pieces | {f"position of constraint `{name}`": value for name, value in position_rows(scene, pose).items()}
 
 
 def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     generator = np.random.default_rng(seed)
-    floor = 1e-2 if q.dtype == jnp.float32 else 1e-4  # SI units; what is smaller is not told from round-off in a difference
+    # SI units; below this size, differences are dominated by round-off
+    floor = 1e-2 if q.dtype == jnp.float32 else 1e-4
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
     draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)  # noqa: E731
     direction = (jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving), jnp.ones_like(t), draw(q), draw(u))
@@ -357,10 +361,11 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     values = {}
     for name in value:
         f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in around]
-        # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
+        # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order if f is smooth, the jump of the
+        # slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = largest(f) + largest(slope) + floor
-        # a kink is a jump of order one, and its estimate is of lower order than the difference
+        # the jump at a kink is of order one, and its estimate has lower order than the difference
         error = np.maximum(np.abs(slope - central_difference(ends, h)), 1e-3 * np.abs(kink))
         values[f"{name}: its derivative"] = np.max(error, initial=0.0) / size
     return check("derivatives", values, q.dtype)

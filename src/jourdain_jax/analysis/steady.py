@@ -1,10 +1,11 @@
-"""Steady motions by root finding: privileged speeds are constant, and only coordinates that do not influence
+"""Steady motions by root finding: privileged speeds are constant, and only coordinates without influence on
 them change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
-These are the equations of families of steady motions, too (`instant.py`). Whether what was found is steady is then judged without that list, by dy/dt and
-d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/roots.py`).
+Families of steady motions use the same equations (`instant.py`). They are solved by Levenberg-Marquardt from
+the guess (`calculus/roots.py`). Steadiness of the result is judged by dy/dt and d2y/dt2 along the motion,
+without the list of ignorable coordinates.
 """
 
 from collections.abc import Mapping
@@ -28,16 +29,16 @@ from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` "
-    "bounds the search, and a backend goes to `jj.build`")
+_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"},
+    "no motion is integrated; `max_steps` bounds the search, and a backend is an option of `jj.build`")
 
 
 class SteadyMotion(Printed, eqx.Module):
     """A state of steady motion, and the residual of its steadiness."""
 
     state: State
-    acceleration: Scalar  # largest |dy/dt| that is left
-    residual: Scalar  # largest of that, of |d2y/dt2| along the motion, and of what is left of the rows
+    acceleration: Scalar  # largest remaining |dy/dt|
+    residual: Scalar  # largest of that, of |d2y/dt2| along the motion, and of the constraint residuals
     converged: Flag  # whether `residual` is below the root of round-off
 
     def __getitem__(self, name: str):
@@ -70,22 +71,23 @@ def steady(
         steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
 
     **Arguments**
-    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It need not satisfy the
-      constraints.
-    - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. If many
-      steady motions satisfy this, the result is one near the guess.
-    - `moving`: names of the coordinates that may keep moving; default: those without influence on the scene's
+
+    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It may violate the constraints.
+    - `held`: names of coordinates and speeds that keep the guess's value; all others are unknown. If many
+      steady motions have these values, the result is one near the guess.
+    - `moving`: names of the coordinates that may change; default: those without influence on the scene's
       accelerations (`ignorable`).
-    - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that must be
-      constant (default: the scene's own). Choose speeds in which the motion is steady: rates of yaw, lean and
-      spin, say, not velocities along fixed axes.
-    - `options`: a `jj.Options`, of which only `max_steps` has an effect: it bounds the steps of the search
-      (default: 60), which runs to round-off; `by_name`: `max_steps`.
+    - `inputs`: values of the scene's inputs (default: zero).
+    - `privileged`: names of the speeds that must be constant (default: the scene's own). Choose speeds in
+      which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
+    - `options`: a `jj.Options`, of which only `max_steps` has an effect, the largest number of steps of the
+      search (default: 60); `by_name`: `max_steps`. The search runs to round-off.
 
-    **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
-    scene's parameters and in the held values, where the steady motion is a smooth function of them.
+    **Returns** a `SteadyMotion`. Inspect `converged` and `residual`: a failed search raises no error. Where
+    the steady motion is a smooth function of the scene's parameters and the held values, it is differentiable
+    in them, in any mode.
 
-    **Raises** ValueError: an unknown name. TypeError: another option by name.
+    **Raises** ValueError for an unknown name, and TypeError for another option by name.
     """
     most_steps = as_options(Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED).max_steps
     built, scene = scene, as_rolling(scene, "steady")
@@ -100,14 +102,14 @@ def steady(
     moving = ignorable if moving is None else as_names(moving)
     check_names(carried := entries_of(scene, moving), entries, unknown)
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
-    # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
+    # no equation changes with them: they keep the guess's value, and no step runs away along them
     idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
 
 
 def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
-    """t, q, u of a guess."""
+    """Return t, q, u of a guess."""
     if isinstance(guess, State):
         return guess.t, guess.q, guess.u
     check_kind(
@@ -126,11 +128,11 @@ class _Problem(eqx.Module):
     f: Float[Array, "inputs"]
     instant: ByProgram | ByMatrices = static()
     privileged: Indices = static()
-    resting: Indices = static()  # coordinates that must not move
+    resting: Indices = static()  # coordinates that must not change
 
     def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, list[Scalar]]:
-        """Return the residual, its derivatives, and the largest entries of the constraints, of dy/dt, and of
-        d2y/dt2.
+        """Return the residual, its derivatives, and the largest magnitudes of the constraints, of dy/dt, and
+        of d2y/dt2.
         """
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, self.t, z[: len(at.q)], z[len(at.q) :], self.f)

@@ -1,9 +1,10 @@
-"""Small motions on the constraint manifold: perturbations of a state, and a choice of independent ones.
+"""Perturbations of a state on the constraint manifold, and a choice of independent ones.
 
     dq = E ds,   dg = G ds = 0,   dphi = Phi_s ds + A du + Phi_f df = 0
 
-`ds` is `dq` itself for a plain coordinate. A quaternion is perturbed by a small turn in body axes, `dq = q (0, ds)/2`, so that no component
-of it is special. Dependent `ds` follow from the geometric rows g, dependent `du` from all velocity rows phi.
+For a plain coordinate, `ds` equals `dq`. A quaternion is perturbed by a small rotation in body axes, `dq = q
+(0, ds)/2`, so that no component is special. The geometric constraints g determine dependent `ds`, all
+velocity constraints phi dependent `du`.
 """
 
 import jax
@@ -24,7 +25,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 def perturbed_names(scene: Scene) -> Labels:
-    """Return names of `ds`: plain coordinates, and three turns in body axes per quaternion:
+    """Return the names of `ds`: plain coordinates, and three rotations in body axes per quaternion:
     `attitude_turn_x`, `..._y`, `..._z`.
     """
     names = list(scene.coordinate_names.entries)
@@ -49,12 +50,12 @@ def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbe
     return S, B
 
 
-# q (0, ds)/2 = H q ds, by parts w, x, y, z of the product and by the axes of the turn
+# q (0, ds)/2 = H q ds, by components w, x, y, z of the product and by axes of the rotation
 _HALF_A_TURN = np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]] * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None] / 2
 
 
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
-    """Return the inverse, or the pseudo-inverse of a matrix that is not square; NaN if there is none."""
+    """Return the inverse, or the pseudo-inverse of a rectangular matrix; NaN if there is none."""
     try:
         return array_module(x).linalg.inv(x) if len(x) == x.shape[1] else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
     except np.linalg.LinAlgError:
@@ -62,12 +63,12 @@ def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]
 
 
 def others(some, count: int) -> Int[np.ndarray, "rest"]:
-    """Return the indices below `count` that are not among `some`."""
+    """Return the indices below `count` that are not in `some`."""
     return np.setdiff1d(np.arange(count), np.asarray(some, int))
 
 
 def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]) -> Float[Entries, "all independent"]:
-    """Return all perturbations from the independent ones so that `rows @ perturbation = 0`."""
+    """Return the matrix from independent to all perturbations, such that `rows @ perturbation = 0`."""
     dependent = others(independent, rows.shape[1])
     rows = _of_unit_length(rows, dependent)
     followed = -inverse(rows[:, dependent]) @ rows[:, independent]
@@ -75,7 +76,8 @@ def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "i
 
 
 def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
-    """Return the smallest singular value of the dependent part of rows of unit length. It has no derivative.
+    """Return the smallest singular value of the dependent columns, with rows of unit length. Its derivative
+    is zero.
     """
     xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
     if xp is np and not all_finite(block):
@@ -85,15 +87,15 @@ def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, 
 
 
 def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, "rows all"]:
-    """Return rows over the lengths of their dependent parts."""
+    """Return rows divided by the lengths of their dependent parts."""
     xp, block = array_module(rows), rows[:, dependent]
     length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
     return rows / xp.where(length > 0, length, 1.0)
 
 
 def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> Indices:
-    """Return indices of the independent speeds: the named ones, else the scene's own choice, else the
-    engine's.
+    """Return indices of the independent speeds: the named ones, else the scene's choice, else an automatic
+    choice.
     """
     known = structure_of(scene)
     return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
@@ -118,10 +120,10 @@ def _scaled_rows(scene: Scene, t, q, u, f):
 def dependent_coordinates(
     scene: Scene, state: State, named: Labels, dependent: Labels | None, G: Float[np.ndarray, "rows coordinates"] | None = None
 ) -> Int[np.ndarray, "dependent"]:
-    """Return indices of the perturbations `ds` that follow from the geometric constraints: the named ones,
-    else well conditioned ones.
+    """Return indices of the dependent perturbations `ds`, which the geometric constraints determine: the
+    named ones, else well conditioned ones.
 
-    `G`: dg/dq at the state, if it is known; otherwise states of the scene's domain decide.
+    `G`: dg/dq at the state, if known; otherwise states of the scene's domain are used.
     """
     names = perturbed_names(scene)
     check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to "
@@ -147,7 +149,7 @@ def dependent_coordinates(
     chosen = np.delete(free, best_privileged(G[:, :, free], len(free), rank)) if len(free) >= rank else free
     if len(chosen) < rank or np.any(pivots_at(G, chosen.tolist(), rank) <= cutoff):
         raise ValueError(
-            f"the geometric rows of `{type(scene).__name__}` make the given coordinates dependent; give "
-            "fewer in `coordinates`, or name the `dependent` ones"
+            f"the geometric constraints of `{type(scene).__name__}` make the given coordinates dependent; "
+            "give fewer in `coordinates`, or name the `dependent` ones"
         )
     return chosen

@@ -1,10 +1,13 @@
 """The unknowns of a fit: shared parameters of the scene, initial values of single runs, and numbers of
 sensors and actuators.
 
-theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held. A single
-run has none of its own: there is nothing to tell them from those that runs share.
+    theta = (shared, own of run 0, own of run 1, ...)
 
-Whether the runs of a fit start on the constraints, at the first guess and where the unknowns are changed.
+Every run has a place for each initial value that is unknown in any run; a known value is held. If there is
+only one run, all its unknowns count as shared.
+
+`check_starts` checks that the runs start on the constraints, at the first guess and after changes of the
+unknowns.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,31 +27,31 @@ from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-Places = Float[np.ndarray, "*members places"]  # a number for every place
+Places = Float[np.ndarray, "*members places"]  # one number for each place
 
 
 @dataclass(eq=False)
 class Unknowns:
-    """All unknowns, with their first guesses and ranges. Vectors theta have one entry for each number of each
-    run.
+    """All unknowns, with first guesses and ranges. A vector theta has one entry for each number of each run.
 
-    Priors are residuals M W (theta - mean), W: one over each standard deviation.
+    Priors are residuals M W (theta - mean), with W one over each standard deviation.
     """
 
     layout: Layout
     runs: int
     guess: Places
-    fixed: Bool[np.ndarray, "places"]  # known, and there to give all runs one shape
+    fixed: Bool[np.ndarray, "places"]  # known values, present so that all runs have one shape
     ranges: tuple[Range, ...]
-    labels: Labels  # of those that are not fixed
+    labels: Labels  # of unknowns that are not fixed
     units: Labels
-    prior_mean: Places  # zero where nothing is known beforehand
-    prior_weight: Places  # W; zero where nothing is
-    whitening: Float[np.ndarray, "shared shared"]  # M, of priors of shared ones: see `estimate.whitening`
-    estimated: np.ndarray = field(init=False)  # places of those that are not fixed
+    prior_mean: Places  # zero without prior
+    prior_weight: Places  # W; zero without prior
+    # M, for priors of shared unknowns: see `estimate.whitening`
+    whitening: Float[np.ndarray, "shared shared"]
+    estimated: np.ndarray = field(init=False)  # places of unknowns that are not fixed
     low: Places = field(init=False)
     high: Places = field(init=False)
-    least: Places = field(init=False)  # the magnitude of each where it is near zero
+    least: Places = field(init=False)  # typical magnitude of each, used near zero
 
     def __post_init__(self):
         self.estimated = np.flatnonzero(~self.fixed)
@@ -57,7 +60,7 @@ class Unknowns:
 
     @property
     def prior_rows(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """Return M W of the estimated unknowns (all shared ones)."""
+        """Return M W of the estimated unknowns (all shared)."""
         rows, shared = np.diag(self.prior_weight[self.estimated]), len(self.whitening)
         rows[:shared] = self.whitening @ rows[:shared]
         return rows
@@ -67,15 +70,13 @@ class Unknowns:
         return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
     def sizes(self, theta: Places) -> Places:
-        """Return the size of each unknown by which its changes are measured: its magnitude or, near zero, a
+        """Return the size of each unknown, by which its changes are measured: its magnitude or, near zero, a
         typical value.
         """
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
-        """Return the first guess, and others on a Latin hypercube over the ranges. Every call returns the
-        same ones.
-        """
+        """Return the first guess, and others on a Latin hypercube over the ranges; the same on every call."""
         theta = np.tile(self.guess, (count, 1))
         if count == 1:
             return theta
@@ -86,7 +87,7 @@ class Unknowns:
         return theta
 
     def split(self, theta: Shaped[np.ndarray, "*members places"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return shared unknowns (*members, shared), and those of the runs (*members, runs, local)."""
+        """Return the shared unknowns (*members, shared), and the unknowns of runs (*members, runs, local)."""
         shared, local = self.layout.sizes
         return theta[..., :shared], theta[..., shared:].reshape(*theta.shape[:-1], self.runs, local)
 
@@ -100,11 +101,11 @@ class _Entry:
     guess: np.ndarray
     range: Range
     fixed: bool = False
-    prior: Any = None  # with mean and sigma
+    prior: Any = None  # has mean and sigma
 
     @property
     def labels(self) -> list[str]:
-        """The name of each number."""
+        """Return the name of each number."""
         return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)] if self.guess.ndim else [self.label]
 
 
@@ -114,11 +115,11 @@ def unknowns_of(
 ) -> Unknowns:
     """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
 
-    A parameter that is a function of the scene in `free` is no unknown: it follows from the others (`ties`).
+    A parameter for which `free` has a function of the scene is no unknown but depends on the others (`ties`).
     The unknowns of a single run count as shared unless `apart`.
 
-    Raises ValueError for unknown names, for guesses outside their bounds, for a parameter with a value per
-    run, for an estimate that runs share but state differently, and where nothing is free.
+    Raises ValueError for unknown names, guesses outside their bounds, a parameter with a value per run,
+    different estimates of a shared number, and if nothing is free.
     """
     parameters = {name: about for name, _, about in parameters_of(scene)}
     shared: list[tuple[str, Kind, _Entry]] = []
@@ -134,8 +135,10 @@ def unknowns_of(
             name, parameters, f"`free` names `{name}`, which is not a parameter of `{type(scene).__name__}`"
         )
         if isinstance(given, Estimate) and given.per_run:
-            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; omit "
-                "`per_run`, or fit the runs one by one")
+            raise ValueError(
+                f"`free` has a `{name}` for each run, but all runs share the scene; omit `per_run`, or fit "
+                "the runs one by one"
+            )
         if callable(given):
             functions[name] = given
             continue
@@ -178,19 +181,21 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """Return a range that begins at zero, since the scene has no motion below zero. If it has none at zero
-    either, the range begins slightly above. Raises ValueError for a guess below zero.
+    """Return a range that begins at zero, since the scene has no motion below zero, or slightly above if
+    `positive`. Raises ValueError for a negative guess.
     """
     if np.any(entry.guess < 0):
-        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared "
-            "non-negative; give a guess of zero or more")
-    # of the first guess: the bound of a parameter that is to be above zero
+        raise ValueError(
+            f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared non-negative; "
+            "give zero or more"
+        )
+    # fraction of the first guess: the bound of a positive parameter
     cut = entry.range.not_below(1e-6 * float(entry.guess.min()) if positive else 0.0)
     return replace(entry, range=cut)
 
 
 def _placed(parts: Iterable[tuple[str, Indices, Kind]]) -> tuple[Place, ...]:
-    """Places one after another."""
+    """Return consecutive places."""
     found: list[Place] = []
     for name, shape, kind in parts:
         found.append(Place(name, shape, found[-1].end if found else 0, kind))
@@ -198,7 +203,7 @@ def _placed(parts: Iterable[tuple[str, Indices, Kind]]) -> tuple[Place, ...]:
 
 
 def _check_told_once(layout: Layout, functions: Mapping) -> None:
-    """Raise a ValueError if a moment of inertia is given twice."""
+    """Raise ValueError if a moment of inertia is given twice."""
     told = {place.name: f"`{place.name}`" for place in layout.shared if place.kind == "scene"} | {name: f"a function for `{name}`" for name in functions}
     for body in layout.bodies:
         for entry in body.entries:
@@ -209,7 +214,7 @@ def _check_told_once(layout: Layout, functions: Mapping) -> None:
 
 
 def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
-    """Estimates of sensors and actuators by name; ValueError where runs state one differently."""
+    """Return estimates of sensors and actuators by name. Raises ValueError if runs give different ones."""
     found: dict[str, tuple[int, Estimate]] = {}
     for index, run in enumerate(runs):
         for label, estimate in run.estimates.items():
@@ -217,14 +222,14 @@ def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
             same = estimate.per_run and known.per_run and np.shape(estimate.guess) == np.shape(known.guess)
             if estimate != known and not same:
                 raise ValueError(
-                    f"run {first} and run {index} state `{label}` differently, but share it ({known} and "
+                    f"run {first} and run {index} share `{label}` but state it differently ({known} and "
                     f"{estimate}); give both the same, or `per_run=True`"
                 )
     return {label: estimate for label, (_, estimate) in found.items()}
 
 
 def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
-    """Return an unknown of one run, marked as held if the run knows it or does not have it."""
+    """Return an unknown of one run, held if the run knows it or does not have it."""
     if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
         return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
@@ -240,8 +245,8 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """Check the first guess and return an unknown from its description: an `Estimate`, a range, a prior or
-    None.
+    """Return an unknown from its description: an `Estimate`, a range, a prior or None. Raises ValueError for
+    an invalid first guess.
     """
     guess, found, prior = value, default, None
     if isinstance(given, Estimate):
@@ -254,12 +259,13 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
     elif given is not None:
         raise ValueError(
             f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, "
-            "`Normal(...)`, `Estimate(...)` or None; for a parameter that follows from others, a function of "
-            "the scene"
+            "`Normal(...)`, `Estimate(...)`, None, or, to tie it to other parameters, a function of the scene"
         )
     if guess.shape != value.shape:
-        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; omit it "
-            "to begin at the present value")
+        raise ValueError(
+            f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; omit it to begin at "
+            "the present value"
+        )
     if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
     if isinstance(prior, Correlated) and (value.shape or label.startswith("run ")):
@@ -275,7 +281,7 @@ def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -
     """
     guess, layout = unknowns.guess, unknowns.layout
     change = 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
-    changes = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"
+    changes = "violates the constraints when the unknowns change: the values in `start` depend on each other"
     for index, run in enumerate(runs):
         for theta, why in ((guess, "is not admissible"), (guess + change, changes)):
             shared, local = unknowns.split(theta)

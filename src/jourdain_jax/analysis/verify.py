@@ -1,17 +1,17 @@
 """Verification of a scene's equations at one state: independent formulations must give equal numbers.
 
-inertia            masses and inertias are those of a body, orientations are rotations, directions of gravity unit vectors
-                                                                            (this and the next two piece by piece: `statements`)
+inertia            possible masses and inertias; orientations are rotations, directions of gravity unit vectors
+                                                                            (this and the next two: `statements`)
 potentials         every load with a potential is its gradient
-derivatives        of every body, load, potential and row: autodiff against central differences
+derivatives        of every body, load, potential and constraint: autodiff against central differences
 reductions         udot and A' lambda by every applicable reduction
 forms              M and h by Lagrange's energy derivatives and by the Gibbs function, against Jourdain's virtual power
-virtual power      Z' (M udot + h - Q) = 0 over the admissible virtual velocities, row by row too           (18), (71)-(73)
-Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1); R from the rows alone, where nothing is built in
-energy             d(T + V)/dt along the motion, less the power of what has no potential
+virtual power      Z' (M udot + h - Q) = 0 over the admissible virtual velocities, also per constraint           (18), (71)-(73)
+Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1); R from the constraints alone if none is built in
+energy             d(T + V)/dt along the motion, minus the power of loads without potential
 gradients          of udot and A' lambda: forward against reverse mode, and against central differences
 
-Everything is computed once, uncompiled: compiling it would take several times as long as running it.
+Everything is computed once and uncompiled, since compilation would take several times longer.
 """
 
 from collections.abc import Mapping
@@ -56,20 +56,21 @@ def verify(
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
     Values are relative to the size of the compared quantities. Thresholds depend on the floating-point type
-    (`analysis.statements`): single precision shows gross errors only, and certifies nothing. If no reduction
+    (`analysis.statements`): single precision shows only gross errors and certifies nothing. If no reduction
     applies (no inertia along a free direction), there are no gradients to check, and the verification fails.
 
     **Arguments**
+
     - `state`: a state on the constraints, from `start` or `consistent`, or named values as for `start`.
       Default: the scene's example, otherwise a random state of its domain. Symmetric states may hide errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
-    - `seed`: of the random state and of the random directions for derivatives. Directions are admissible in
-      the coordinates, arbitrary in the speeds and relative in the parameters. The Gibbs-Appell reduction is
-      not differentiated. Parameters that would make dependent rows independent have no derivative and are
+    - `seed`: for the random state and the random directions of derivatives. Directions are admissible in the
+      coordinates, arbitrary in the speeds and relative in the parameters. The Gibbs-Appell reduction is not
+      differentiated. Parameters that would make dependent constraints independent have no derivative and are
       omitted, with a note (`derivative_exists`).
 
-    **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a
-    DifferentiationModeError where numbers are traced.
+    **Returns** a `Verification`, printed with the table of `jj.check`. A failed check raises no error. Raises
+    DifferentiationModeError for traced numbers.
     """
     checked_whole(seed, "`seed`", 0, expected="that is not negative")
     scene = as_scene(scene)
@@ -107,7 +108,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     energy = lambda t, q, u: sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))  # noqa: E731
     energy_rate = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot))
     forms = {"Gibbs function": gibbs_equations(scene, t, q, u, inputs)}
-    # a mass that changes joins at the body's own velocity (m a = F); d/dt dT/dqdot would count its momentum as lost
+    # a varying mass joins at the body's own velocity (m a = F); d/dt dT/dqdot would count its momentum as
+    # lost
     if speeds_are_rates(scene) and not structure_of(scene).varying_inertia:
         forms["Lagrange's equations"] = lagrange_equations(scene, t, q, u, inputs)
     return {
@@ -131,8 +133,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
 
 
 def _gyroscopic(scene, t, q, u, partial) -> Speeds:
-    """Return the size of the inertia forces `m v omega` and `omega I omega`. They may cancel inside `h`,
-    which then has round-off of this size.
+    """Return the size of the inertia forces `m v omega` and `omega I omega`. They may cancel in `h`, which
+    then has round-off of this size.
     """
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
@@ -150,8 +152,8 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
     """Return relative differences by check and suspect."""
     size, names = _size(found, found["reference"]), names_of_rows(scene)
     virtual = {f"reduction `{name}`": found["force"][name] for name in applicable}
-    virtual |= {f"row `{name}`": force for name, force in zip(names, found["rows"], strict=True)}
-    newton = {"rows: their reactions do not add up to the constraint force": found["rows"]}
+    virtual |= {f"constraint `{name}`": force for name, force in zip(names, found["rows"], strict=True)}
+    newton = {"constraints: their reactions do not add up to the constraint force": found["rows"]}
     if not _acts_on_speeds(scene):
         newton["bodies: m a - F does not add up to the constraint force"] = found["newton"]
     of_h, of_newton = 1 + largest(found["h"]), _size(found, found["newton"])
@@ -161,17 +163,16 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
         "forms": {f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
         "virtual power": {suspect: largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
         "Newton": {suspect: largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
-        "energy": {"a load whose potential does not give its force, or a row whose power is not "
-            "counted": energy},
+        "energy": {"a load whose potential does not give its force, or a constraint with uncounted power": energy},
     }
 
 
 def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
     if not applicable:
-        return {"the mass matrix and the rows: no reduction applies": np.inf}
+        return {"the mass matrix and the constraints: no reduction applies": np.inf}
     differences = dict.fromkeys(applicable, 0.0)
     for quantity in ("udot", "force"):
-        # against the median of all: one wrong way does not make the others look wrong
+        # against the median of all, so that one wrong reduction does not make the others look wrong
         middle = np.median(np.stack([found[quantity][name] for name in applicable]), axis=0)
         size = _size(found, middle)
         differences = {name: np.max([known, largest(found[quantity][name] - middle) / size]) for name, known in differences.items()}
@@ -179,8 +180,8 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
 
 
 def _acts_on_speeds(scene: Scene) -> bool:
-    """Return whether loads act directly on speeds, or a potential depends on coordinates. Then the forces on
-    bodies do not include all loads.
+    """Return whether loads act directly on speeds, or a potential depends on coordinates. In either case the
+    forces on bodies do not include all loads.
     """
     flags: list[bool] = []
 

@@ -311,8 +311,7 @@ def _turned(tilt) -> Matrix3:
 
 
 def _tangents_along(n, along) -> Tangents:
-    along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the "
-                                                                   "plane")
+    along = checked_real(along, "`along` of a plane", (3,), advice="give a vector not normal to the plane")
     first = along - (n @ along) * n
     if not np.all(known_numbers((first @ first) / (along @ along)) > 1e-8):
         raise ValueError(
