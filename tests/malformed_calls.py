@@ -260,7 +260,7 @@ PLOTTED = {
     "looking(lambda: {'sleigh': 0.1})": "gives ... for `sleigh`, expected shapes",
     "moved['headin']": ("KeyError", "a trajectory of `ChaplyginSleigh` has no `headin`; did you mean `heading`? Valid names:"),
     "moved.constraint_forces().forces_on('slegh')": ("KeyError", "did you mean `sleigh`"),
-    "moved.point('sleigh', (1.0, 2.0))": "point of body `sleigh` has shape (2,), expected (3,); give three components in its body frame, m",
+    "moved.point('sleigh', (1.0, 2.0))": "point of body `sleigh` has shape (2,), expected (3,); pass three components in its body frame, m",
     "moved.point('slegh')": ("KeyError", "no body `slegh` in this scene; did you mean `sleigh`? Valid names: `sleigh`."),
     "jj.simulate(described(invariants=lambda self, m: {'momentum': m['bead'].velocity}), {}, t1=0.1).invariants()": (
         "invariant `momentum` of `Described` has shape (3,), expected one number; give every component a name"
