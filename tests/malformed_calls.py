@@ -263,7 +263,7 @@ PLOTTED = {
     "moved.point('sleigh', (1.0, 2.0))": "point of body `sleigh` has shape (2,), expected (3,); pass three components in its body frame, m",
     "moved.point('slegh')": ("KeyError", "no body `slegh` in this scene; did you mean `sleigh`? Valid names: `sleigh`."),
     "jj.simulate(described(invariants=lambda self, m: {'momentum': m['bead'].velocity}), {}, t1=0.1).invariants()": (
-        "invariant `momentum` of `Described` has shape (3,), expected one number; give every component a name"
+        "invariant `momentum` of `Described` has shape (3,), expected one number; give every component its own name"
     ),
     "file(lambda: moved, lambda path: jj.load_rollout(path, Sleigh))": (
         "holds a trajectory, expected a rollout; read it with `jj.load_trajectory(path, scene)`"

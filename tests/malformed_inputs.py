@@ -486,7 +486,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.linearize(b, o)": "`state` is an array of shape (3,), expected a State",
     "jj.linearize(sleigh, {}, 'headin')": "`ChaplyginSleigh` has no coordinate `headin` to perturb; did you mean `heading`?",
     "jj.linearize(b, {}, 3)": "`3` was given, expected names in one text or several",
-    "jj.linearize(b, {}, ('x', 'x'))": "`coordinates` names one twice (x, x); name each once",
+    "jj.linearize(b, {}, ('x', 'x'))": "`coordinates` contains a name twice (x, x); give each once",
     "jj.linearize(sleigh, {}, dependent=('hedding',))": "`ChaplyginSleigh` has no coordinate `hedding` to perturb; did you mean `heading`?",
     "jj.linearize(sleigh, {}, ('x',), privileged=('heading_rate',))": "`privileged` of `ChaplyginSleigh` names 1 speeds, but the scene has 2",
     "jj.linearize(sleigh, {}, privileged=('heading_rat', 'x_rate'))": "unknown privileged speed of `ChaplyginSleigh`: `heading_rat`; did you mean",

@@ -231,7 +231,7 @@ WRONG = {  # the code's text in a lane, the text of the error alone
     "radius=-0.1, height=-0.1": ("no positive length: the radius of contact `rim`", r"less the tyre of contact `rim` .* -0\.12 m"),
     "tyre=-0.01": ("a negative tyre: contact `rim`", r"tyre of -0\.01 m, expected a radius"),
     "tyre=0.2": ("no positive length: the radius less the tyre of contact `rim`", r"less the tyre of contact `rim` .* -0\.1 m"),
-    "ball=0.6": ("no positive length: the radius of the ground less that of the ball of contact `top`", "`top` .* finds no point where body and ground touch"),
+    "ball=0.6": ("no positive length: ground radius minus ball radius of contact `top`", "`top` .* finds no point where body and ground touch"),
     "pipe=-0.5": ("no positive length: the radius of the ground of contact `top`", "`top` .* finds no point where body and ground touch"),
     "slope=0.1": ("a body off its ground: contact `rim`", "at a probed state its body is"),
     "tilting=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", "at 0 m/s by `origin`"),

@@ -313,7 +313,7 @@ def _with_receipts_of(path):
 def test_chunks_of_another_grid_do_not_count(whole, path, computed):
     """As where two machines whose numbers differ found the grid at the same time: sums about another centre would give another mean."""
     _changed(path, "grid.json", centre=whole.store.read_grid()["high"])
-    with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are left out"):
+    with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are omitted"):
         found = jj.load_study(path)
     assert (found.complete, found.counts) == (False, {})
     with pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"), pytest.warns(UserWarning, match="have other bits here"):

@@ -61,7 +61,7 @@ def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
 
 @of_known_numbers
 def energy_balance(scene: Scene) -> EnergyBalance:
-    """Return whether T + V is conserved and, if not, what changes it. Powers are those of eqs. (71)-(73).
+    """Report whether T + V is conserved, and the powers that change it, eqs. (71)-(73).
 
     Eight random admissible states with random inputs are examined. A power counts as zero below 1e-9 of the
     largest power (1e-4 in single precision). Raises DifferentiationModeError for traced numbers.

@@ -147,8 +147,8 @@ def fit_page(
 
 def _informed(shares: Informed) -> Section:
     about = (
-        "By how much the variance of an estimate would fall if these samples were a little more precise, of "
-        "all samples together; it allows for all other unknowns being estimated, too."
+        "Shares of samples in the information on each unknown. They account for the estimation of all other "
+        "unknowns."
     )
     shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # of which it is drawn where they inform
     columns = {f"run {run}": shares.of_runs[:, run] for run in shown} | shares.of_channels | {"priors": shares.of_priors}

@@ -1,9 +1,9 @@
-"""Holonomic constraints: single rows by Frobenius' criterion, all together by the growth of the admissible
-velocities.
+"""Holonomic constraints: single constraints by Frobenius' criterion, all together by the growth of the
+admissible velocities.
 
 A row `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 = d -
-alpha . nu`. By itself it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on
-the velocities that w admits (Frobenius).
+alpha . nu`. It is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the
+velocities that w admits (Frobenius).
 
 All rows: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1,
 D_k]` grow to a final dimension; the motion stays on a manifold of that dimension. If constraints or rates
@@ -96,7 +96,7 @@ def integrable_below() -> float:
 
 
 def frobenius_violations(scene: Scene) -> dict[str, float]:
-    """Return Frobenius' criterion for every row by itself, at six random admissible states of the scene's
+    """Return Frobenius' criterion for every single row, at six random admissible states of the scene's
     domain.
 
     The criterion is the largest value of the two-form dw on unit velocities that w admits, over all states,

@@ -41,7 +41,9 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _DIAGONAL, _PRODUCTS = ((0, 0), (1, 1), (2, 2)), ((0, 1), (1, 2), (0, 2))
-_OTHERWISE = "give its parameters ranges or ties of their own, or make its inertia of `jj.log_cholesky` numbers in the scene"
+_OTHERWISE = (
+    "give each parameter its own range or tie, or make its inertia of `jj.log_cholesky` numbers in the scene"
+)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ Samples = Float[np.ndarray, "*samples"]
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss, `huber(k)` or `student_t(degrees)`. With an infinite parameter it is that of least squares."""
+    """A loss, `huber(k)` or `student_t(degrees)`. An infinite parameter means least squares."""
 
     kind: str
     parameter: float
@@ -255,7 +255,7 @@ class Problem:
         return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
-        """Return for which shares of the span the mean squared residual is at most `most` times that of
+        """Return for which shares of the span the mean squared residual is at most `most` times the value for
         noise.
         """
         good = np.isfinite(at.cost)

@@ -129,7 +129,7 @@ def dependent_coordinates(
     check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to "
         "perturb")
     if len(set(named)) != len(named):
-        raise ValueError(f"`coordinates` names one twice ({', '.join(named)}); name each once")
+        raise ValueError(f"`coordinates` contains a name twice ({', '.join(named)}); give each once")
     both = set(named) & set(dependent or ())
     if both:
         raise ValueError(f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it "

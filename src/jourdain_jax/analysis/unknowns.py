@@ -270,8 +270,10 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
     if isinstance(prior, Correlated) and (value.shape or label.startswith("run ")):
         what = f"has {value.size} numbers" if value.shape else "belongs to one run"
-        raise ValueError(f"`{label}` was given a prior of `joint_normal`, but it {what}; such a prior is for "
-            "parameters of one number that all runs share")
+        raise ValueError(
+            f"`{label}` was given a prior of `joint_normal`, but it {what}; such priors are for shared "
+            "parameters of one number"
+        )
     return _Entry(label, unit, guess, found, prior=prior)
 
 

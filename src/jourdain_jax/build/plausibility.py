@@ -104,7 +104,7 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
     if isinstance(ground, Cylinder | Sphere):
         found["the radius of the ground"] = ground.radius
         if ground.side == "inside" and isinstance(shape, Ball):
-            found["the radius of the ground less that of the ball"] = ground.radius - shape.radius
+            found["ground radius minus ball radius"] = ground.radius - shape.radius
     return found
 
 

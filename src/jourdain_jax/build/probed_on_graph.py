@@ -126,8 +126,8 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities in which operations of these kinds occur. "rank" stands for the constraint rows,
-    "nonlinear" for their dependence on the speeds.
+    """Return the quantities in which operations of these kinds occur. "rank" means the constraint rows,
+    "nonlinear" their dependence on the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]

@@ -36,7 +36,7 @@ WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is th
 
 @dataclass(frozen=True)
 class Structure:
-    """Static facts about a scene."""
+    """Properties of a scene found by probing: rank, privileged speeds, dependence on time, faults."""
 
     row_names: Labels
     rank: int  # at generic states
@@ -199,8 +199,8 @@ def is_judged(scene: Scene) -> bool:
 
 
 def trust(scene: Scene) -> float:
-    """Return the reliability of typical lengths: one, or a thousandth for traced parameters, whose true
-    values may be of another magnitude.
+    """Return the weight of typical lengths: 1, or 0.001 for traced parameters, whose true values may have
+    another magnitude.
     """
     return 1.0 if is_judged(scene) else 1e-3
 
@@ -315,7 +315,7 @@ def _probed_structure(scene: Scene) -> Structure:
 
 
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Return times, speeds, marks of random states, and findings, at random and symmetric states."""
+    """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES

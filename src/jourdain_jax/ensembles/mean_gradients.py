@@ -66,8 +66,8 @@ class MeanGradients(Printed):
         return float(self.gradient[self.outputs.index(output), self.names.index(name)])
 
     def _text(self) -> str:
-        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (f"; {self.failed} "
-            "failed and are left out" if self.failed else "")]
+        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (
+            f"; {self.failed} failed and are omitted" if self.failed else "")]
         for i, output in enumerate(self.outputs):
             lines.append(f"  {output}: mean {self.mean[i]:.6g}")
             lines += [f"    by {name}: {self.gradient[i, j]:.6g} +- "
@@ -103,7 +103,7 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
     known = {name: np.ndim(value) for name, value, _ in parameters_of(task.scene)}
     for name in shared:
         if name not in known or name in task.design.names:
-            said = "varies over the lanes, and has its derivatives without being named" if name in known else "is no parameter of the scene"
+            said = "varies over the samples; omit it" if name in known else "is no parameter of the scene"
             raise ValueError(f"`{name}` {said}; "
                 f"{nearest(name, [one for one in known if one not in task.design.names])}")
         if known[name]:
@@ -153,20 +153,23 @@ def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, en
     warned = []
     failed = int(np.sum(ends == -2))
     if failed:
-        warned.append(f"{failed} of {len(values)} motions failed without being tried in another way, as "
-            "`run` would, and are left out")
+        warned.append(
+            f"{failed} of {len(values)} motions failed and are omitted (`run` would try them in another way)"
+        )
     if np.unique(ends[ends != -2]).size > 1:
         of_event = np.array([isinstance(output, OfEvent) for output in task.outputs.values()])
         gradient[of_event] = error[of_event] = np.nan
         if of_event.any():
             none = ", ".join(name for name, is_one in zip(task.outputs, of_event, strict=True) if is_one)
-            warned.append(f"which lanes end at an event depends on what varies: the means of {none} have no "
-                "pathwise derivative; take differences")
+            warned.append(
+                f"whether a sample ends at an event depends on what varies: the means of {none} have no "
+                "pathwise derivative; take differences"
+            )
         if not of_event.all():
             warned.append(
-                f"{int(np.sum(ends >= 0))} of {len(values)} lanes end at an event, others do not, or at "
-                "another one: where an output jumps from one end to another, the share of lanes that pass "
-                "between them is missing; compare with differences of the mean"
+                f"{int(np.sum(ends >= 0))} of {len(values)} samples end at an event, others at another one "
+                "or none: if an output jumps between ends, the gradient lacks the change of these shares; "
+                "compare with differences of the mean"
             )
     for text in warned:
         warn(text, SensitivityWarning)

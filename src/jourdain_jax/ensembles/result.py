@@ -252,7 +252,8 @@ class StudyResult(Printed):
     def _text(self) -> str:
         tally = self._tally
         done = int(tally.codes.sum())
-        lines = [f"Study in {self.store.path}: {done} of {len(self)} lanes" + ("" if self.complete else "; run it again to go on")]
+        lines = [f"Study in {self.store.path}: {done} of {len(self)} lanes" + ("" if self.complete else
+            "; run it again to continue")]
         lines += [f"  {count} {results.MESSAGES[CODES.index(name)].split(';')[0]}" for name, count in self.counts.items()]
         if self.failed.size:
             lines.append("  failed: lanes " + ", ".join(map(str, self.failed[:10])) + (" ..." if self.failed.size > 10 else ""))
@@ -280,7 +281,10 @@ def load_study(path: FilePath) -> StudyResult:
     """
     found = StudyResult(Store(path))
     if found.left_out:
-        text = "are left out: the receipts of their chunks are damaged, or of another study; run the study again, which computes them anew"
+        text = (
+            "are omitted: receipts of their chunks are damaged or belong to another study; run the study "
+            "again to compute them"
+        )
         warn(f"{found.store.lanes_of(found.left_out)} {text}")
     return found
 

@@ -39,7 +39,7 @@ class SobolIndices(Printed):
 
     def _text(self) -> str:
         width = max(map(len, self.names))
-        note = f"; {self.left_out} groups with a sample that has no value are left out" if self.left_out else ""
+        note = f"; {self.left_out} groups with a missing value are omitted" if self.left_out else ""
         lines = [f"Sobol' indices from {self.groups} groups of samples, with limits of "
             f"{100 * self.confidence:g} %{note}"]
         lines.append(f"  {'':<{width}} {'first order':>22} {'total':>22}")

@@ -262,7 +262,10 @@ class Store:
                 )
             else:
                 kept = f"{len(self.receipts())} of {self.chunks} chunks are kept"
-                text = f"{error.strerror or type(error).__name__}; {kept}: make room or mend the folder, and run the study again to go on"
+                text = (
+                    f"{error.strerror or type(error).__name__}; {kept}: free disk space or repair the "
+                    "folder, and run the study again to continue"
+                )
             raise OSError(error.errno, text, str(self.path)) from error
 
     def write(self, number: int, values: Mapping[str, np.ndarray], tally: Tally) -> None:

@@ -137,8 +137,8 @@ class Study(Printed):
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
-            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected="of at least 1, or None: "
-                "trajectories of no lane are kept")
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected=
+                "of at least 1, or None to store no trajectories")
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
             # as for the scene itself: a study may continue with another memory bound

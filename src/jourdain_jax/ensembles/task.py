@@ -91,7 +91,7 @@ class Task:
 
     @property
     def settled(self) -> dict[str, Any]:
-        """Return the stated span, inputs and options by name."""
+        """Return the given span, inputs and options by name."""
         return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:

@@ -74,7 +74,7 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
 
     - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed ones of each
       chunk, and returns the indices of unfinished ones if a process died.
-    - `attempts`: how often such a chunk is tried alone, so that no other chunk can be the cause.
+    - `attempts`: how often each of these chunks is tried alone, to exclude other chunks as the cause.
 
     A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
     RuntimeError if this happens in the first block, which every process computes.
@@ -91,7 +91,10 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
                     raise RuntimeError(f"{_died(store, [0])}, with which every process begins. {_ADVICE}")
         waiting = [number for number in waiting if number not in left_out and store.receipt(number) is None]
     if left_out:
-        said = f"{_died(store, sorted(left_out))}, which are left out; all others are kept, and the same call tries these again. {_ADVICE}"
+        said = (
+            f"{_died(store, sorted(left_out))}, which are omitted; all others are stored, and the same call "
+            f"tries these again. {_ADVICE}"
+        )
         warn(said)
 
 

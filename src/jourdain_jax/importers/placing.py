@@ -60,7 +60,7 @@ def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
-    """Return principal moments about the middle for a mass of 1 kg; the axis of cylinders and capsules is z.
+    """Return principal moments about the centre for a mass of 1 kg. Cylinders and capsules have the axis z.
     """
     if kind in ("sphere", "ellipsoid", "box"):
         squares = np.square(np.broadcast_to(size, 3))

@@ -213,7 +213,7 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     for link in tree.links:
         name = link_names[link.name]
         if link.name in tree.free:
-            about = f"of the frame of {link.name}, in that of {link.parent or 'the ground'}"
+            about = f"of the frame of {link.name}, in the frame of {link.parent or 'the ground'}"
             parameters[f"{name}_origin"] = parameter(link.position, unit="m", about=about)
         if link.name in moving and link.mass is not None:
             parameters |= _mass_parameters(link, name)
@@ -261,7 +261,7 @@ def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
         if link.joints or link.parent is None:
             if fixed[link.name] and "inertia" not in ignore:
                 _check_moments(combined(fixed[link.name]), f"{source}: link "
-                    f"`{link.name}`{', with what is fixed to it,' if len(fixed[link.name]) > 1 else ''}")
+                                                           f"`{link.name}`{', with links fixed to it,' if len(fixed[link.name]) > 1 else ''}")
         else:
             fixed[link.parent] += [Mass(m.mass, link.position + link.turn @ m.centre, link.turn @ m.inertia @ link.turn.T) for m in fixed[link.name]]
         if (link.mass is not None or link.name in heavy) and link.parent is not None:

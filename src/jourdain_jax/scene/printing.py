@@ -83,7 +83,7 @@ def _value(value) -> str:
 
 
 def in_digits(values) -> list[str]:
-    """Return numbers with six digits; those below the round-off of the largest are 0."""
+    """Return numbers with six digits; numbers below the round-off of the largest become 0."""
     values = np.asarray(values)
     least = eps_of(values) * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]

@@ -20,7 +20,7 @@ from jourdain_jax.scene.names import Named, check_names, nearest
 from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.scene.visuals import Visual
 
-_VANISH = "return numbers that vanish where the constraint is met"
+_VANISH = "return numbers that vanish if the constraint holds"
 
 
 def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
@@ -161,7 +161,7 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
     """Return values of the conserved quantities by name."""
-    advice = "give every component a name of its own"
+    advice = "give every component its own name"
     return _numbers(scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice)
 
 

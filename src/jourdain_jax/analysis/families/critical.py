@@ -42,7 +42,7 @@ FOUND, NOT_FOUND, SINGULAR = range(3)
 MEANINGS = (
     "found",
     "not found: the family's point does not continue to these parameters",
-    "not a smooth function of the parameters here: eigenvalues meet, or special points do",
+    "not a smooth function of the parameters here: eigenvalues or special points coincide",
 )
 SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0))}  # S = w (first) + (second), by rows
 
@@ -218,7 +218,7 @@ class Special(eqx.Module):
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
     def given(self, numbers: Float[Array, "numbers"], X: Unknowns) -> Float[Array, "all_numbers"]:
-        """Arguments of the program: all numbers, a, b, and S(w) by rows."""
+        """Return the arguments of the program: all numbers, a, b, and S(w) by rows."""
         _, a, b, w = self.parts(X)
         of_w, fixed = np.array(SHAPES[self.kind])
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])

@@ -145,9 +145,8 @@ class SteadyEquations(Motions):
         """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of motion
         along the family or of held quantities.
 
-        There are further steady motions along the directions T. Their zero eigenvalues are removed as a
-        subspace: the other eigenvalues are those of P' A P, where the columns of P are orthonormal and
-        perpendicular to T.
+        The directions T lead to further steady motions and have zero eigenvalues. The other eigenvalues are
+        the eigenvalues of P' A P, where the columns of P are orthonormal and perpendicular to T.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
         F, C = look.small
