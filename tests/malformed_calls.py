@@ -180,14 +180,14 @@ FITS = {
     "jj.MultipleShooting()": "expects either `pieces`",
     "jj.MultipleShooting(pieces=4, duration=1.0)": "expects either `pieces`",
     "jj.MultipleShooting(pieces=1)": "two or more",
-    "jj.MultipleShooting(duration=0.0)": "above zero",
-    "jj.MultipleShooting(duration=np.nan)": "above zero",
+    "jj.MultipleShooting(duration=0.0)": "positive finite time",
+    "jj.MultipleShooting(duration=np.nan)": "positive finite time",
     "pieces(11, pieces=20)": "run 0 has 11 samples, too few for 20 pieces",
     "pieces(11, duration=2.0)": "one piece only",
     "planned(sigma=None)": "sigma of channel `x` is None",
     "planned(correlation_time=0.1)": "has a correlation time",
     "planned().log_det('mas')": ("KeyError", "`mas` is not among the unknowns"),
-    "cell(disc, 'rin')": "the load cell `plate` of run 0 of `TiltingDisc` is under contact `rin`, which is not there; did you mean `rim`",
+    "cell(disc, 'rin')": "the load cell `plate` of run 0 of `TiltingDisc` is under contact `rin`, which does not exist; did you mean `rim`",
     "cell(jj.models.TwoWheelAxleRedundant(), 'wheel1')": "is under contact `wheel1`, whose force is not determined",
     "jj.LoadCell(3)": "`contact` of `LoadCell` is an int",
     "jj.steady(disc, {'lean': 0.3}, held=('leen',))": "did you mean `lean`",
@@ -309,7 +309,7 @@ CLASSES = {
     "jj.simulate(Random(), {'x': 1.0}, t1=1.0)": "draws random numbers",
     "jj.accelerations(described(geometric_constraints=lambda self, pose: {'row': pose.q.x - pose.q.y},"
     " velocity_constraints=lambda self, motion: {'row': motion.u.x_rate}), 0.0, jnp.zeros(2), jnp.zeros(2))": (
-        "row name `row` of `Described` is used twice"
+        "constraint name `row` of `Described` is used twice"
     ),
 }
 

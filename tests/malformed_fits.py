@@ -131,7 +131,7 @@ SENSORS: dict[str, str] = {
     "fitted(gain=[1.0, 2.0])": "`gain` of sensor `gyro` of run 0 of `Cart` has shape (2,), expected () or ()",
     "fitted(lag=jj.Estimate(0.0))": "first guess of `gyro.lag` is 0.0; expected a first guess above zero",
     "jj.fit(cart, [shown(gain=gain), shown(gain=jj.Estimate(2.0))], 'mass')": (
-        "run 0 and run 1 state `gyro.gain` differently, but share it ... ; give both the same, or `per_run=True`"
+        "run 0 and run 1 share `gyro.gain` but state it differently ... ; give both the same, or `per_run=True`"
     ),
     "jj.log_likelihood(cart, shown(gain=gain))": "`gyro.gain` is to be estimated, but a likelihood needs its value",
     "with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1))": "command of input `push` of run 0 of `Cart` ends at 1 s, before",
