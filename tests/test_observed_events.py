@@ -84,5 +84,5 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
 def test_a_motion_that_does_not_meet_the_event_is_named():
     other = fit(run(values=np.full(9, 0.3), events={"far": (0.9, SIGMA)}))
     assert not other.converged
-    assert "the motion of run 0 does not meet `far` before 4 times the observed time" in "".join(other.warnings)
+    assert "the motion of run 0 does not reach `far` before 4 times the observed time" in "".join(other.warnings)
     assert jj.log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf

@@ -189,8 +189,8 @@ def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[n
 
 
 def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that express the own unknowns of a piece by the shared ones and by those of the
-    previous piece, and the remaining rows, without own unknowns.
+    """Return the rows that express a piece's unknowns by shared ones and the previous piece's; and the
+    remaining rows, without the piece's unknowns.
 
     `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """

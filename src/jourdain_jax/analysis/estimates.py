@@ -55,14 +55,14 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
             found.append(
                 f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: "
-                "derivatives and standard errors omit the shift of the times of jumps; make the jumps gradual"
+                "derivatives and standard errors omit the shift of jump times; make the jumps gradual"
             )
         if type(scene).events is Scene.events:
             continue
         if run.ended_by:
             if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
                 found.append(
-                    f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the "
+                    f"the motion of run {index} does not reach `{run.ended_by}` before {LATEST:g} times the "
                     "observed time; use a closer first guess"
                 )
             continue

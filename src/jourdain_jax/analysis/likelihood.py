@@ -98,8 +98,8 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
     if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
         yield (
-            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: a "
-            "wrapped angle, but coordinates are continuous; give `np.unwrap` of it"
+            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn, as "
+            "a wrapped angle; coordinates are continuous: apply `np.unwrap`"
         )
 
 

@@ -2,10 +2,10 @@
 after an interruption.
 
     NAME/zarr.json, NAME/c/0, ...    arrays, cut into chunks of lanes; every chunk ends in its CRC-32C, as Zarr's codec `crc32c` has it
-    run/study.json                   what study this is: format, digests, settings, versions; written once
-    run/grid.json                    the grid of the statistics, written by whichever process computes the first block first
-    run/manifest.json                digests of these two and of all other files that are written once, and of itself; replaced in one step
-    run/chunks/K                     receipt of chunk K: written when all its arrays are, with their checksums, its counts and its sums
+    run/study.json                   identity of the study: format, digests, settings, versions; written once
+    run/grid.json                    the grid of the statistics, written by the first process that completes block 0
+    run/manifest.json                digests of all files that are written once, and of itself; replaced in one step
+    run/chunks/K                     receipt of chunk K: written after its arrays, with their checksums, its counts and its sums
     run/lock                         held by the process that runs the study
 
 A chunk counts as finished if its receipt is intact and belongs to this study and grid, and its arrays match
