@@ -18,6 +18,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long. Timings are taken in
 # `bench/`, with none of this.
 quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
+# Of loops as large as a motion these passes take a fourth of XLA's time.
+quick += " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # from 0.11.1 on, an unknown flag
     quick += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", quick)
@@ -29,10 +31,10 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-friction modes sides held_rows linearize identify native_mutants malformed_inputs gpu inertia mutants periodic
-types result_codes load_jumps sensors study_faults plain_numbers inputs events feasible_starts native simulate
-whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32 derivatives_of_failed
-diffrax build fit_report quality native_derivatives native_second traced_parameters extremes report
+friction modes sides held_rows crossings linearize identify malformed_inputs native_mutants inertia gpu mutants
+periodic study_faults result_codes load_jumps native events feasible_starts types stiff sensors log_density simulate
+build storage_faults report diffrax code_map lowering fit_report studies whipple_bicycle rank_of_vanishing_rows
+quality native_functions native_derivatives call_costs rows_lost_at_rest extremes readme inputs float32
 """
 
 

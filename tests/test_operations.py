@@ -98,6 +98,29 @@ def test_the_derivative_of_an_extreme_is_shared_by_all_that_reach_it(largest, po
         assert_allclose(to_second_order(f, point), by_jax(f, point), rtol=1e-14, atol=1e-14)
 
 
+SOME, FAR = np.array([2, 0, 1]), np.array([5, -9, 1])
+ENTRIES = [
+    lambda x: x[SOME, 1],
+    lambda x: x[:, SOME, SOME % 2],
+    lambda x: x.at[FAR].get(mode="clip"),
+    lambda x: jax.vmap(lambda row, k: row[:, k], in_axes=(1, 0))(x, jnp.array([0, 1, 1, 0])),
+    lambda x: x.at[1:, 0].set(5.0),
+    lambda x: x.at[SOME, ..., 0].set(x[..., 1]),
+    lambda x: x.at[FAR].set(9.0, mode="drop"),
+    lambda x: jax.vmap(lambda row, k: row.at[:, k].add(x[0, :, 0]))(x, SOME % 2),
+]
+
+
+@pytest.mark.parametrize("f", ENTRIES)
+def test_entries_at_places_are_those_of_jax(f):
+    graph, x = Graph(), np.arange(24.0).reshape(3, 4, 2)
+    inputs = [graph.input(str(k), True) for k in range(24)]
+    (found,) = interpret(graph, jax.make_jaxpr(f)(x), [Nodes(np.reshape(inputs, x.shape))])
+    nodes = as_nodes(graph, found)
+    values = Probes(graph, {str(k): np.array([float(k)]) for k in range(24)})(nodes.ravel().tolist())
+    assert_array_equal(values.reshape(nodes.shape), f(jnp.asarray(x)))
+
+
 def test_nothing_is_assumed_of_the_sign_of_a_parameter():
     graph = Graph()
     p, x = graph.input("p", False), graph.input("x", True)

@@ -1,6 +1,7 @@
 """What checkers of types say of users' code: nothing of what is right, and something of each mistake. pyright runs where it is installed."""
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 from pages import DOCS, ROOT, code_of
 
 OPTIONS = {
-    "mypy": ("--strict", "--allow-untyped-defs", "--allow-incomplete-defs", "--allow-untyped-calls", "--cache-dir=cache", "--config-file=mypy.ini"),
+    "mypy": ("--strict", "--allow-untyped-defs", "--allow-incomplete-defs", "--allow-untyped-calls", f"--cache-dir={os.devnull}", "--config-file=mypy.ini"),
     "pyright": ("--pythonpath", sys.executable),
 }
 

@@ -3,8 +3,9 @@
 Primitives without a rule here run one by one in JAX, which takes tens of milliseconds each to compile.
 """
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -260,29 +261,36 @@ def _reshaped(equation, x, *dynamic):
     return x.reshape(equation.outvars[0].aval.shape)
 
 
-def gathered(equation, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
-    """Return `x[..., indices, ...]`, or None for an unsupported gather."""
-    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    axes, lanes = _integers(numbers.start_index_map), _integers(numbers.operand_batching_dims)
-    whole = all(size == (1 if axis in (*axes, *lanes) else x.shape[axis]) for axis, size in enumerate(sizes))
-    places = _places(x, axes, lanes, _integers(numbers.start_indices_batching_dims), indices)
-    if not whole or set(_integers(numbers.collapsed_slice_dims)) != set(axes) or places is None:
+def places(shape: Sequence[int], indices: np.ndarray, sizes: Sequence[int], axes, lanes, mode) -> np.ndarray:
+    """Return the flat places, in an array of this shape, of the windows of these sizes that begin at `indices`
+    along `axes`; -1 for a window beyond the array, unless the mode moves it inside.
+
+    `lanes`: pairs of an axis of the array and the axis of the indices that it goes along with. Axes of the
+    indices come first, those of windows last.
+    """
+    begin = np.zeros((*indices.shape[:-1], len(shape)), int)
+    begin[..., list(axes)] = indices
+    for axis, along in lanes:
+        begin[..., axis] = np.indices(indices.shape[:-1], sparse=True)[along]
+    inside = np.clip(begin, 0, np.subtract(shape, sizes))
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1][: len(shape)]
+    first = (inside @ strides)[(..., *[None] * len(shape))]
+    found = first + np.arange(math.prod(shape)).reshape(shape)[tuple(map(slice, sizes))]
+    if mode != jax.lax.GatherScatterMode.FILL_OR_DROP:
+        return found
+    beyond = np.any(begin != inside, axis=-1)
+    return np.where(beyond.reshape(first.shape), -1, found)
+
+
+def gathered(params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
+    """Return the windows of x that begin at the indices; None if one lies beyond x."""
+    n, count = params["dimension_numbers"], indices.ndim - 1
+    lanes = zip(n.operand_batching_dims, n.start_indices_batching_dims, strict=True)
+    found = places(x.shape, indices, params["slice_sizes"], n.start_index_map, lanes, params["mode"])
+    if np.any(found < 0):
         return None
-    found = np.moveaxis(x, (*lanes, *axes), range(len(places)))[places]
-    return np.moveaxis(found, range(indices.ndim - 1, found.ndim), _integers(numbers.offset_dims))
-
-
-def _places(x: np.ndarray, axes, lanes, lanes_of_indices, indices: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Return index arrays for the axes `(*lanes, *axes)` of x, or None if an index is out of bounds."""
-    sizes = np.array([x.shape[axis] for axis in axes], int)
-    if not np.all((indices >= 0) & (indices < sizes)):
-        return None
-    every = np.indices(indices.shape[:-1], sparse=True)
-    return *(every[axis] for axis in lanes_of_indices), *np.moveaxis(indices, -1, 0)
-
-
-def _integers(numbers) -> tuple[int, ...]:
-    return tuple(map(int, numbers))
+    found = np.squeeze(found, tuple(count + axis for axis in (*n.collapsed_slice_dims, *n.operand_batching_dims)))
+    return np.ravel(x)[np.moveaxis(found, range(count, found.ndim), n.offset_dims)]
 
 
 RULES: dict[str, Callable] = {
@@ -313,6 +321,6 @@ RULES: dict[str, Callable] = {
     "dynamic_slice": lambda e, x, *starts: x[_window(x, starts, e.params["slice_sizes"])],
     "iota": _iota,
     "pad": _pad,
-    "gather": gathered,
+    "gather": lambda e, x, indices: gathered(e.params, x, indices),
     "platform_index": _platform,
 }

@@ -12,6 +12,7 @@ G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -123,6 +124,7 @@ class Solution(NamedTuple):
     holds: Bool[Array, "contacts"]
 
 
+@jax.jit
 def coulomb(law: Law) -> Solution:
     """Return forces that satisfy Coulomb's law at all contacts simultaneously, with w = G P + b.
 
@@ -137,23 +139,28 @@ def coulomb(law: Law) -> Solution:
     Derivatives are those of these equations. Redundant contacts keep the shares that the sweeps find. Source:
     P. Alart and A. Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
     """
-    G, b, count = law.G, law.b, len(law.target)
-    normal, tangential = _scales(G)
-    P = jnp.zeros((count, 3), b.dtype)
+    count = len(law.target)
+    P = jnp.zeros((count, 3), law.b.dtype)
     for turn in range(count * count * SWEEPS):
-        j = turn % count
-        w = G[3 * j : 3 * j + 3] @ P.ravel() + b[3 * j : 3 * j + 3]
-        N = jnp.where(law.touches[j], jnp.maximum(P[j, 0] - (w[0] - law.target[j]) * normal[j], 0.0), 0.0)
-        T = P[j, 1:] - (w[1:] + G[3 * j + 1 : 3 * j + 3, 3 * j] * (N - P[j, 0])) * tangential[j]
-        bound, square = law.static[j] * N, T @ T
-        over = square > bound * bound
-        T = jnp.where(over, bound / jnp.sqrt(jnp.where(over, square, 1.0)), 1.0) * T
-        P = P.at[j].set(jnp.append(N, jnp.where(law.slides[j], -law.friction[j] * N * law.e[j], T)))
+        P = _swept(law, P, turn % count)
     modes = _modes(law, P)
     for _ in range(STEPS + count - 1):
         P, e = _improved(law, P, modes)
         found, modes = modes._replace(direction=e), _modes(law, P)
     return Solution(P, found, holds(law, P, found))
+
+
+@partial(jax.jit, static_argnums=2)
+def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "contacts 3"]:
+    """Return the forces after contact j has taken those that its law asks for, given the others."""
+    normal, tangential = _scales(law.G)
+    w = law.G[3 * j : 3 * j + 3] @ P.ravel() + law.b[3 * j : 3 * j + 3]
+    N = jnp.where(law.touches[j], jnp.maximum(P[j, 0] - (w[0] - law.target[j]) * normal[j], 0.0), 0.0)
+    T = P[j, 1:] - (w[1:] + law.G[3 * j + 1 : 3 * j + 3, 3 * j] * (N - P[j, 0])) * tangential[j]
+    bound, square = law.static[j] * N, T @ T
+    over = square > bound * bound
+    T = jnp.where(over, bound / jnp.sqrt(jnp.where(over, square, 1.0)), 1.0) * T
+    return P.at[j].set(jnp.append(N, jnp.where(law.slides[j], -law.friction[j] * N * law.e[j], T)))
 
 
 def _scales(G: Float[Array, "rows rows"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
@@ -174,6 +181,7 @@ def _modes(law: Law, P: Float[Array, "contacts 3"]) -> Modes:
     return Modes(jnp.where(closed, 1.0, 0.0), jnp.where(sticks, 1.0, 0.0), e)
 
 
+@jax.jit
 def _improved(
     law: Law, P: Float[Array, "contacts 3"], modes: Modes
 ) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
@@ -231,6 +239,7 @@ class Impulse(NamedTuple):
     exists: Flag  # whether the law has a solution
 
 
+@partial(jax.jit, static_argnums=0)
 def impulse(
     kind: str,
     G: Float[Array, "3 3"],

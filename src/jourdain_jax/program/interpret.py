@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.jaxprs import called, evaluated
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.eager.numpy_backend import applied
+from jourdain_jax.eager.numpy_backend import applied, gathered, places
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
@@ -104,16 +105,17 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
 
 
 def _elementwise(graph: Graph, result: Callable, inputs: Sequence[Value]) -> np.ndarray:
-    arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs))
-    flat = [np.ravel(a).tolist() for a in arrays]
-    found = [result(*entries) for entries in zip(*flat, strict=True)]
+    arrays = [as_nodes(graph, x) for x in inputs]
+    if any(a.shape != arrays[0].shape for a in arrays):
+        arrays = np.broadcast_arrays(*arrays)
+    found = [result(*entries) for entries in zip(*(a.ravel().tolist() for a in arrays), strict=True)]
     return np.array(found, dtype=np.int64).reshape(arrays[0].shape)
 
 
 def refuse(equation) -> None:
     """Raise ValueError if a scene cannot contain this equation."""
-    kinds = {v.aval.dtype for v in (*equation.invars, *equation.outvars)}
-    if any(jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
+    kinds = [v.aval.dtype for v in (*equation.invars, *equation.outvars)]
+    if any(not isinstance(kind, np.dtype) and jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
         raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
             "them outside and pass them as parameters or inputs")
 
@@ -149,38 +151,36 @@ def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.nd
 
 
 def _gather(graph, inputs, params):
-    """Gather nodes by gathering their positions."""
-    x, indices = inputs
-    with jax.ensure_compile_time_eval():
-        positions = jnp.arange(x.size, dtype=jnp.int32).reshape(x.shape)
-        places = np.asarray(jax.lax.gather_p.bind(positions, jnp.asarray(indices), **params | {"fill_value": -1}))
-    if np.any(places < 0):
+    if (found := gathered(params, *inputs)) is None:
         raise Unsupported("an index out of bounds")
-    return np.ravel(x)[places]
+    return found
+
+
+def _targets(inputs, params) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flat places that a scatter changes, and the entries that it takes there."""
+    x, indices, update = inputs
+    n, count = params["dimension_numbers"], indices.ndim - 1
+    moved = np.moveaxis(update, n.update_window_dims, range(count, update.ndim))
+    window = iter(moved.shape[count:])
+    alone = (*n.inserted_window_dims, *n.operand_batching_dims)
+    sizes = [1 if axis in alone else next(window) for axis in range(x.ndim)]
+    lanes = zip(n.operand_batching_dims, n.scatter_indices_batching_dims, strict=True)
+    found = places(x.shape, indices, sizes, n.scatter_dims_to_operand_dims, lanes, params["mode"]).ravel()
+    return found[found >= 0], moved.ravel()[found >= 0]
 
 
 def _scatter(graph, inputs, params):
-    x, indices, update = inputs
-    count = x.size
-    with jax.ensure_compile_time_eval():
-        base = jnp.arange(count, dtype=jnp.int32).reshape(x.shape)
-        source = jnp.arange(count, count + update.size, dtype=jnp.int32).reshape(update.shape)
-        keep = {k: v for k, v in params.items() if k not in ("update_jaxpr", "update_consts")}
-        places = np.asarray(jax.lax.scatter_p.bind(base, jnp.asarray(indices), source, update_jaxpr=None, update_consts=(), **keep))
-    return np.concatenate([np.ravel(x), np.ravel(update)])[places]
+    flat, (where, update) = inputs[0].flatten(), _targets(inputs, params)
+    flat[where] = update
+    return flat.reshape(inputs[0].shape)
 
 
 def _scatter_add(graph, inputs, params):
-    x, indices, update = inputs
-    target = _scatter(graph, [np.full(x.shape, -1), indices, np.arange(update.size).reshape(update.shape)], params)
-    hit = np.ravel(target)
-    if len(set(hit[hit >= 0].tolist())) != update.size:
+    flat, (where, update) = inputs[0].flatten(), _targets(inputs, params)
+    if len(set(where.tolist())) != inputs[2].size:
         raise Unsupported("the operation `scatter-add` with repeated places")
-    flat, added = np.ravel(x).copy(), np.ravel(update)
-    for place, source in enumerate(hit.tolist()):
-        if source >= 0:
-            flat[place] = graph.add(int(flat[place]), int(added[source]))
-    return flat.reshape(x.shape)
+    flat[where] = [graph.add(*pair) for pair in zip(flat[where].tolist(), update.tolist(), strict=True)]
+    return flat.reshape(inputs[0].shape)
 
 
 # Operands that hold entries; the others are indices.
@@ -202,12 +202,12 @@ _OF_NODES: dict[str, Callable] = {
 
 def _is_rounded(dtype: np.dtype) -> bool:
     """Return whether a type has lower precision than the program."""
-    return _kind(dtype) == "f" and dtype.itemsize < jnp.result_type(float).itemsize
+    return _kind(dtype) == "f" and dtype.itemsize < real_type().itemsize
 
 
 def _kind(dtype: np.dtype) -> str:
     """Return NumPy's kind of a type; bfloat16 and similar types are floats."""
-    return "f" if jnp.issubdtype(dtype, jnp.floating) else dtype.kind
+    return dtype.kind if dtype.kind != "V" else "f" if jnp.issubdtype(dtype, jnp.floating) else "V"
 
 
 def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:

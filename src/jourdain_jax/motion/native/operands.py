@@ -8,7 +8,7 @@ saved times if lanes share them.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 
@@ -23,7 +23,8 @@ class Operands(NamedTuple):
 
     def _laned(self, x: Array, rank: int) -> Array:
         """Return the operand with all batch axes."""
-        return jnp.broadcast_to(x, (*self.batch, *x.shape[x.ndim - rank :]))
+        shape = (*self.batch, *x.shape[x.ndim - rank :])
+        return lax.broadcast_in_dim(x, shape, range(len(shape) - x.ndim, len(shape)))
 
     def _rows(self, values: Sequence) -> list[tuple[Any, int, bool]]:
         """Return each vector, number or constant of a start with its rank, and whether all lanes share it."""
@@ -48,10 +49,12 @@ class Operands(NamedTuple):
         """Return rows as one array, with or without batch axes."""
         found = []
         for x, rank, _ in rows:
-            x = self._laned(jnp.asarray(x, dtype), rank) if laned else jnp.asarray(x, dtype)
-            found.append(jnp.moveaxis(x, -1, 0) if rank else x[None])
+            x = lax.convert_element_type(x, dtype)
+            x = self._laned(x, rank) if laned else x
+            found.append(lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1))) if rank else lax.expand_dims(x, (0,)))
         # XLA compiles a concatenation faster with the batch axis last (`markers.entries_of`)
-        return jnp.moveaxis(jnp.concatenate(found), 0, -1)
+        joined = lax.concatenate(found, 0)
+        return lax.transpose(joined, (*range(1, joined.ndim), 0))
 
     def side_by_side(self, *values: Array) -> list[Array]:
         """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share.

@@ -22,7 +22,7 @@ from functools import cache, lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
+from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
 
@@ -123,11 +123,9 @@ def _made(
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
     """Return the operands that `make` computes from operands of a call, and the context for a call with them.
     """
-    avals = [
-        ctx.avals_in[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False)
-        for x in jax.eval_shape(make, *ctx.avals_in)
-    ]
-    return ctx.replace(avals_in=avals), mlir.lower_fun(make)(ctx.replace(primitive=None), *values)
+    made = jax.make_jaxpr(make)(*ctx.avals_in)
+    lower = mlir.lower_fun(jaxpr_as_fun(made))
+    return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)
 
 
 def on_cpu(
