@@ -138,7 +138,7 @@ def test_lanes_are_put_together_in_the_domain_or_end_with_a_code():
 def test_an_attitude_of_which_a_part_is_named_is_refused_where_many_have_it(given):
     disc = SCENES["disc with quaternion"]
     for look in (jj.start, lambda scene, values: jj.simulate(scene, values, t1=0.1)):
-        with pytest.raises(ValueError, match=r"of the quaternion `attitude` only .*; give all four parts, attitude=\(w, x, y, z\)"):
+        with pytest.raises(ValueError, match=r"of the quaternion `attitude` is given, .*; give all four parts, attitude=\(w, x, y, z\)"):
             look(disc, given)
     if len(given) == 1:
         lanes = jj.rollout(disc, {"attitude_w": np.array([0.0, 0.3])}, ts=[0.1], progress=False)

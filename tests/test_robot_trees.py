@@ -137,7 +137,7 @@ def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(momen
     joint = '<joint name="f" type="fixed"><parent link="arm"/><child link="plate"/><origin xyz="0 0 0.1" rpy="0.3 0.2 0.1"/></joint></robot>'
     arm = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), 0.01 * np.eye(3)))
     assert jj.from_urdf(arm.replace("</robot>", plate + joint))().plate_mass == 0.1
-    with pytest.raises(ValueError, match=r"link `arm`, with what is fixed to it, has principal moments"):
+    with pytest.raises(ValueError, match=r"link `arm`, with links fixed to it, has principal moments"):
         jj.from_urdf(arm.replace("0.01", "1e-8").replace('xyz="0.0 0.3 0.0"', "").replace("</robot>", (plate + joint).replace("0 0 0.1", "0 0 0")))
 
 
