@@ -13,7 +13,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 464_864,
+    "code tokens of src": 464_943,
     "code tokens of docs": 11_431,
     "code tokens of notebooks": 7444,
     "caches": 49,

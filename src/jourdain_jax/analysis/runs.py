@@ -230,6 +230,8 @@ class Group:
         # bytes of saved states with tangents in one loop: far below the size that XLA compiles into one
         # function (see `jourdain_jax`)
         self._width, self._fewest = int(min(64, max(1, 2**18 // states))), 1
+        self._threads = os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(self._threads)  # for all evaluations; threads start where needed
 
     def places(self, runs: np.ndarray) -> np.ndarray:
         """Return the positions of these runs in the group."""
@@ -245,11 +247,8 @@ class Group:
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
         yield lanes(*first)  # compiles if necessary
-        if not chunks:
-            return
-        with ThreadPoolExecutor() as pool:
-            for k in range(0, len(chunks), together := os.cpu_count() or 1):
-                yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
+        for k in range(0, len(chunks), self._threads):
+            yield from self._pool.map(lanes, *zip(*chunks[k : k + self._threads], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """Return, for each batch, the number of lanes that count and the indices of their members and runs.

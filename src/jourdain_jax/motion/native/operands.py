@@ -6,8 +6,10 @@ saved times if lanes share them.
 """
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -46,15 +48,20 @@ class Operands(NamedTuple):
         return tuple(is_shared for x, rank, is_shared in rows for _ in range(x.shape[-1] if rank else 1))
 
     def _joined(self, rows: list, dtype, laned: bool) -> Array:
-        """Return rows as one array, with or without batch axes."""
+        """Return rows as one array, with or without batch axes. Neighbours with the same batch axes are joined
+        before they are given the others.
+        """
         found = []
-        for x, rank, _ in rows:
-            x = lax.convert_element_type(x, dtype)
-            x = self._laned(x, rank) if laned else x
-            found.append(lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1))) if rank else lax.expand_dims(x, (0,)))
-        # XLA compiles a concatenation faster with the batch axis last (`markers.entries_of`)
-        joined = lax.concatenate(found, 0)
-        return lax.transpose(joined, (*range(1, joined.ndim), 0))
+        for _, some in groupby(rows, lambda row: np.shape(row[0])[: np.ndim(row[0]) - row[1]]):
+            each = []
+            for x, rank, _ in some:
+                x = lax.convert_element_type(x, dtype)
+                each.append(lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1))) if rank else lax.expand_dims(x, (0,)))
+            # XLA compiles a concatenation of numbers faster with the batch axis last (`markers.entries_of`)
+            part = lax.concatenate(each, 0)
+            part = lax.transpose(part, (*range(1, part.ndim), 0))
+            found.append(self._laned(part, 1) if laned else part)
+        return lax.concatenate(found, found[0].ndim - 1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
         """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share.
