@@ -242,7 +242,7 @@ BAD = {
     "unknown-function": (lambda: systems.pendulum_with(systems.given_function), r"function `f` in `.*` has no counterpart in JAX"),
     "function-not-in-jax": (lambda: systems.pendulum_with(lambda q, N: sympy.besselj(0, q) * N.x), r"function `besselj`"),
     "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is not a real number"),
-    "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not on their rates"),
+    "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not their rates"),
     "rate-of-an-input": (lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x), r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate"),
 }
 

@@ -236,10 +236,10 @@ WRONG = {  # the code's text in a lane, the text of the error alone
     "slope=0.1": ("a body off its ground: contact `rim`", "at a probed state its body is"),
     "tilting=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", "at 0 m/s by `origin`"),
     "carried=1.0": ("a ground that another body carries: the ground of contact `top`", "moves with another body"),
-    "axis=2.0": ("no unit vector: the axis of contact `top`", "the axis of contact `top` .* from 1 by 1,"),
-    "normal=1.1": ("no unit vector: the normal of contact `rim`", r"normal of contact `rim` .* from 1 by 0\.1"),
+    "axis=2.0": ("not a unit vector: the axis of contact `top`", "the axis of contact `top` .* from 1 by 1,"),
+    "normal=1.1": ("not a unit vector: the normal of contact `rim`", r"normal of contact `rim` .* from 1 by 0\.1"),
     "rise=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", r"at 0 m/s by `origin` .* but at 0\.3 m/s"),
-    "down=(0, 0, -2)": ("no unit vector: the direction of gravity in load 1", "gravity in load 1 .* differs from 1 by 1,"),
+    "down=(0, 0, -2)": ("not a unit vector: the direction of gravity in load 1", "gravity in load 1 .* differs from 1 by 1,"),
 }
 
 

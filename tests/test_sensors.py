@@ -231,7 +231,7 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     held = jj.fit(Cart(), late(0, 0.0, tau=float(found["late.lag"].high)), ("mass",))
     assert float(held.chi_square - found.chi_square) == pytest.approx(3.841, rel=0.05)
     assert held["late.delay"].value < found["late.delay"].low
-    assert found.warning.startswith("the interval of `late.delay` is too narrow: with `late.lag` away from its bound")
+    assert found.warning.startswith("the interval of `late.delay` is too narrow: with `late.lag` off its bound")
     assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
     assert near["late.lag"].low > 0.0

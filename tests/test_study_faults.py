@@ -464,7 +464,7 @@ def _with_deaths(path, deadly, first_block=False):
 def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes_on(deadly, whole, tmp_path):
     path = tmp_path / "discs.zarr"
     lanes = ", ".join({1: "32 to 63", 2: "64 to 89"}[number] for number in deadly)
-    with pytest.warns(UserWarning, match=rf"processes died 3 times on lanes {lanes} of .*left out; all others are kept.*memory=") as said:
+    with pytest.warns(UserWarning, match=rf"processes died 3 times on lanes {lanes} of .*omitted; all others are stored.*memory=") as said:
         assert _with_deaths(path, deadly) == dict.fromkeys(deadly, 3)
     assert len(said) == 1
     found = jj.load_study(path)

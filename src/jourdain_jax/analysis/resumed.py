@@ -54,7 +54,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
         raise ValueError(
-            f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: "
+            f"`data` have the unknowns {', '.join(unknowns.labels)}, expected the fit's: "
             f"{', '.join(fit.labels)}"
         )
     theta[0, unknowns.estimated] = fit.values
