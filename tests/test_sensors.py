@@ -189,7 +189,7 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
     if late:
         assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
     bad = jj.Experiment(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
-    with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` sits on body `arn`, which is not there; did you mean `arm`"):
+    with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` is on body `arn`, which does not exist; did you mean `arm`"):
         jj.fit(Swing(), bad, ("stiffness",))
 
 
