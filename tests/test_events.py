@@ -491,3 +491,62 @@ def test_a_bounce_that_is_over_has_happened(backend):
     assert {lanes.event_names[event] for event in np.asarray(lanes.event)} == {"floor"}
     assert np.all(lanes.t_end < 1e-6)
     assert lanes.t_end[-1] == 0.0
+
+
+class AtLevel(OnLine):
+    """A mass that starts at its event, under a force that grows with time; forwards and back in time."""
+
+    level: float = jj.parameter(0.0)
+    push: float = jj.parameter(0.0)
+    growth: float = jj.parameter(0.0)
+    goes_on = False
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.push + self.growth * motion.t),)
+
+    def events(self, motion):
+        value = motion.q.x - self.level
+        return {"level": jj.Event(value, jump={"x_rate": -0.5 * motion.u.x_rate}) if self.goes_on else value}
+
+
+class OffLevel(AtLevel):
+    goes_on = True
+
+
+# level, push, growth, and x and its rate at the start -> time of the first event (None: none)
+AT_LEVEL = {
+    "accelerates": ((0.0, 2.0, 0.0, 0.0, 0.0), None),
+    "accelerates from round-off": ((0.1 + 0.2, 2.0, 0.0, 0.3, 0.0), None),
+    "sets off by its third derivative": ((0.0, 0.0, 3.0, 0.0, 0.0), None),
+    "comes back": ((0.0, 2.0, -6.0, 0.0, 0.0), 1.0),
+    "comes back at once": ((0.0, 2.0, -600.0, 0.0, 0.0), 0.01),
+    "rises and falls": ((0.0, -2.0, 0.0, 0.0, 1.0), 1.0),
+    "falls": ((0.0, -2.0, 0.0, 0.0, 0.0), 0.0),
+    "falls by its third derivative": ((0.0, 0.0, -3.0, 0.0, 0.0), 0.0),
+    "sinks and rises": ((0.0, 2.0, 0.0, 0.0, -1e-6), 0.0),
+    "is below": ((0.0, 2.0, 0.0, -1e-9, 0.0), 0.0),
+    "stays": ((0.0, 0.0, 0.0, 0.0, 0.0), 0.0),
+}
+WAYS_FROM_LEVEL = [{"backend": "native"}, {"solver": jj.Taylor()}, {"backend": "xla"}, {"backend": "dense"}, {"solver": jj.RadauIIA()}, {"solver": diffrax.Tsit5()}]
+
+
+@pytest.mark.parametrize("options", WAYS_FROM_LEVEL, ids=str)
+@pytest.mark.parametrize("kind", [AtLevel, OffLevel])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_value_of_zero_at_the_start_falls_by_the_first_derivative_that_is_not_zero(options, kind, direction):
+    if kind is OffLevel and isinstance(options.get("solver"), diffrax.Tsit5):
+        pytest.skip("diffrax does not go on after events")
+    level, push, growth, x, rate = np.array([numbers for numbers, _ in AT_LEVEL.values()]).T
+    expected = [np.inf if time is None else time for _, time in AT_LEVEL.values()]
+    parameters = {"level": level, "push": push, "growth": direction * growth}
+    lanes = jj.rollout(kind(), {"x": x, "x_rate": direction * rate}, parameters=parameters, t1=2.0 * direction, **options).lanes
+    times, happened = (lanes.phases.ts[:, 0], lanes.phases.events[:, 0] >= 0) if kind is OffLevel else (lanes.t_end, lanes.event >= 0)
+    assert_allclose(np.where(happened, np.abs(times), np.inf), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_a_motion_that_sets_off_from_its_event_has_derivatives(derivative):
+    def moved(push):
+        return jj.simulate(AtLevel(push=push), {"x": 0.0}, t1=2.0).q_end[0]
+
+    assert jax.jit(derivative(moved))(2.0) == pytest.approx(2.0, rel=1e-6)

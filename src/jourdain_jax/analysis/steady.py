@@ -24,7 +24,7 @@ from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, 
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_time, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -117,7 +117,7 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
         "a State or a dictionary of named values; those not named start from zero"
     )
     q, u, _ = scene.named(**guess)
-    return jnp.asarray(t0, real_type()), q, u
+    return as_time(t0), q, u
 
 
 class _Problem(eqx.Module):

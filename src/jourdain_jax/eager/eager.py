@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.jaxprs import evaluated, needed_only
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import described, has_unit, is_traced
 from jourdain_jax.eager.numpy_backend import applied
 
 
@@ -28,14 +28,24 @@ def eval_numpy(f: Callable) -> Callable:
 
     @wraps(f)
     def run(*arguments, lanes=()):
-        # booleans stay static, because they decide which code is traced
-        arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
+        arguments = jax.tree.map(_as_known, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=lambda x: x is None)
         return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers, *lanes)
 
     vars(run)["cache_clear"] = program.cache_clear
     return run
+
+
+def _as_known(x):
+    """Return a number as a NumPy array, anything else as it is. Booleans stay static, because they decide
+    which code is traced.
+
+    **Raises** ValueError for a quantity with a unit.
+    """
+    if has_unit(x):
+        raise ValueError(f"an argument is {described(x)}, expected real numbers; give numbers in SI units")
+    return np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x
 
 
 def eager_if_concrete(f: Callable) -> Callable:

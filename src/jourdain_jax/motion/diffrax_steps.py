@@ -170,10 +170,18 @@ def check(setup: Setup) -> None:
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
-    """Return which events have happened at the start, which diffrax does not check."""
-    rates = integrands.rates(t0, begun.y0, begun.args)
-    values, along = jax.jvp(lambda t, y: integrands.events(t, y, begun.args), (t0, begun.y0), (jnp.ones_like(t0), rates))
-    return jnp.stack(event_search.at_start(ArrayWriter(t0), values, along, values, jnp.sign(t1 - t0), t1 - t0)[0])
+    """Return which events have happened at the start, which diffrax does not check, by values there and a
+    short step later (midpoint rule).
+    """
+
+    def moved(h):
+        middle = integrands.rates(t0 + h / 2, jax.tree.map(lambda y, f: y + h / 2 * f, begun.y0, rates), begun.args)
+        return integrands.events(t0 + h, jax.tree.map(lambda y, f: y + h * f, begun.y0, middle), begun.args)
+
+    w, rates, step = ArrayWriter(t0), integrands.rates(t0, begun.y0, begun.args), w.eps**0.25 * (t1 - t0)
+    values, along = jax.jvp(moved, (jnp.zeros_like(t0),), (jnp.ones_like(t0),))
+    sunk, sinks = event_search.at_start(w, values, along, moved(step), step, jnp.sign(t1 - t0), t1 - t0)
+    return jnp.stack([below | (falls & ~(rate * step > 0.0)) for below, falls, rate in zip(sunk, sinks, along, strict=True)])
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):

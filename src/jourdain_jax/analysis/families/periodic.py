@@ -32,7 +32,7 @@ from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, pla
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, all_finite, checked_whole, compiled_quickly, known_numbers, largest, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, all_finite, checked_real, checked_whole, compiled_quickly, known_numbers, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -136,6 +136,7 @@ def periodic(
     options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
     # tolerances are traced below
     options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)
+    period = checked_real(period, "`period`", (), advice="give a time in s")
     if not np.all(known_numbers(period) > 0) or not all_finite(known_numbers(period)):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
     checked_whole(pieces, "`pieces`", 1, expected="of at least 1")
@@ -154,9 +155,9 @@ def periodic(
     carried = unseen(instant, scene)
     kept = tuple(k for k, name in enumerate(names) if name not in carried)
     free = tuple(k for k in kept if names[k] not in held)
-    shifted = jnp.array([shift.get(name, 0.0) for name in names], start.q.dtype)
+    shifted = jnp.stack([checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names]).astype(start.q.dtype)
     problem = _Shooting(scene, inputs, options, shifted, instant, pieces, None if until is None else events.index(until), kept, free, tuple(shift))
-    return _found(problem, start, jnp.asarray(period, start.q.dtype))
+    return _found(problem, start, period.astype(start.q.dtype))
 
 
 class _Shooting(eqx.Module):

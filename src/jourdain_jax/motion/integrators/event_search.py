@@ -5,12 +5,12 @@ The same source serves JAX arrays and machine code through the writer `w` of a s
 (`motion/native/step.py`). Values of events are lists.
 
 An event happens where its value falls through zero. A motion that starts with a value of zero (to round-off)
-and a rate that raises it continues if the value is positive after a first step:
+continues if the value is positive after a first step h, whether its rate raises it or a later derivative:
 
-    |c_0| <= noise c_0',   noise = eps^0.6 span
+    |c_0| <= noise c_0'   or   |c_0|, |h c_0'| <= noise/h |c(h) - c_0|,   noise = eps^0.6 span
 
 Otherwise the step is halved, down to that noise, so that the search does not find the zero at the start. If
-the value is negative or does not rise at the start, the event has happened there.
+the value is negative there, or none of these steps raises it, the event has happened at the start.
 
 All event values are positive at t_b, or rise from zero there, and at least one is not positive at t_a. NaN is
 not positive, so it lies beyond the event. Of the values that are not positive at t_a, the search follows the
@@ -76,13 +76,14 @@ def reach_of_noise(w, span):
     return w.eps**LEAVES * w.magnitude(span)
 
 
-def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> tuple[list, list]:
-    """Return the events that have happened at a start, and values that rise from zero there but are
-    not positive after one step."""
-    sunk, sinks = [], []
+def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
+    """Return the events that have happened at a start, and values that may rise from zero there but are
+    not positive after one step `h`."""
+    sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
-        rate = slope * direction
-        rises = (rate > 0.0) & (w.magnitude(a) <= reach_of_noise(w, span) * rate)
+        rate, change = slope * direction, w.magnitude(b - a)
+        level = ~(a > 0.0) & (change > 0.0) & (w.larger(w.magnitude(a), w.magnitude(h * slope)) * w.magnitude(h) <= noise * change)
+        rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
         sunk.append(~(a > 0.0) & ~rises)
         sinks.append(rises & ~(b > 0.0))
     return sunk, sinks
@@ -274,9 +275,9 @@ def monitored(
     locating = w.equal(p["code"], LOCATING)
     # a motion that starts beyond an event ends at once; a NaN state is not an event
     sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
-    fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.goes_on else 0.0) & sound
+    fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
     share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
-    sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
+    sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
     if form.goes_on:
         sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
@@ -310,9 +311,11 @@ def monitored(
         which = w.where(sunk[i] | sinks[i], i, which)
     code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
     code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
+    shorter = share * w.magnitude(h)
+    p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of a step by Taylor series, whose length is its own
     changed = {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
-        "h": w.where(over, p["h"], w.where(dips | restarts, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
+        "h": w.where(over, p["h"], w.where(dips | restarts, shorter, w.where(locating, p["h"], new["h"]))),
         "code": w.where(over, results.EVENT, code),
         "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
         "rejected": w.where(over, p["rejected"], new["rejected"] + w.where(dips | restarts, 1.0, 0.0)),
@@ -326,7 +329,8 @@ def monitored(
         # saved state is the one after it
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
-        at_once = over & ~goes & (p["begun"] > 0.0)  # right after a transition, which determines its time
+        follows = over & (p["passed"] + p["crossings"] > 0.0)
+        at_once = follows & ~goes  # right after a transition, which determines its time
         ends = at_once | (found & ~goes)
         p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
@@ -337,7 +341,7 @@ def monitored(
         flat = ~side & (over | is_flat(w, rate, slope))
         quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
         passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
-        stuck, repeats = w.room(), over & any_of(sinks) & (p["begun"] > 0.0)
+        stuck, repeats = w.room(), follows & any_of(sinks)
         w.store(0.0, stuck)
         w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
         passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
@@ -347,7 +351,7 @@ def monitored(
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
         # counted as trial steps, so that they end
         changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
-        changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
+        changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:
         put_tangents(w, form, p, k[0], ends, new["t"], rate_0, y1)

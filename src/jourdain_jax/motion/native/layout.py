@@ -12,7 +12,7 @@ For sampled inputs, rows of pointers and integers locate a lane's samples (`tabl
 
 If the motion continues after events (`transitions.py`), `mode` are the modes, `passed` counts the
 transitions, and `log_event`, `log_mode`, `log_lost` and `log_t` record for each the event, the new modes,
-the loss of energy, and the time with its tangents. `begun` is the number of steps tried up to the last
+the loss of energy, and the time with its tangents. `begun` is the number of steps accepted up to the last
 transition, `disarmed` marks events whose value has not yet left zero. `left` describes the transition in
 the last trial step: the event's index plus 1 (negative if its value has no slope), or 0 for none; its time;
 the state and modes before it.
