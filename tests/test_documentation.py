@@ -156,6 +156,13 @@ def test_the_readme_has_at_most_five_hundred_words():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 500
 
 
+def test_dips_that_may_be_missed_are_named_in_the_same_words():
+    said = "smooth dip of an event narrower than the longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less"
+    pages = [(ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("limits.md", "howto/events.md")]
+    for text in (*pages, jj.Scene.events.__doc__, jj.Event.__doc__):
+        assert said in " ".join(text.split())
+
+
 def test_the_site_has_at_most_28_000_words():
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= 28_000
 

@@ -162,8 +162,9 @@ class Scene(eqx.Module):
         The first of several events in one step counts. A value that falls through zero and rises again within
         one step is found if a relation in it (`<`, `where`, `abs`, ...) changes. It is also found if the fall
         shows in the cubic through values and rates at the ends of the step (default solvers), or in the dense
-        output at three times in the step (other adaptive solvers). A smooth dip of a stop event that is
-        narrower than the longest step may be missed. Use values that fall once, or a smaller `max_step`.
+        output at three times in the step (other adaptive solvers). A smooth dip of an event narrower than the
+        longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less
+        than that. Use values that fall only once, or a smaller `max_step`.
         """
         return {}
 
