@@ -588,3 +588,71 @@ def test_a_disc_that_falls_flat_has_a_code(bounce):
     motion = jj.simulate(Coin(bounce=bounce), {"z": 0.02, "attitude": attitude}, t1=1.0)
     assert "fell flat on its ground" in str(motion)
     assert abs(motion.q_end[2]) < 1e-5
+
+
+class Braked(jj.Scene):
+    """A ball in a plane that slides over a strip which brakes it, and is stopped at a line; `at`, `width`: of strip or line."""
+
+    friction: float = jj.parameter(0.3)
+    at: float = jj.parameter(0.5)
+    width: float = jj.parameter(0.02)
+    brake: float = jj.parameter(0.0)
+    push: float = jj.parameter(0.0)
+    line: str = eqx.field(static=True, default="")
+    coordinates = jj.coordinates("x z turn")
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody(1.0, 0.1 * jnp.ones(3), [q.x, 0.0, q.z], jj.rot_y(q.turn))}
+
+    def contacts(self, pose):
+        return {"floor": jj.ball_contact(pose["ball"], 0.5, height="row", friction=self.friction)}
+
+    def loads(self, motion):
+        there = (motion.q.x > self.at) & (motion.q.x < self.at + self.width)
+        return (jj.gravity(motion, G), jj.generalized_force(motion, x_rate=self.push - self.brake * jnp.where(there, 1.0, 0.0)))
+
+    def events(self, motion):
+        far = motion.q.x - self.at
+        lines = {"wall": -far, "away": far, "window": jnp.abs(far) - self.width}
+        return {self.line: lines[self.line]} if self.line else {}
+
+
+def _braked(friction, at, brake, width=0.02, v=4.0, T=0.3):
+    """Its place at the time T by v^2 - 2 a s, with a = mu g, and mu g + brake in the strip."""
+    a, b = friction * G, friction * G + brake
+    v1 = jnp.sqrt(v**2 - 2 * a * at)
+    v2 = jnp.sqrt(v1**2 - 2 * b * width)
+    left = T - (v - v1) / a - (v1 - v2) / b
+    return at + width + v2 * left - a * left**2 / 2
+
+
+def test_a_strip_is_met_by_a_body_that_slips():
+    def end(numbers):
+        friction, at = numbers
+        return jj.simulate(Braked(friction=friction, at=at, brake=20.0), {"z": 0.5, "x_rate": 4.0}, ts=[0.3])["x"][-1]
+
+    numbers = jnp.array([0.3, 0.5])
+    expected = with_value(jax.jacfwd, lambda x: _braked(x[0], x[1], 20.0))(numbers)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        for found, right in zip(with_value(derivative, end)(numbers), expected, strict=True):
+            assert_allclose(found, right, atol=1e-12)
+    places = jnp.linspace(0.3, 0.7, 16)
+    lanes = jj.rollout(Braked(brake=20.0), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, ts=[0.3], rtol=1e-6, atol=1e-6).lanes
+    assert_allclose(lanes.q_end[:, 0], _braked(0.3, places, 20.0), atol=1e-12)
+    assert_array_equal(lanes.crossings, 2)
+
+
+@pytest.mark.parametrize("line", ["wall", "window"])
+def test_an_event_ends_a_motion_that_slips(line):
+    places, width = jnp.linspace(0.3, 1.1, 16), 1e-4
+    lanes = jj.rollout(Braked(line=line, width=width), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, t1=1.5).lanes
+    assert_allclose(lanes.q_end[:, 0], places - (width if line == "window" else 0.0), atol=1e-9)
+
+
+def test_a_body_with_friction_sets_off_from_its_event():
+    """Sliding, and pushed from rest."""
+    start = {"z": 0.5, "x_rate": jnp.array([1.0, 0.0, 0.0, -1.0])}
+    lanes = jj.rollout(Braked(line="away", at=0.0), start, parameters={"push": jnp.array([0.0, 1.0, -1.0, 0.0])}, t1=0.5).lanes
+    assert lanes.event.tolist() == [-1, -1, 0, 0]
+    assert_allclose(lanes.t_end, [0.5, 0.5, 0.0, 0.0], atol=1e-9)
+    assert_allclose(lanes.q_end[1, 0], 0.125 / 1.4, atol=1e-9)
