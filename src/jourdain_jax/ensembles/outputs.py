@@ -4,12 +4,14 @@ Outputs are functions of a `Trajectory`, evaluated on all samples of a block by 
 NaN for failed motions.
 """
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.files import shortened
 from jourdain_jax.calculus.reals import Scalar, described
 from jourdain_jax.ensembles.along import integral, largest, sampled
 from jourdain_jax.equations.listed import names_of_events
@@ -200,9 +202,11 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
             '{"final lean": jj.End("lean", "rad")}')
     found = {}
     for name, output in outputs.items():
-        if not isinstance(name, str) or not name or {"/", "\\"} & {*name} or name.startswith(("_", ".")):
-            raise ValueError(f"an output is called {name!r}, expected a text without `/` and `\\` that "
-                "begins with neither `_` nor `.`")
+        # it becomes the name of a folder
+        printable = isinstance(name, str) and name.isprintable() and len(name.encode()) <= 200
+        if not printable or not re.fullmatch(r"[^/\\_.][^/\\]*", name):
+            raise ValueError(f"an output is called {shortened(repr(name))}, expected printable text of at most "
+                "200 bytes without `/` and `\\` that begins with neither `_` nor `.`")
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
             raise ValueError(f"output `{name}` is {described(output)}, expected an output such as "
                 "jj.End('lean'), or a function of a trajectory")
