@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, real_type, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of

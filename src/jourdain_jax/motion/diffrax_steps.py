@@ -175,13 +175,15 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
     """
 
     def moved(h):
-        middle = integrands.rates(t0 + h / 2, jax.tree.map(lambda y, f: y + h / 2 * f, begun.y0, rates), begun.args)
-        return integrands.events(t0 + h, jax.tree.map(lambda y, f: y + h * f, begun.y0, middle), begun.args)
+        ahead = lambda h, rates: jax.tree.map(lambda y, f: y + h * f, begun.y0, rates)  # noqa: E731
+        middle = integrands.rates(t0 + h / 2, ahead(h / 2, rates), begun.args)
+        return integrands.events(t0 + h, ahead(h, middle), begun.args)
 
     w, rates, step = ArrayWriter(t0), integrands.rates(t0, begun.y0, begun.args), w.eps**0.25 * (t1 - t0)
     values, along = jax.jvp(moved, (jnp.zeros_like(t0),), (jnp.ones_like(t0),))
     sunk, sinks = event_search.at_start(w, values, along, moved(step), step, jnp.sign(t1 - t0), t1 - t0)
-    return jnp.stack([below | (falls & ~(rate * step > 0.0)) for below, falls, rate in zip(sunk, sinks, along, strict=True)])
+    each = zip(sunk, sinks, along, strict=True)
+    return jnp.stack([below | (falls & ~(rate * step > 0.0)) for below, falls, rate in each])
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):

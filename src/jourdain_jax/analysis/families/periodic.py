@@ -155,7 +155,8 @@ def periodic(
     carried = unseen(instant, scene)
     kept = tuple(k for k, name in enumerate(names) if name not in carried)
     free = tuple(k for k in kept if names[k] not in held)
-    shifted = jnp.stack([checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names]).astype(start.q.dtype)
+    shifts = (checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names)
+    shifted = jnp.stack([*shifts]).astype(start.q.dtype)
     problem = _Shooting(scene, inputs, options, shifted, instant, pieces, None if until is None else events.index(until), kept, free, tuple(shift))
     return _found(problem, start, period.astype(start.q.dtype))
 

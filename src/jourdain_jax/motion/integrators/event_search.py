@@ -82,7 +82,8 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -
     sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate, change = slope * direction, w.magnitude(b - a)
-        level = ~(a > 0.0) & (change > 0.0) & (w.larger(w.magnitude(a), w.magnitude(h * slope)) * w.magnitude(h) <= noise * change)
+        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # what a straight line changes it by
+        level = ~(a > 0.0) & (change > 0.0) & (straight * w.magnitude(h) <= noise * change)
         rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
         sunk.append(~(a > 0.0) & ~rises)
         sinks.append(rises & ~(b > 0.0))
@@ -312,7 +313,7 @@ def monitored(
     code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
     code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
     shorter = share * w.magnitude(h)
-    p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of a step by Taylor series, whose length is its own
+    p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of Taylor series, whose steps have no `h`
     changed = {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
         "h": w.where(over, p["h"], w.where(dips | restarts, shorter, w.where(locating, p["h"], new["h"]))),
