@@ -98,7 +98,9 @@ class Diffrax(eqx.Module, Integrator):
         rtol, atol = setup.tolerances
         control = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
         control = diffrax.ClipStepSizeController(control, step_ts=ts, jump_ts=None if knots is None else knots)
-        event = diffrax.Event(_lowest, optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0)), direction=False)
+        # flip: values fall, which is not looked for; in lanes without an event it would be an error
+        search = optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0), flip=True)
+        event = diffrax.Event(_lowest, search, direction=False)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(integrands.rates),
             self.solver,
@@ -170,18 +172,22 @@ def check(setup: Setup) -> None:
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
-    """Return which events have happened at the start, which diffrax does not check, by values there and a
-    short step later (midpoint rule).
+    """Return which events have happened at the start, which diffrax does not check, by values there and after
+    two short steps (midpoint rule).
     """
 
     def moved(h):
-        ahead = lambda h, rates: jax.tree.map(lambda y, f: y + h * f, begun.y0, rates)  # noqa: E731
-        middle = integrands.rates(t0 + h / 2, ahead(h / 2, rates), begun.args)
-        return integrands.events(t0 + h, ahead(h, middle), begun.args)
+        ahead = lambda y, h, f: jax.tree.map(lambda y, f: y + h * f, y, f)  # noqa: E731
+        y = begun.y0
+        for t in (t0, t0 + h):
+            middle = integrands.rates(t + h / 2, ahead(y, h / 2, integrands.rates(t, y, begun.args)), begun.args)
+            y = ahead(y, h, middle)
+        return integrands.events(t0 + 2 * h, y, begun.args)
 
-    w, rates, step = ArrayWriter(t0), integrands.rates(t0, begun.y0, begun.args), w.eps**0.25 * (t1 - t0)
-    values, along = jax.jvp(moved, (jnp.zeros_like(t0),), (jnp.ones_like(t0),))
-    sunk, sinks = event_search.at_start(w, values, along, moved(step), step, jnp.sign(t1 - t0), t1 - t0)
+    w = ArrayWriter(t0)
+    step = w.eps**0.25 * (t1 - t0)
+    values, along = jax.jvp(moved, (jnp.zeros_like(t0),), (jnp.full_like(t0, 0.5),))
+    sunk, sinks = event_search.at_start(w, values, along, moved(step / 2), step, jnp.sign(t1 - t0), t1 - t0)
     each = zip(sunk, sinks, along, strict=True)
     return jnp.stack([below | (falls & ~(rate * step > 0.0)) for below, falls, rate in each])
 

@@ -1,8 +1,7 @@
 """The first stop event of a step and its time, located by trials of shorter steps
 from the last state before it.
 
-The same source serves JAX arrays and machine code through the writer `w` of a step
-(`motion/native/step.py`). Values of events are lists.
+One source serves JAX arrays and machine code (`w`, `motion/native/step.py`). Values of events are lists.
 
 An event happens where its value falls through zero. A motion that starts with a value of zero (to round-off)
 continues if the value is positive after a first step h, whether its rate raises it or a later derivative:
@@ -77,8 +76,7 @@ def reach_of_noise(w, span):
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
-    """Return the events that have happened at a start, and values that may rise from zero there but are
-    not positive after one step `h`."""
+    """Return the events that happened at a start, and values near zero there that a step `h` leaves there."""
     sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate, change = slope * direction, w.magnitude(b - a)
@@ -326,8 +324,7 @@ def monitored(
     ends = found
     if form.goes_on:
         goes = goes_on(w, form, changed["event"]) & (found | over)
-        # an event just beyond the end of its step by rounding happens at the end; the
-        # saved state is the one after it
+        # an event just beyond the end of its step by rounding happens there; the saved state is that after it
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
         follows = over & (p["passed"] + p["crossings"] > 0.0)
