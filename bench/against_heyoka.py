@@ -16,7 +16,7 @@ from figures import Figures, figure, least_processor_time
 from minimal_states import final_states
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.explicit_steps import order_for
+from jourdain_jax.integrate.explicit_steps import order_for
 from jourdain_jax.motion.simulate import set_up
 
 ERRORS = (1e-8, 1e-12)

@@ -36,7 +36,7 @@ SOURCE = ROOT / "src" / PACKAGE
 FOLDERS = ("src", "tests", "bench", "docs", "notebooks")
 PUBLIC = {PACKAGE, *(f"{PACKAGE}.{name}" for name in ("models", "bicycle", "bicycle.parameters", "bicycle.readings", "cli", "dynamics.reduced"))}
 # below public names, tests may speak to the scalar program and its operations, also as machine code, and to one step
-SEAMS = tuple(f"{PACKAGE}.{name}" for name in ("program", "calculus.scalar_operations", "motion.native.step"))
+SEAMS = tuple(f"{PACKAGE}.{name}" for name in ("program", "calculus.scalar_operations", "integrate.loop.step"))
 THROUGH = "evaluated_natively"  # the file of `tests` that runs a scalar program as machine code
 CACHES = {"cache", "lru_cache", "cached_property"}
 CONTAINERS = {"dict", "list", "set", "defaultdict", "OrderedDict", "Counter", "WeakKeyDictionary", "WeakValueDictionary", "WeakSet", "deque"}

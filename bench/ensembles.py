@@ -36,8 +36,8 @@ from distributed import Client, LocalCluster
 from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles.run import Runner
-from jourdain_jax.ensembles.store import Store
+from jourdain_jax.studies.run import Runner
+from jourdain_jax.studies.store import Store
 
 MODEL, SPAN, TOLERANCE = "tilting-disc", 2.0, 1e-6
 WIDTH = 8  # lanes of a vector

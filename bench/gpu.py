@@ -26,8 +26,8 @@ from figures import HERE, Figures, figure, main, seconds_of
 from jax.interpreters import mlir
 
 import jourdain_jax as jj
-from jourdain_jax.motion.native import values
-from jourdain_jax.native import ffi, host, nvidia
+from jourdain_jax.integrate.loop import value_kernels
+from jourdain_jax.kernels import ffi, host, nvidia
 
 DISC, BICYCLE = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
 NUMBERS = ("mB", "mR", "mF", "mH", "rR", "rF", "w", "c")  # of a bicycle, by which it is differentiated
@@ -82,19 +82,19 @@ def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
 
         def call(*values):
             found = jax.ffi.ffi_call(handler(lanes, threads), results)(*operands.side_by_side(*values))
-            jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), values, found)
+            jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), value_kernels, found)
             return found
 
         return mlir.lower_fun(call)(ctx, *values)
 
     jax.clear_caches()
-    mlir.register_lowering(values._call_p, lowered, platform="cpu")
+    mlir.register_lowering(value_kernels._call_p, lowered, platform="cpu")
     try:
         with jax.default_device(jax.devices("cpu")[0]):
             jax.block_until_ready(jax.jit(jax.vmap(f))(jnp.linspace(*SPREAD[of], lanes)))
             jax.effects_barrier()
     finally:
-        mlir.register_lowering(values._call_p, values.on_cpu, platform="cpu")
+        mlir.register_lowering(value_kernels._call_p, value_kernels.on_cpu, platform="cpu")
         jax.clear_caches()
     return calls
 
@@ -103,7 +103,7 @@ def bits(of: str, name: str, quick: bool) -> Figures:
     """How many numbers that kernels return differ in a bit from those of the CPU."""
     lanes, differ, count = 10_000 if of == "disc" else 2_000, 0, 0
     for how, given, expected in calls_of(KINDS[of][name][1], lanes, of):
-        found = jax.jit(lambda *x, how=how: values._call_p.bind(*x, **how))(*given)
+        found = jax.jit(lambda *x, how=how: value_kernels._call_p.bind(*x, **how))(*given)
         for ours, theirs in zip(found, expected, strict=True):
             differ += int(np.sum(np.asarray(ours).view(np.int64) != theirs.view(np.int64)) - np.sum(np.isnan(ours) & np.isnan(theirs)))
             count += theirs.size

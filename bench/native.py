@@ -25,8 +25,8 @@ from figures import Figures, figure, fresh, least_processor_time, main, seconds_
 from minimal_states import starts_at
 
 import jourdain_jax as jj
+from jourdain_jax.integrate.vector_fields.field import ByProgram
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.motion.vector_fields.field import ByProgram
 
 LANES, FEW = 1024, 128
 WAYS = {"native": "native", "XLA": "xla"}

@@ -230,7 +230,7 @@ def code_of(entry: Entry) -> str:
         call = f"motion = jj.simulate(\n    scene,\n    {start},\n    t1={p.span},\n   {inputs[1:]},\n)"
     lines = [
         "import jax.numpy as jnp\n\n" if "jnp." in inputs else "",
-        "import jourdain_jax as jj\nfrom jourdain_jax.plotting.pictures import draw_still\n",
+        "import jourdain_jax as jj\nfrom jourdain_jax.views.pictures import draw_still\n",
         entry.import_line,
         f"\nscene = {entry.made}\n{call}\n",
         f'draw_still(\n    motion,\n    "{entry.name}.png",\n    view={p.view},\n    at={p.at}{more},\n)',

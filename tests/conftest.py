@@ -27,7 +27,7 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line number
 
 # Every annotated function of these layers that is not inside of another is checked, shapes and dtypes included. Not in the layers whose small
 # functions are called a million times while scenes are traced: there it takes a tenth of the time of all tests.
-LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", "bicycle", "plotting", "cli")
+LAYERS = ("equations", "dynamics", "integrate", "motion", "analysis", "identification", "studies", "models", "bicycle", "views", "cli")
 
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
@@ -78,7 +78,7 @@ def _less_effort():
     from jax._src import source_info_util
     from jax._src.interpreters import mlir
 
-    from jourdain_jax.native import host
+    from jourdain_jax.kernels import host
 
     make, shared, noting = mlir.make_ir_context, mlir.make_ir_context(), source_info_util.current
     with pytest.MonkeyPatch.context() as patch:
@@ -120,7 +120,7 @@ def _compiled_programs_are_dropped():
 @pytest.fixture(scope="module")
 def small_blocks():
     """Blocks of a study are of 32 lanes, so that few lanes make several."""
-    from jourdain_jax.ensembles import task
+    from jourdain_jax.studies import task
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task, "LARGEST_BLOCK", 32)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import jax
 
-from jourdain_jax.motion.native.values import nodes_called
-from jourdain_jax.native import host
+from jourdain_jax.integrate.loop.value_kernels import nodes_called
+from jourdain_jax.kernels import host
 from jourdain_jax.program.graph import Graph
 
 

@@ -15,18 +15,18 @@ from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
 from jourdain_jax import GibbsAppell, structure_of, velocity_residual
-from jourdain_jax.build.trace import power_of_loads
 from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.scene.identity import reference_parameters
+from jourdain_jax.structure.trace import power_of_loads
 
 PUSH = 0.7  # value of the input, where a scene has one
 NEAR = 0.03  # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is left out

@@ -18,8 +18,8 @@ from unittest import mock
 import jax
 from jax.interpreters import mlir
 
-from jourdain_jax.motion.native import values
-from jourdain_jax.native import ffi, gpu, host, nvidia
+from jourdain_jax.integrate.loop import value_kernels
+from jourdain_jax.kernels import ffi, gpu, host, nvidia
 
 _ENDS = """
 declare i32 @pthread_setspecific(i32, ptr)
@@ -179,11 +179,11 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int =
         ),
         mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched),
     ):
-        mlir.register_lowering(values._call_p, values._on_nvidia, platform="cpu")
+        mlir.register_lowering(value_kernels._call_p, value_kernels._on_nvidia, platform="cpu")
         try:
             yield launched
         finally:
-            mlir.register_lowering(values._call_p, values.on_cpu, platform="cpu")
+            mlir.register_lowering(value_kernels._call_p, value_kernels.on_cpu, platform="cpu")
             jax.clear_caches()
 
 

@@ -140,7 +140,7 @@ def test_the_structure_of_a_scene_is_found_without_compiling_its_constants(compi
 WARM_CALL = """
 import cProfile, pstats
 import numpy as np, jourdain_jax as jj
-from jourdain_jax.native import host
+from jourdain_jax.kernels import host
 host.EFFORT = 0  # of LLVM, as in the other tests
 disc = jj.models.TiltingDisc()
 values = {"lean": 0.3, "spin_rate": -3.0}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jourdain_jax.eager.eager import uncompiled_lanes
+from jourdain_jax.program.eager import uncompiled_lanes
 
 CONSTANT = np.arange(12.0).reshape(3, 4)
 

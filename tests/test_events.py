@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI5, DOPRI8, TSIT5, method_of
+from jourdain_jax.integrate.explicit_steps import DOPRI5, DOPRI8, TSIT5, method_of
 
 # Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in.
 

@@ -16,14 +16,14 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
-from jourdain_jax.build.trace import named_values
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.structure.trace import named_values
 
 DRAWS, STATES = 5, 20
 

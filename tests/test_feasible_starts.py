@@ -18,7 +18,7 @@ from small_scenes import DiscWithHeightRow, InSpace
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
-from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.program.eager import eval_numpy
 
 # Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so
 

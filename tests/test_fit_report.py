@@ -299,7 +299,7 @@ def test_profiles_answer_wrong_names_and_other_data():
 
 
 def shares(fit, runs):
-    from jourdain_jax.analysis.resumed import informed, taken_up
+    from jourdain_jax.identification.report.resumed_fit import informed, taken_up
 
     return informed(*taken_up(fit, runs), 20)
 

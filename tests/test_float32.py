@@ -34,7 +34,7 @@ import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import host
+from jourdain_jax.kernels import host
 
 gc.disable()  # a process of a minute
 host.EFFORT = 0  # of LLVM, as in the other tests

@@ -14,11 +14,11 @@ from generated_scenes import KINDS, Recipe, recipe
 from tolerances import tolerance
 
 from jourdain_jax import Lowered
-from jourdain_jax.build.trace import named_values
 from jourdain_jax.equations import instant, virtual_power
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.structure.trace import named_values
 
 STRUCTURES = range(25)
 PARAMETERS, STATES, LEAST = 2, 5, 8  # per structure: 25 times at least 8 instances make 200

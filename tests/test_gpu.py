@@ -16,8 +16,8 @@ from ends_of_models import end_of_model
 from test_modes import NUMBERS, seen
 
 import jourdain_jax as jj
-from jourdain_jax.native import ffi, gpu, nvidia
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.kernels import ffi, gpu, nvidia
+from jourdain_jax.scene.parameter_fields import parameters_of
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against() or nvidia.reason_against_text()), reason="no machine code is made here")
 ARCHITECTURES = ("sm_75", "sm_80", "sm_90", "sm_100")

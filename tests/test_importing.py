@@ -24,7 +24,7 @@ assert jax.device_count() == 3
 disc = jj.models.TiltingDisc()
 assert jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), t1=0.1).result == 0
 jj.clear_caches()  # of what is imported
-left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.ensembles", "jourdain_jax.plotting", "jourdain_jax.models.blades"}
+left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.studies", "jourdain_jax.views", "jourdain_jax.models.blades"}
 imported = left & sys.modules.keys()
 assert not imported, imported
 from jourdain_jax import fit

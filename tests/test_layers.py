@@ -1,7 +1,7 @@
 """The layer table of the package, held by reading every import in `src` (no import is executed).
 
-Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < ensembles < models <
-importers < bicycle < plotting < cli.
+Bottom to top: calculus < program < kernels < scene < equations < structure < dynamics < lowering < integrate <
+motion < analysis < identification < studies < models < importers < bicycle < views < cli.
 A layer imports itself and what lies below it; only the package's `__init__` sees everything.
 """
 
@@ -16,25 +16,26 @@ PACKAGE = "jourdain_jax"
 SOURCE = Path(__file__).parents[1] / "src" / PACKAGE
 LAYERS = (
     "calculus",
-    "eager",
     "program",
-    "native",
+    "kernels",
     "scene",
     "equations",
-    "build",
+    "structure",
     "dynamics",
     "lowering",
+    "integrate",
     "motion",
     "analysis",
-    "ensembles",
+    "identification",
+    "studies",
     "models",
     "importers",
     "bicycle",
-    "plotting",
+    "views",
     "cli",
 )
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
-OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
+OWNERS = {"diffrax": ("integrate", "motion")}  # third-party packages that only the named layers know
 OPTIONAL = (
     "matplotlib",
     "mpl_toolkits",

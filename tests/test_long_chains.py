@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jourdain_jax.build.assembling import assemble
 from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes
+from jourdain_jax.structure.assembly import assemble
 
 
 def links(count) -> tuple[Pattern, np.ndarray]:

@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, OnPlane, Upright
 
 import jourdain_jax as jj
-from jourdain_jax.eager import numpy_backend
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
-from jourdain_jax.program.fused import fused
+from jourdain_jax.program import numpy_backend
+from jourdain_jax.program.fused_loop import fused
 
 # What lowering does to a scene, what it says where it does not, and derivatives through the program.
 

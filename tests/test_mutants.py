@@ -23,25 +23,25 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
-from jourdain_jax.build.trace import named_values
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
+from jourdain_jax.integrate import event_search
+from jourdain_jax.integrate.arrays import array_adjoint as backwards
+from jourdain_jax.integrate.arrays import array_functions
+from jourdain_jax.integrate.arrays import array_loop as on_arrays
+from jourdain_jax.integrate.arrays import array_motion as motions
+from jourdain_jax.integrate.arrays.array_loop import Loop
+from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
+from jourdain_jax.integrate.explicit_steps import method_of
+from jourdain_jax.integrate.loop import native_motion, step
+from jourdain_jax.integrate.loop.handover import Start
+from jourdain_jax.integrate.setup import Solved
+from jourdain_jax.integrate.vector_fields.field import Integrated
 from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.arrays import back as backwards
-from jourdain_jax.motion.arrays import functions
-from jourdain_jax.motion.arrays import loop as on_arrays
-from jourdain_jax.motion.arrays import motion as motions
-from jourdain_jax.motion.arrays.loop import Loop
-from jourdain_jax.motion.arrays.writer import ArrayWriter
-from jourdain_jax.motion.integrators import event_search
-from jourdain_jax.motion.integrators.explicit_steps import method_of
-from jourdain_jax.motion.native import native_motion, step
-from jourdain_jax.motion.native.start import Start
-from jourdain_jax.motion.setup import Solved
-from jourdain_jax.motion.vector_fields.field import Integrated
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.structure.trace import named_values
 
 
 def rewritten(function: Callable, right: str, wrong: str) -> Callable:
@@ -137,11 +137,11 @@ def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None,
         events=lambda t, y, k: events(t, y.q, k),
         within=lambda middle, k: k,
     )
-    functions.integrands = given
+    array_functions.integrands = given
 
     def run(y0, goals, k=1.0):
-        known, rest = functions.split(jnp.asarray(k))
-        form = functions.ArrayForm(None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0)
+        known, rest = array_functions.split(jnp.asarray(k))
+        form = array_functions.ArrayForm(None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0)
         control = tuple(map(jnp.asarray, (rtol, rtol, 1e-14, longest, dt0, 2000.0)))
         start = Start(() if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,))
         return Loop(form, method_of(diffrax.Dopri8()), rest, 2000), start
@@ -387,7 +387,7 @@ MUTANTS = [
     Mutant("an earlier window left out", motions, "cotangents", "(x, number, 0, keepdims=False)", "(x, 0 * number, 0, keepdims=False)", TIMES, "derivative"),
     Mutant("tangents of times forgotten", event_search, "put_tangents", "-dc / slope", "0 * dc", ALONG, "forward"),
     Mutant("time of an event forgotten", backwards, "event_back", "total = w.load(g_t)", "total = 0 * w.load(g_t)", EVENT, "derivative"),
-    Mutant("tangents of parameters forgotten", functions.Functions, "_parts", "part.get, of[0]", "lambda i: None if k else part[i], of[0]", ALONG, "forward"),
+    Mutant("tangents of parameters forgotten", array_functions.Functions, "_parts", "part.get, of[0]", "lambda i: None if k else part[i], of[0]", ALONG, "forward"),
     Mutant("an event by parameters forgotten", backwards, "event_back", "w.where(usable, w.load(added, i), 0.0)", "0.0", EVENT, "by k"),
 ]
 CHECKS = [*dict.fromkeys(mutant.check for mutant in MUTANTS), tangents_through_saved_times]
@@ -397,7 +397,7 @@ CHECKS = [*dict.fromkeys(mutant.check for mutant in MUTANTS), tangents_through_s
 def _nothing_kept(monkeypatch):
     """Programs are built in each test, and none of them afterwards; short windows, so that a motion has several; functions of a test's own."""
     monkeypatch.setattr(backwards, "SLOTS", 8)
-    monkeypatch.setattr(functions, "integrands", None)
+    monkeypatch.setattr(array_functions, "integrands", None)
     lower._lowered.cache_clear()
     yield
     lower._lowered.cache_clear()

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import machine_code
 import pytest
 
-from jourdain_jax.native import ffi, host
+from jourdain_jax.kernels import ffi, host
 
 OTHER = 12345  # the number of another user
 
@@ -155,7 +155,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import jourdain_jax as jj
-from jourdain_jax.native import host
+from jourdain_jax.kernels import host
 host.EFFORT = 0
 for name in sys.argv[1:]:
     scene = jj.models.MODELS[name]()

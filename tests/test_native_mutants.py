@@ -18,9 +18,9 @@ from small_scenes import OnLine, OnPlane
 from test_mutants import Mutant
 
 import jourdain_jax as jj
-from jourdain_jax.motion import integration, put_on_rows
-from jourdain_jax.motion.integrators import event_search
-from jourdain_jax.motion.native import back, functions, loop, native_motion, projection, step, transitions
+from jourdain_jax.integrate import event_search, state_projection
+from jourdain_jax.integrate.loop import adjoint, loop, native_motion, projection_kernel, rate_functions, step, transitions
+from jourdain_jax.motion import integration
 from jourdain_jax.motion.simulate import set_up
 
 pytestmark = machine_code.needed
@@ -195,12 +195,12 @@ def a_bead_stays_on_its_circle():
 
 def a_start_is_put_onto_its_rows():
     scene = Round()
-    usual = put_on_rows.usual_sizes(scene, False, True)
+    usual = state_projection.usual_sizes(scene, False, True)
     assert usual.program is not None
     t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
-    q_near, _ = jax.jit(lambda q: put_on_rows.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
+    q_near, _ = jax.jit(lambda q: state_projection.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
     assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
-    u_near, _ = jax.jit(lambda u: put_on_rows.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual))(u)
+    u_near, _ = jax.jit(lambda u: state_projection.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual))(u)
     assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
 
 
@@ -380,40 +380,40 @@ MUTANTS = [
     Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
     Mutant("a bracket with the wrong end", event_search, "_follow", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
-    Mutant("rows by half", projection, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
+    Mutant("rows by half", projection_kernel, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(
         "rows that are not scaled",
-        projection,
+        projection_kernel,
         "_write_factored",
         "w.load(row, k) * scale, row",
         "w.load(row, k), row",
         ROWS,
         "coordinates|speeds",
     ),
-    Mutant("weights of the first stage", back, "step_back", "* b[stage]", "* b[0]", BACK, WRONG),
-    Mutant("no later stages", back, "step_back", "columns[stage][j], total", "0.0, total", BACK, WRONG),
-    Mutant("cotangents not scaled by the step", back, "step_back", "return h * total", "return total", BACK, WRONG),
+    Mutant("weights of the first stage", adjoint, "step_back", "* b[stage]", "* b[0]", BACK, WRONG),
+    Mutant("no later stages", adjoint, "step_back", "columns[stage][j], total", "0.0, total", BACK, WRONG),
+    Mutant("cotangents not scaled by the step", adjoint, "step_back", "return h * total", "return total", BACK, WRONG),
     Mutant(
         "slopes of another stage",
-        back,
+        adjoint,
         "step_back",
         "total = w.fma(w.load(G, i + j * count)",
         "total = w.fma(w.load(G, i)",
         BACK,
         WRONG,
     ),
-    Mutant("parameters of the last step", back, "step_back", "w.load(by_known, i) + w.where(took", "w.where(took", BACK, WRONG),
-    Mutant("saved states forgotten", back, "_write_added", 'w.load(place, type="double") + more', "more", BACK, WRONG),
-    Mutant("no projection on the way back", back, "step_back", 'w.run("project_back", state, t + h, at, g1, added)', "None", PROJECTED_BACK, WRONG),
-    Mutant("an event at a number for a time", back, "event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
-    Mutant("the level of an event forgotten", back, "event_back", "w.where(usable, more, 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
-    Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
+    Mutant("parameters of the last step", adjoint, "step_back", "w.load(by_known, i) + w.where(took", "w.where(took", BACK, WRONG),
+    Mutant("saved states forgotten", adjoint, "_write_added", 'w.load(place, type="double") + more', "more", BACK, WRONG),
+    Mutant("no projection on the way back", adjoint, "step_back", 'w.run("project_back", state, t + h, at, g1, added)', "None", PROJECTED_BACK, WRONG),
+    Mutant("an event at a number for a time", adjoint, "event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
+    Mutant("the level of an event forgotten", adjoint, "event_back", "w.where(usable, more, 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
+    Mutant("tangents of states alone", rate_functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
     Mutant("the time of an event fixed", event_search, "put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
     Mutant("the wrong way from an event", event_search, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
     Mutant("tangents of an event by rates of before it moved", event_search, "put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
-    Mutant("the tangent at the time of an event", back, "event_back", "dt * w.load(f, i)", "0.0 * dt", BENT, WRONG),
-    Mutant("the tangent of an event forgotten", back, "_moved_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
-    Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(added, asked)", "0.0 * g_dt", BENT, WRONG),
+    Mutant("the tangent at the time of an event", adjoint, "event_back", "dt * w.load(f, i)", "0.0 * dt", BENT, WRONG),
+    Mutant("the tangent of an event forgotten", adjoint, "_moved_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
+    Mutant("an event that stays while its tangent moves", adjoint, "_moved_back", "w.load(added, asked)", "0.0 * g_dt", BENT, WRONG),
     Mutant(
         "cotangents of states for those of tangents",
         native_motion,
@@ -427,16 +427,16 @@ MUTANTS = [
     Mutant("a state that leaves an event late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON, WRONG),
     Mutant("a jump at a fixed time", transitions, "reset_program", "{t: dt}", "{t: graph.zero}", ON, WRONG),
     Mutant("a mode that stays", event_search, "pass_event", 'w.at(after, of["mode"].start), modes', "modes, modes", ON, "state after"),
-    Mutant("rates after an event in the mode before", back, "reset_back", 'w.at(after, of["mode"].start), modes', "modes, modes", ON_BACK, WRONG),
-    Mutant("rates after an event forgotten", back, "reset_back", "w.load(g, i) * w.load(f_after, i)", "0.0 * w.load(g, i)", ON_BACK, WRONG),
-    Mutant("what moves an event forgotten", back, "reset_back", "w.load(out, i) + w.load(by_event, i)", "w.load(out, i)", ON_BACK, WRONG),
-    Mutant("cotangents of another event's time", back, "_write_transition_back", '"passed", lane) - 1.0', '"passed", lane)', ON_BACK, WRONG),
+    Mutant("rates after an event in the mode before", adjoint, "reset_back", 'w.at(after, of["mode"].start), modes', "modes, modes", ON_BACK, WRONG),
+    Mutant("rates after an event forgotten", adjoint, "reset_back", "w.load(g, i) * w.load(f_after, i)", "0.0 * w.load(g, i)", ON_BACK, WRONG),
+    Mutant("what moves an event forgotten", adjoint, "reset_back", "w.load(out, i) + w.load(by_event, i)", "w.load(out, i)", ON_BACK, WRONG),
+    Mutant("cotangents of another event's time", adjoint, "_write_transition_back", '"passed", lane) - 1.0', '"passed", lane)', ON_BACK, WRONG),
     Mutant("a transition whose tangent leaves late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON_TWICE, WRONG),
     Mutant("goals that do not move cotangents", native_motion, "moved", "jax.vjp(rates, z)[1](g)[0]", "0 * g", TIMES_BENT, WRONG),
     Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (loop.kernel, back.kernel_back, put_on_rows._kernel, functions.reason_against_derivatives)
+KEPT = (loop.kernel, adjoint.kernel_back, state_projection._kernel, rate_functions.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,8 @@ from in_mpmath import in_mpmath
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.native import host
-from jourdain_jax.native.math_functions import BY_POLYNOMIALS
+from jourdain_jax.kernels import host
+from jourdain_jax.kernels.math_functions import BY_POLYNOMIALS
 from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion.native.values import nodes_called
+from jourdain_jax.integrate.loop.value_kernels import nodes_called
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed

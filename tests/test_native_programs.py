@@ -13,7 +13,7 @@ from in_mpmath import COMPARED, EPS, TRUTHS, Known, found
 from numpy.testing import assert_array_equal
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.native import host, scalar_program
+from jourdain_jax.kernels import host, scalar_program
 from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
 

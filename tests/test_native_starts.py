@@ -10,10 +10,10 @@ import small_scenes
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.kernels import ffi
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.native import ffi
+from jourdain_jax.program.eager import eval_numpy
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
 

@@ -9,7 +9,7 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
-from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.program.eager import eval_numpy
 
 
 def forces(scene, **values):

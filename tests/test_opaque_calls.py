@@ -12,13 +12,13 @@ from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.build.trace import event_values
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes
 from jourdain_jax.program.opaque_calls import interpret_with_calls
+from jourdain_jax.structure.trace import event_values
 
 
 def by_table(force, numbers):

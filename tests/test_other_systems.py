@@ -20,12 +20,12 @@ from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.calculus import files as whole_files
-from jourdain_jax.ensembles import files, memory, workers
-from jourdain_jax.ensembles.store import Store
-from jourdain_jax.motion.native import values
+from jourdain_jax.integrate.loop import value_kernels
+from jourdain_jax.kernels import ffi, host
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.native import ffi, host
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.studies import folder_lock, memory, workers
+from jourdain_jax.studies.store import Store
 
 SOURCE = Path(jj.__file__).parent
 needs_machine_code = machine_code.needed
@@ -105,10 +105,10 @@ def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(m
     monkeypatch.setattr(host, "lanes", lambda: 2)
     monkeypatch.setattr(host, "threads", lambda: 3)
     asked = []
-    monkeypatch.setattr(values, "write_rows", lambda *given, write=values.write_rows: asked.append(given[0].threads) or write(*given))
+    monkeypatch.setattr(value_kernels, "write_rows", lambda *given, write=value_kernels.write_rows: asked.append(given[0].threads) or write(*given))
     graph = Graph()
     x = graph.input("x", True)
-    sine = values.nodes_called(graph, [graph.call("sin", x)], [x])
+    sine = value_kernels.nodes_called(graph, [graph.call("sin", x)], [x])
     angles = np.linspace(0.0, 3.0, 301)[:, None]  # enough for three threads
     assert_allclose(jax.vmap(sine)(jnp.asarray(angles)), np.sin(angles), rtol=1e-15, atol=1e-16)
     assert_allclose(sine(jnp.asarray(angles[7])), np.sin(angles[7]), rtol=1e-15)
@@ -194,7 +194,7 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
     assert len(asked) == 1
-    with runpy.run_path(files.__file__)["locked"](tmp_path / "lock"):
+    with runpy.run_path(folder_lock.__file__)["locked"](tmp_path / "lock"):
         pass
 
 

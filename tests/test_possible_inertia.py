@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.unknowns import unknowns_of
+from jourdain_jax.identification.solve.unknowns import unknowns_of
 
 GENERATOR = np.random.default_rng(0)
 

@@ -10,8 +10,8 @@ from tolerances import relative_error, tolerance
 import jourdain_jax as jj
 from jourdain_jax import coordinate_rates
 from jourdain_jax.dynamics.power import power
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
+from jourdain_jax.program.eager import eval_numpy
 
 
 def energy_rate_and_power(scene, t, q, u):

@@ -10,7 +10,6 @@ from tolerances import tolerance
 import jourdain_jax as jj
 from jourdain_jax import diagnose
 from jourdain_jax.dynamics.reactions import contact_forces, row_reactions
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import (
     BallOnTurntable,
     ChaplyginSleigh,
@@ -19,6 +18,7 @@ from jourdain_jax.models import (
     VerticalDisc,
     WhippleBicycle,
 )
+from jourdain_jax.program.eager import eval_numpy
 
 SCENES = [
     TwoWheelAxleRedundant(),

@@ -8,12 +8,12 @@ import result_codes as results
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.build.row_program import row_program
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import BY_AUTODIFF
-from jourdain_jax.motion.put_on_rows import row_functions
-from jourdain_jax.native import ffi
+from jourdain_jax.integrate.state_projection import row_functions
+from jourdain_jax.kernels import ffi
 from jourdain_jax.program import interpret
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.structure.row_program import row_program
 
 needs_llvmlite = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against() or "-")
 

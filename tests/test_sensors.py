@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.sensors import filtered, read
+from jourdain_jax.identification.data.sensors import filtered, read
 
 MASS, DAMPING, STIFFNESS = 2.0, 0.6, 5.0
 TS = np.linspace(0.0, 4.0, 81)

@@ -13,8 +13,8 @@ from browser import needs_browser, screenshot
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.plotting.looks import guessed
-from jourdain_jax.plotting.pictures import draw_still
+from jourdain_jax.views.looks import guessed
+from jourdain_jax.views.pictures import draw_still
 
 RED = "#ff0000"
 
@@ -125,7 +125,7 @@ def test_a_notebook_shows_the_page_in_a_frame(shown):
 
 def test_whole_turns_between_saved_times_are_kept():
     turned_by = 2 * np.pi * np.array([0.1, 0.6, 0.9, 2.7, -1.3])
-    from jourdain_jax.plotting.page_data import _whole_turns, quaternions_of
+    from jourdain_jax.views.page_data import _whole_turns, quaternions_of
 
     attitudes = quaternions_of(np.array([jj.rot_y(a) for a in [0.0, *np.cumsum(turned_by)]]))
     for k, turned in enumerate(turned_by):

@@ -30,10 +30,10 @@ from test_studies import assert_same
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
-from jourdain_jax.ensembles import files, store, workers
-from jourdain_jax.ensembles.run import Runner, opened
-from jourdain_jax.ensembles.store import Store
 from jourdain_jax.scene.digests import digest
+from jourdain_jax.studies import folder_lock, store, workers
+from jourdain_jax.studies.run import Runner, opened
+from jourdain_jax.studies.store import Store
 
 COUNT = 90  # lanes, in three chunks
 pytestmark = pytest.mark.usefixtures("small_blocks")
@@ -252,7 +252,7 @@ def test_other_chunks_than_the_study_began_with_are_refused(whole):
         run(whole.store.path, chunk=64)
 
 
-@pytest.mark.skipif(files.fcntl is None, reason="no locks on this system")
+@pytest.mark.skipif(folder_lock.fcntl is None, reason="no locks on this system")
 def test_a_second_run_into_one_folder_is_refused_while_the_first_lives(whole):
     with whole.store.lock(), pytest.raises(jj.InUseError, match=f"in use by process {os.getpid()} on "):
         run(whole.store.path)
@@ -591,7 +591,7 @@ def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):
 SCRIPT = """
 import sys
 import jourdain_jax as jj
-from jourdain_jax.ensembles import task
+from jourdain_jax.studies import task
 
 def spread(motion, allowed=frozenset({"lean", "yaw", "spin", "x"})):
     return motion.q_end[3] - motion.q_end[2] if "lean" in allowed and "q" not in {"a", "b", "c"} else 0.0

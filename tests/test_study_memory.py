@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_study_faults import run, study
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles import memory, task
-from jourdain_jax.ensembles.statistics import Tally
+from jourdain_jax.studies import memory, task
+from jourdain_jax.studies.statistics import Tally
 
 TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
 

@@ -8,7 +8,7 @@ import pytest
 import xarray
 
 from jourdain_jax.cli import main
-from jourdain_jax.ensembles import run
+from jourdain_jax.studies import run
 
 FILE = """
 model = "tilting-disc"

@@ -14,10 +14,10 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.motion.native.layout import MachineWriter
-from jourdain_jax.motion.native.taylor import Series
-from jourdain_jax.native import ffi, host
-from jourdain_jax.native.scalar_program import written
+from jourdain_jax.integrate.loop.lanes import MachineWriter
+from jourdain_jax.integrate.loop.taylor import Series
+from jourdain_jax.kernels import ffi, host
+from jourdain_jax.kernels.scalar_program import written
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed

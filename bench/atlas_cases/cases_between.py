@@ -13,7 +13,7 @@ from atlas_cases.case import Case, required, unanswered
 from atlas_cases.motions import Motion, against, max_error
 from atlas_cases.outcomes import Outcome, judged
 from atlas_cases.scenes_motion import SteepEdge
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.integrate import result_codes
 
 ROWS_SKIP = {"naive": "its steps are those of E1 to E24"}
 NO_ROWS_SKIP = ROWS_SKIP | {"reductions": "no rows", "constraints": "no rows"}
@@ -30,7 +30,7 @@ class Stopped(Motion):
     def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
         """Right where the event, its time and the values there are."""
         code = int(motion.result)
-        if code != results.EVENT:
+        if code != result_codes.EVENT:
             return judged(np.inf, tolerance, motion.message if code else "")
         if motion.event_names[int(motion.event)] != self.event:
             return judged(np.inf, tolerance)

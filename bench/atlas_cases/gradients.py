@@ -13,7 +13,7 @@ from atlas_cases import naive
 from atlas_cases.case import by_type
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.integrate import result_codes
 
 FEWER_STEPS = 2000  # for the reductions, of which reverse mode takes seconds per thousand steps: ten times what a right answer took
 IMPLICIT_STEPS = 5000  # for an implicit solver of diffrax, which comes to a singularity in ever shorter steps and goes back over all of them
@@ -69,8 +69,8 @@ class DerivativeOfMotion:
                     slope, code = jax.grad(value, has_aux=True)(x)
         except (ValueError, jj.DifferentiationModeError) as refusal:
             return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
-        if int(code) not in (results.SUCCESS, results.EVENT):
-            return judged(np.nan, tolerance, results.MESSAGES[int(code)], stalled=int(code) == results.MAX_STEPS)
+        if int(code) not in (result_codes.SUCCESS, result_codes.EVENT):
+            return judged(np.nan, tolerance, result_codes.MESSAGES[int(code)], stalled=int(code) == result_codes.MAX_STEPS)
         found = judged(worst(float(slope), self.known, self.scale), tolerance)
         said = [str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)]
         return found if found.outcome == "right" or not said else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")

@@ -11,7 +11,7 @@ import jourdain_jax as jj
 from atlas_cases import naive
 from atlas_cases.methods import Method, reduction
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
-from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.program.eager import eval_numpy
 
 ONLY_MOTION = "no motion is asked"
 ONLY_OF_MOTIONS = ("constraints", "integrators", "adjoints", "elsewhere")

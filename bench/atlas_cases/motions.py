@@ -14,7 +14,7 @@ from atlas_cases.case import by_type, single
 from atlas_cases.elsewhere import Elsewhere
 from atlas_cases.methods import EVEN_STEPS, Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.integrate import result_codes
 
 # Methods that take long and show something in some cases only.
 SELDOM = {
@@ -95,9 +95,9 @@ class Motion:
     def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
         """Outcome of a trajectory: its result code, its numbers, and what its summary warns of."""
         code = int(motion.result)
-        if code == results.MAX_STEPS:
+        if code == result_codes.MAX_STEPS:
             return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True)
-        if code != results.SUCCESS:
+        if code != result_codes.SUCCESS:
             return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)")
         error = self.error(np.asarray(motion.q, float), np.asarray(motion.u, float))
         found = judged(error, tolerance)

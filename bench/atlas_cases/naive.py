@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.program.eager import eager_if_concrete
 
 
 @dataclass(frozen=True)

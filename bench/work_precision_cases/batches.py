@@ -11,7 +11,7 @@ from baselines import heyoka_disc, heyoka_lowered
 from minimal_states import final_states, starts_at
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.explicit_steps import order_for
+from jourdain_jax.integrate.explicit_steps import order_for
 from work_precision_cases import peer_c, peer_diffrax, peer_heyoka
 from work_precision_cases import record as records
 from work_precision_cases.curve import NotApplicable

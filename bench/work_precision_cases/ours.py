@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.explicit_steps import order_for
+from jourdain_jax.integrate.explicit_steps import order_for
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.problem import Problem
 

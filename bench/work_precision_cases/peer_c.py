@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 from baselines.hand_derived import HAND_DERIVED
 
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI8
+from jourdain_jax.integrate.explicit_steps import DOPRI8
 from work_precision_cases import kane
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.peer_diffrax import BY_HAND

@@ -12,8 +12,8 @@ import typing as _typing
 
 import jax as _jax
 
-from jourdain_jax.calculus.on_first_use import module_on_first_use as _module_on_first_use
-from jourdain_jax.calculus.on_first_use import names_on_first_use as _names_on_first_use
+from jourdain_jax.calculus.lazy_imports import module_on_first_use as _module_on_first_use
+from jourdain_jax.calculus.lazy_imports import names_on_first_use as _names_on_first_use
 
 if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
@@ -30,10 +30,8 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
-from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.calculus.on_first_use import version_of as _version_of
+from jourdain_jax.calculus.lazy_imports import version_of as _version_of
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
@@ -48,84 +46,86 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
+from jourdain_jax.integrate.explicit_steps import Taylor
+from jourdain_jax.integrate.inputs import Sampled
+from jourdain_jax.integrate.result_codes import SimulationError
+from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.vector_fields.field import Formulation
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.lowering.lowered import Lowered, NotLowered
-from jourdain_jax.motion.inputs import Sampled
-from jourdain_jax.motion.integrators.explicit_steps import Taylor
+from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered
 from jourdain_jax.motion.model import Model, build, load_model
 from jourdain_jax.motion.options import Options
-from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import consistent, start
 from jourdain_jax.motion.trajectories.diagnostics import diagnose
-from jourdain_jax.motion.trajectories.results import SimulationError
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import Formulation
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-from jourdain_jax.scene.contacts import Contact, Coulomb, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+from jourdain_jax.scene.contact.contacts import Contact, Coulomb, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+from jourdain_jax.scene.contact.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+from jourdain_jax.scene.contact.held_rows import joint_friction
 from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
-from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
-from jourdain_jax.scene.held_rows import joint_friction
 from jourdain_jax.scene.identity import clear_caches
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.modes import Event, modes
 from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
 from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
+from jourdain_jax.structure.sampling import sample_states
+from jourdain_jax.structure.structure import structure_of
 
 if _typing.TYPE_CHECKING:  # imported on first use
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
-    from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
-    from jourdain_jax.analysis.experiment import Experiment
     from jourdain_jax.analysis.families.chart import stability_chart
     from jourdain_jax.analysis.families.critical import critical
     from jourdain_jax.analysis.families.family import family
     from jourdain_jax.analysis.families.periodic import periodic
-    from jourdain_jax.analysis.filtering import filtered_log_likelihood
-    from jourdain_jax.analysis.fit import fit, fit_batch
-    from jourdain_jax.analysis.fit_result import Fit
-    from jourdain_jax.analysis.layout import possible_inertia
-    from jourdain_jax.analysis.likelihood import PlannedInformation, log_likelihood, planned_information
     from jourdain_jax.analysis.linearize import Linearization, linearize
-    from jourdain_jax.analysis.log_density import LogDensity, log_density
-    from jourdain_jax.analysis.problem import huber, student_t
-    from jourdain_jax.analysis.quantities import Accelerometer, LoadCell
     from jourdain_jax.analysis.report import Report, report
-    from jourdain_jax.analysis.sensors import Actuator, Sensor
-    from jourdain_jax.analysis.shooting import MultipleShooting
     from jourdain_jax.analysis.statements import Verification, derivative_exists
     from jourdain_jax.analysis.steady import SteadyMotion, steady
     from jourdain_jax.analysis.verify import verify
-    from jourdain_jax.ensembles.design import Design
-    from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-    from jourdain_jax.ensembles.files import InUseError
-    from jourdain_jax.ensembles.mean_gradients import MeanGradients
-    from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
-    from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
-    from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
-    from jourdain_jax.ensembles.study import Study
     from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
     from jourdain_jax.equations.lagrange import lagrange_equations
+    from jourdain_jax.identification.data.channels import Accelerometer, LoadCell
+    from jourdain_jax.identification.data.estimate import Estimate, bounds, joint_normal, positive, unbounded
+    from jourdain_jax.identification.data.experiment import Experiment
+    from jourdain_jax.identification.data.sensors import Actuator, Sensor
+    from jourdain_jax.identification.fit import fit, fit_batch
+    from jourdain_jax.identification.inference.filtering import filtered_log_likelihood
+    from jourdain_jax.identification.inference.likelihood import PlannedInformation, log_likelihood, planned_information
+    from jourdain_jax.identification.inference.log_density import LogDensity, log_density
+    from jourdain_jax.identification.report.fit_result import Fit
+    from jourdain_jax.identification.solve.layout import possible_inertia
+    from jourdain_jax.identification.solve.problem import huber, student_t
+    from jourdain_jax.identification.solve.shooting import MultipleShooting
     from jourdain_jax.importers.mjcf import from_mjcf
     from jourdain_jax.importers.sympy_scene import from_sympy
     from jourdain_jax.importers.urdf import from_urdf
-    from jourdain_jax.motion.batches.rollout import Rollout, rollout
+    from jourdain_jax.integrate.discrete_gradient import DiscreteGradient
+    from jourdain_jax.integrate.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
+    from jourdain_jax.integrate.implicit_midpoint import ImplicitMidpoint
+    from jourdain_jax.integrate.radau import RadauIIA
     from jourdain_jax.motion.check import Checked, check
     from jourdain_jax.motion.diffrax_steps import diffrax_term
-    from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-    from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
-    from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
-    from jourdain_jax.motion.integrators.radau import RadauIIA
+    from jourdain_jax.motion.rollout import Rollout, rollout
     from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
-    from jourdain_jax.plotting.pictures import animate
-    from jourdain_jax.plotting.quantities import plot
-    from jourdain_jax.plotting.show import View, show
+    from jourdain_jax.studies.design import Design
+    from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+    from jourdain_jax.studies.folder_lock import InUseError
+    from jourdain_jax.studies.mean_gradients import MeanGradients
+    from jourdain_jax.studies.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
+    from jourdain_jax.studies.result import StudyResult, load_study, merge_studies
+    from jourdain_jax.studies.sobol import SobolIndices, sobol_indices
+    from jourdain_jax.studies.study import Study
+    from jourdain_jax.views.pictures import animate
+    from jourdain_jax.views.quantities import plot
+    from jourdain_jax.views.show import View, show
 else:  # a static tool does not see it: to one, any other name is a mistake
     _GONE = {
         "Built": "it is `Model`, which `build` returns",
@@ -134,7 +134,7 @@ else:  # a static tool does not see it: to one, any other name is a mistake
     }
     __getattr__, __dir__ = _names_on_first_use(globals(), _GONE)
 
-_pictures = _module_on_first_use("jourdain_jax.plotting.pictures")
+_pictures = _module_on_first_use("jourdain_jax.views.pictures")
 _show_scenes_with(lambda scene: _pictures.scene_picture(scene))
 __version__ = _version_of("jourdain-jax")
 

@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.reals import Scalar, largest
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.dynamics.power import power
@@ -19,6 +17,8 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.sampling import sample_states
+from jourdain_jax.structure.structure import structure_of
 
 _ORIGINS = {
     "loads": "loads without a potential",

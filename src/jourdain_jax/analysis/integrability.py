@@ -28,13 +28,13 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import structure_of
-from jourdain_jax.build.trace import named_values, traced_scene
 from jourdain_jax.calculus.reals import largest, real_type
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.sampling import sample_states
+from jourdain_jax.structure.structure import structure_of
+from jourdain_jax.structure.trace import named_values, traced_scene
 
 Both = tuple[np.ndarray, np.ndarray]
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
-from jourdain_jax.analysis.instant import ByMatrices, instant_of, places_of
+from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
     eliminated,
@@ -30,18 +30,18 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
     smallest_pivot,
 )
-from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, array_module, compiled_quickly, holds, is_traced, largest, static
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.lowering.kinks import bent_load
-from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, warn
 from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import WELL_CONDITIONED
 
 
 class Modes(eqx.Module):
@@ -101,7 +101,7 @@ class Linearization(Printed, eqx.Module):
         """Return 0, or `SINGULAR_PARTITION` if the privileged speeds and coordinates do not determine the
         others; then all results are NaN.
         """
-        return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
+        return jnp.where(self.pivot >= SMALLEST_PIVOT, result_codes.SUCCESS, result_codes.SINGULAR_PARTITION)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
         """Return the roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Distinct roots are

@@ -8,20 +8,20 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
-from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.integrate.inputs import as_inputs
+from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.kernels import ffi
 from jourdain_jax.motion.model import Model, build, modelled
-from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import COORDINATE_DOMAIN, SPEED_DOMAIN
+from jourdain_jax.structure.structure import structure_of
 
 AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", "affine", "worst_pivot", "typical_pivot", "rank_losses")
 

@@ -19,11 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, static, tiny_of
 from jourdain_jax.dynamics.accelerations import reductions
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies, partial_velocities, pose_at
@@ -31,13 +29,15 @@ from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import loads_of, potential_of
+from jourdain_jax.scene.user_methods import loads_of, potential_of
+from jourdain_jax.structure.structure import plain_row_lengths, usual_rows
 
 # relative to the size of the compared quantities, in double and in single precision
 THRESHOLDS = {

@@ -3,7 +3,7 @@ them change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
-Families of steady motions use the same equations (`instant.py`). They are solved by Levenberg-Marquardt from
+Families of steady motions use the same equations (`motion_derivatives.py`). They are solved by Levenberg-Marquardt from
 the guess (`calculus/roots.py`). Steadiness of the result is judged by dy/dt and d2y/dt2 along the motion,
 without the list of ignorable coordinates.
 """
@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.families.equations import sizes
-from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
+from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, static
 from jourdain_jax.calculus.roots import smooth_root
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
-from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_time, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed

@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
-from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
 from jourdain_jax.calculus.reals import Entries, Indices, all_finite, array_module, rank_cutoff, tiny_of
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.scene_parts import names_of_position_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.rank import best_privileged, named_speeds, pivots_at
+from jourdain_jax.structure.structure import WELL_CONDITIONED, structure_of, usual_rows
 
 
 def perturbed_names(scene: Scene) -> Labels:

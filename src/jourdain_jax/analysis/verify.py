@@ -22,28 +22,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.analysis.statements import Verification, by_reduction, check, gradient_checks, statement_checks
-from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, of_bodies, partial_velocities, shapes_along_motion, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
-from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.scene_parts import names_of_rows
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.check import check as look_for_mistakes
-from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.start import consistent
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import loads_of, potential_of
+from jourdain_jax.scene.user_methods import loads_of, potential_of
+from jourdain_jax.structure.sampling import sample_states
+from jourdain_jax.structure.structure import plain_row_lengths, structure_of, usual_rows
 
 
 @shown_from_users_lines

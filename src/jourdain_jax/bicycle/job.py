@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.bicycle.from_measurements import benchmark_from_measurements
+from jourdain_jax.bicycle.measurements import benchmark_from_measurements
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.stability import eigenvalues, linear_matrices, stability_speeds, upright_running
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 from jourdain_jax.calculus.reals import compiled_quickly
+from jourdain_jax.integrate.result_codes import EVENT
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.batches.rollout import Rollout, rollout
-from jourdain_jax.motion.trajectories.results import EVENT
+from jourdain_jax.motion.rollout import Rollout, rollout
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; higher speeds count as none

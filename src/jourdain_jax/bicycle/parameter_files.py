@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.estimate import Correlated, joint_normal
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.calculus import files
 from jourdain_jax.calculus.files import read_text, shortened
-from jourdain_jax.ensembles.distributions import Normal
+from jourdain_jax.identification.data.estimate import Correlated, joint_normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import Labels, check_name
-
-from .parameters import PARAMETER_NAMES, doubts, violations
+from jourdain_jax.studies.distributions import Normal
 
 _FORMAT = "`name = value` or `name = value+/-sigma`, for example `rF = 0.35+/-0.001`"
 _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
@@ -97,7 +96,7 @@ def shipped_measurements() -> dict[str, Path]:
 
 
 def _shipped(ending: str) -> dict[str, Path]:
-    folder = Path(str(resources.files("jourdain_jax") / "data" / "bicycles"))
+    folder = Path(str(resources.files("jourdain_jax") / "bicycle" / "data"))
     return {path.stem.removesuffix(ending) or path.stem: path for path in sorted(folder.glob(f"*{ending}.txt"))}
 
 

@@ -37,8 +37,8 @@ from jaxtyping import Bool, Complex, Float
 
 from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.calculus.reals import Flag, Scalar, compiled_quickly, real_type
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.put_on_rows import State, state_of
 
 _SPEED = 4.0  # m/s, of the second linearisation
 _DEPENDENT = ("pitch",)

@@ -14,10 +14,9 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Key, UInt32
 
+from jourdain_jax.bicycle.parameter_files import MeasuredBicycle
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, violations
 from jourdain_jax.calculus.reals import Scalar
-
-from .parameter_files import MeasuredBicycle
-from .parameters import PARAMETER_NAMES, violations
 
 
 class ParameterSamples(eqx.Module):

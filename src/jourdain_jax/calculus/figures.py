@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.lazy_imports import needed
 
 pyplot = partial(needed, "matplotlib.pyplot", "a picture", "plot")
 DATA, MODEL, QUIET = "#d1495b", "#1b4f72", "#888888"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jourdain_jax.bicycle.job import Refused, Study, run, table, write_results
 from jourdain_jax.bicycle.parameter_files import shipped_bicycles, shipped_measurements
-from jourdain_jax.plotting.bicycle_figures import animate_ride, draw_eigenvalues, draw_rides
+from jourdain_jax.views.bicycle_figures import animate_ride, draw_eigenvalues, draw_rides
 
 DEMO = "Rigid"  # a measured bicycle with all standard errors and a stable speed range
 

@@ -8,18 +8,18 @@ import numpy as np
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
 from jourdain_jax.calculus.files import check_place, number
-from jourdain_jax.equations.listed import names_of_events
+from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.integrate.result_codes import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.trajectories.diagnostics import diagnose
-from jourdain_jax.motion.trajectories.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.trajectories.storage import save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.pictures import animate, check_suffix
-from jourdain_jax.plotting.quantities import check_format, plot
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.views.pictures import animate, check_suffix
+from jourdain_jax.views.quantities import check_format, plot
 
 
 def add(verbs) -> None:

@@ -31,15 +31,15 @@ from pathlib import Path
 from jourdain_jax.calculus.files import check_depth, parsed, read_text, whole_number
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.cli.model_verbs import plain
-from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-from jourdain_jax.ensembles.files import InUseError
-from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
-from jourdain_jax.ensembles.result import LEVELS, StudyResult, load_study, merge_studies
-from jourdain_jax.ensembles.study import REFUSED, Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.motion.model import build
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN
 from jourdain_jax.scene.names import check_names, nearest
+from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+from jourdain_jax.studies.folder_lock import InUseError
+from jourdain_jax.studies.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
+from jourdain_jax.studies.result import LEVELS, StudyResult, load_study, merge_studies
+from jourdain_jax.studies.study import REFUSED, Study
 
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}

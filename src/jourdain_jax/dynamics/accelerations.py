@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, check_kind, checked_real, largest
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
     Multipliers,
@@ -28,9 +26,11 @@ from jourdain_jax.equations.reductions import (
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import structure_of, usual_rows
 
 
 class Baumgarte(eqx.Module):

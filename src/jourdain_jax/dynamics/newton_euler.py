@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, of_bodies, partial_velocities
 from jourdain_jax.equations.virtual_power import Resultants, inertia_resultants, resultants
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import potential_of
+from jourdain_jax.scene.user_methods import potential_of
 
 
 @eager_if_concrete

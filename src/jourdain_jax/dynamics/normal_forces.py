@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Indices, eps_of, largest, rank_cutoff, tiny_of
-from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.names import Labels, check_names
 
 

@@ -19,17 +19,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.build.trace import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.calculus.reals import Indices, Scalar
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.equations.kinematics import inertias, motion_at, of_bodies, velocities_of
-from jourdain_jax.equations.listed import has_load_without_potential
 from jourdain_jax.equations.reductions import Reduced
+from jourdain_jax.equations.scene_parts import has_load_without_potential
 from jourdain_jax.equations.virtual_power import potential_energy
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import Structure, structure_of
+from jourdain_jax.structure.trace import explicit_rate, forces_for_potentials, power_of_loads
 
 
 class Power(eqx.Module):

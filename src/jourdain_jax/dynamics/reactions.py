@@ -14,23 +14,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Flag, Scalar, eps_of, largest, rank_cutoff, static
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies
-from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.scene_parts import names_of_rows
 from jourdain_jax.equations.virtual_power import contact_response, resultants, switching_forces
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels, Named, UnknownNameError, check_name
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of
+from jourdain_jax.scene.user_methods import contacts_of
+from jourdain_jax.structure.structure import plain_row_lengths
 
 
 class RowReactions(eqx.Module):

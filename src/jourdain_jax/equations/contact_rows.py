@@ -14,11 +14,11 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.rows import rates_along, slip_of
-from jourdain_jax.scene.contacts import Contact, Coulomb
+from jourdain_jax.scene.contact.contacts import Contact, Coulomb
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of, held_rows_of
+from jourdain_jax.scene.user_methods import contacts_of, held_rows_of
 
 
 class ContactRows(eqx.Module):

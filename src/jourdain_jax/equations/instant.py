@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Scalar, as_real
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
-from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, velocity_rows
+from jourdain_jax.equations.scene_parts import names_of_rows
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene

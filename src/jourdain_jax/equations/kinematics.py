@@ -17,12 +17,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Numbers, Scalar, Vector3, as_real, real_type
 from jourdain_jax.calculus.rotations import vee
-from jourdain_jax.eager.eager import eager_if_concrete
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import bodies_of, coordinate_rates_of
+from jourdain_jax.scene.user_methods import bodies_of, coordinate_rates_of
 
 
 class Velocities(eqx.Module):

@@ -9,8 +9,8 @@ It gives M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, `h 
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
+from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.reals import Speeds
 from jourdain_jax.calculus.roots import fixed_point
 from jourdain_jax.equations.least_change import least_change
-from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
 

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
-from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
+from jourdain_jax.scene.user_methods import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
 
 
 class UsualRows(eqx.Module):
@@ -59,7 +59,7 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     """Return values of all constraints at velocity level, by name."""
     rows = rates_along(scene, motion, lambda pose: position_rows(scene, pose))
     for name, contact in contacts_of(scene, motion.pose()).items():
-        if contact.friction is not None:  # it may slip (`equations/switching.py`)
+        if contact.friction is not None:  # it may slip (`equations/phases.py`)
             continue
         rows[f"{name} slip"] = slip_of(contact, motion)
     for name, value in velocity_constraints_of(scene, motion).items():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.files import shortened
-from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.lazy_imports import needed
 
 _FUNCTIONS = {
     **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},

@@ -12,7 +12,7 @@ import numpy as np
 
 from jourdain_jax.calculus.rotations import matrices_to_quaternions, onto_axis
 from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, all_of
-from jourdain_jax.importers.placing import SIZES, about, by_euler_angles, by_quaternion, combined, moments, volume
+from jourdain_jax.importers.placement import SIZES, about, by_euler_angles, by_quaternion, combined, moments, volume
 from jourdain_jax.importers.scene_class import identifier
 from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Push, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene

@@ -19,7 +19,7 @@ from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 
 

@@ -9,14 +9,14 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Matrix3, Vector3, real_type
 from jourdain_jax.calculus.rotations import onto_axis, quaternion_to_matrix
-from jourdain_jax.importers.placing import combined
+from jourdain_jax.importers.placement import combined
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
 from jourdain_jax.scene.names import Labels, check_names
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

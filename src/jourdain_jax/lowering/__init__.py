@@ -1,7 +1,7 @@
 """Lowering: a scene's equations as a short scalar program.
 
-    scene -> jaxpr -> graph of scalars -> elimination of dependent speeds -> normal forms -> straight-line code
+    scene -> jaxpr -> graph of scalars -> elimination of the constraints -> normal forms -> straight-line code
 
-It removes structural zeros and ones, which XLA cannot remove from products of dense matrices, and
-coordinates without influence.
+Structural zeros and ones, which XLA cannot remove from products of dense matrices, vanish here; so do
+coordinates on which nothing depends. Open `lower.py` first, then `appell.py`.
 """

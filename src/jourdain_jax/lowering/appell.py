@@ -15,9 +15,6 @@ from itertools import islice
 
 import numpy as np
 
-from jourdain_jax.build.probed_on_graph import generic_states
-from jourdain_jax.build.structure import Structure
-from jourdain_jax.build.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.contact_forms import simplify_contacts
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
@@ -27,6 +24,9 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import NodeList
 from jourdain_jax.program.identity_test import equal, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
+from jourdain_jax.structure.probes import generic_states
+from jourdain_jax.structure.structure import Structure
+from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
 
 
 @dataclass(frozen=True)

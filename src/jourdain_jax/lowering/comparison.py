@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.structure import Structure
 from jourdain_jax.calculus.reals import all_finite, at_index, largest, real_type
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.dense_rates import dense_rates
 from jourdain_jax.lowering.elimination import pivots_ok
-from jourdain_jax.lowering.lowered import NotLowered
+from jourdain_jax.lowering.lowered_equations import NotLowered
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import Structure
 
 DIFFERS = "differs from the dense path"
 LIKELY = "a body, load or constraint may have a kink there, or the constraints or the remaining inertia are nearly singular"

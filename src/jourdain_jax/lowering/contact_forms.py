@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.polynomial import NormalForms
+from jourdain_jax.structure.trace import TracedScene
 
 MOST_TERMS = (8, 60)  # term limits to try
 

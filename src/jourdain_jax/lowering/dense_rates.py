@@ -15,15 +15,15 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from jourdain_jax.build.assembling import speed_scales, typical_lengths
-from jourdain_jax.build.structure import Structure
-from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Indices, all_finite, at_index
 from jourdain_jax.calculus.roots import shortest
-from jourdain_jax.eager.eager import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
+from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import speed_scales, typical_lengths
+from jourdain_jax.structure.structure import Structure
+from jourdain_jax.structure.trace import VelocityQuantities, jaxpr_of_scene
 
 
 def dense_rates(scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:

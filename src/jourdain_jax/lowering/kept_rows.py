@@ -6,12 +6,12 @@ the multipliers are not unique.
     z <- z + dz,   A_z dz = -phi(t, q, u)         projection of the speeds
 """
 
-from jourdain_jax.build.structure import Structure
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
 from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.graph import Graph, NodeList
 from jourdain_jax.program.polynomial import NormalForms
+from jourdain_jax.structure.structure import Structure
 
 
 class KeptRows:

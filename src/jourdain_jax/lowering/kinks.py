@@ -5,15 +5,15 @@ Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
 
 import numpy as np
 
-from jourdain_jax.build.probed_on_graph import looked_at
-from jourdain_jax.build.structure import structure_whatever_its_faults
-from jourdain_jax.build.trace import TracedScene, named_values, owned
 from jourdain_jax.lowering.relations import AGREE, branches, jumps, switches
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.probes import looked_at
+from jourdain_jax.structure.structure import structure_whatever_its_faults
+from jourdain_jax.structure.trace import TracedScene, named_values, owned
 
 
 def loads_have_relations(scene: Scene) -> bool:

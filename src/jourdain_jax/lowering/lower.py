@@ -11,27 +11,27 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.assembling import random_states
-from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
-from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
 from jourdain_jax.calculus.reals import Indices, all_finite, is_traced
-from jourdain_jax.equations.listed import names_of_events, stops
+from jourdain_jax.equations.scene_parts import names_of_events, stops
+from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
-from jourdain_jax.lowering.far import full_turns, on_velocity_rows
+from jourdain_jax.lowering.distant_probes import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
-from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
+from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.relations import jumps, relations, sided
-from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
-from jourdain_jax.program.part import part_of
+from jourdain_jax.program.subgraph import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.identity import once_per_class, varied, with_reference_parameters
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import random_states
+from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
+from jourdain_jax.structure.trace import TracedScene, Variables, named_values, traced_scene
 
 # Operations of the program before simplification above which the dense path is taken. With XLA, such a
 # program needs a minute more to compile than dense matrices (24 joint angles, 20,762 operations: 71 and 7.5

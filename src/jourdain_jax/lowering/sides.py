@@ -8,7 +8,7 @@ side of a relation the state is.
     c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
 
 No branch changes within a step: the event search ends the step where x vanishes, and the derivative jumps
-there as at any event (`motion/native/transitions.py`). Modelica treats relations the same way. If a branch is
+there as at any event (`integrate/loop/transitions.py`). Modelica treats relations the same way. If a branch is
 undefined beyond x = 0, as with `sqrt`, its relation has only the event.
 """
 
@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.build.trace import Variables
-from jourdain_jax.lowering.lowered import NODES, Lowered
+from jourdain_jax.lowering.lowered_equations import NODES, Lowered
 from jourdain_jax.lowering.relations import COMPARED, WHOLE, counted, switches, where
 from jourdain_jax.program.graph import Graph, NodeList
+from jourdain_jax.structure.trace import Variables
 
 
 @lru_cache(maxsize=64)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from jourdain_jax.calculus.on_first_use import names_on_first_use
+from jourdain_jax.calculus.lazy_imports import names_on_first_use
 from jourdain_jax.models.registry import MODELS, model
 
 if TYPE_CHECKING:

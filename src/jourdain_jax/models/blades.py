@@ -10,7 +10,7 @@ from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

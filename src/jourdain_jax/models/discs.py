@@ -8,9 +8,9 @@ from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.contacts import disc_contact
+from jourdain_jax.scene.contact.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 
 
 class VerticalDisc(Heavy):

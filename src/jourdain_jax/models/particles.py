@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
+from jourdain_jax.scene.contact.grounds import tangents_of
 from jourdain_jax.scene.coordinates import coordinates
-from jourdain_jax.scene.grounds import tangents_of
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

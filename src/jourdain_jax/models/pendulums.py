@@ -13,7 +13,7 @@ from jourdain_jax.scene.constraints import rod
 from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import damper, gravity, spring
 from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

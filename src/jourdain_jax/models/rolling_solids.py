@@ -8,10 +8,10 @@ from jourdain_jax.calculus.reals import Matrix3, Parameter, Vector3
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.contacts import ball_contact, ellipsoid_contact
+from jourdain_jax.scene.contact.contacts import ball_contact, ellipsoid_contact
+from jourdain_jax.scene.contact.grounds import Plane
 from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
-from jourdain_jax.scene.grounds import Plane
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.visuals import Visual
 
 

@@ -8,14 +8,14 @@
 
 from dataclasses import dataclass
 
-from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.lowering.comparison import DIFFERS
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import NotLowered
+from jourdain_jax.lowering.lowered_equations import NotLowered
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines, warn
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import structure_whatever_its_faults
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,14 +19,13 @@ from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
 from jourdain_jax.calculus.reals import at_index, static
-from jourdain_jax.motion.arrays.writer import ArrayWriter
-from jourdain_jax.motion.inputs import Inputs, as_inputs
-from jourdain_jax.motion.integrators import event_search, integrands
+from jourdain_jax.integrate import event_search, integrands, result_codes
+from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
+from jourdain_jax.integrate.inputs import Inputs, as_inputs
+from jourdain_jax.integrate.own_steps import reason_against_watching
+from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
+from jourdain_jax.integrate.vector_fields.field import Formulation, Instant, Integrated, VectorField
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.motion.own_steps import reason_against_watching
-from jourdain_jax.motion.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.vector_fields.field import Formulation, Instant, Integrated, VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.scene import Scene
 
@@ -118,24 +117,24 @@ class Diffrax(eqx.Module, Integrator):
         )
         (found_ts, (t_end,)), (ys, last) = solution.ts, solution.ys
         y_end = at_index(last, 0)
-        code = jnp.asarray(results.STEP_TOO_SMALL)
+        code = jnp.asarray(result_codes.STEP_TOO_SMALL)
         for told, own in (
-            (diffrax.RESULTS.successful, results.SUCCESS),
-            (diffrax.RESULTS.event_occurred, results.EVENT),
-            (diffrax.RESULTS.max_steps_reached, results.MAX_STEPS),
-            (diffrax.RESULTS.nonlinear_divergence, results.UNSOLVED_STEP),
-            (diffrax.RESULTS.nonlinear_max_steps_reached, results.UNSOLVED_STEP),
+            (diffrax.RESULTS.successful, result_codes.SUCCESS),
+            (diffrax.RESULTS.event_occurred, result_codes.EVENT),
+            (diffrax.RESULTS.max_steps_reached, result_codes.MAX_STEPS),
+            (diffrax.RESULTS.nonlinear_divergence, result_codes.UNSOLVED_STEP),
+            (diffrax.RESULTS.nonlinear_max_steps_reached, result_codes.UNSOLVED_STEP),
         ):
             code = jnp.where(solution.result == told, own, code)
         code, event_index = code.astype(jnp.int32), jnp.asarray(-1, jnp.int32)
         reached = jnp.isfinite(found_ts)
         if self.event_names:
             first = jnp.argmin(integrands.events(t_end, y_end, begun.args)).astype(jnp.int32)
-            event_index = jnp.where(code == results.EVENT, first, event_index)
+            event_index = jnp.where(code == result_codes.EVENT, first, event_index)
             over = _over_at_start(begun, t0, t1)
             happened = jnp.any(over)
             t_end, y_end = jax.tree.map(lambda first, last: jnp.where(happened, first, last), (t0, begun.y0), (t_end, y_end))
-            reached, code = reached & (~happened | (found_ts == t0)), jnp.where(happened, results.EVENT, code)
+            reached, code = reached & (~happened | (found_ts == t0)), jnp.where(happened, result_codes.EVENT, code)
             event_index = jnp.where(happened, jnp.argmax(over).astype(jnp.int32), event_index)
         return Solved(
             ts=found_ts,

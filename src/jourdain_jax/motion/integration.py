@@ -25,26 +25,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.plausibility import faults_at
-from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
 from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, at_index, eps_of, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
-from jourdain_jax.motion.integrators import integrands
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
-from jourdain_jax.motion.native import native_motion, values
-from jourdain_jax.motion.own_steps import reason_against_watching
-from jourdain_jax.motion.put_on_rows import State, coordinates_elsewhere, projected
-from jourdain_jax.motion.setup import Begun, Passed, Plain, Setup, Solved, times_fit
-from jourdain_jax.motion.trajectories import diagnostics, results
-from jourdain_jax.motion.trajectories.over_times import Phases
+from jourdain_jax.integrate import integrands, result_codes
+from jourdain_jax.integrate.implicit_steps import FixedStepMethod
+from jourdain_jax.integrate.inputs import Inputs, Mode, for_programs, in_phases
+from jourdain_jax.integrate.loop import native_motion, value_kernels
+from jourdain_jax.integrate.own_steps import reason_against_watching
+from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved, times_fit
+from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant, Integrated
+from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.motion.trajectories import diagnostics
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import ByProgram, Instant, Integrated
-from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.motion.trajectories.values_in_time import Phases
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.parameters import parameter_faults
+from jourdain_jax.scene.parameter_fields import parameter_faults
+from jourdain_jax.structure.plausibility import faults_at
+from jourdain_jax.structure.row_program import row_program
 
 
 def integrate(setup: Setup) -> Trajectory:
@@ -84,7 +84,7 @@ def _with_machine_code(setup: Setup) -> Setup:
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
         return setup
-    return setup._replace(field=replace(field, native=values.beside(field.program)))
+    return setup._replace(field=replace(field, native=value_kernels.beside(field.program)))
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
@@ -194,14 +194,14 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
     drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
     code = solved.code
-    for found_out, cause in ((drifted, results.OFF_CONSTRAINTS), (lost, results.ENERGY_LOST), (violated, results.CONTRADICTORY_ROWS)):
-        code = jnp.where((code <= results.EVENT) & found_out, cause, code)
+    for found_out, cause in ((drifted, result_codes.OFF_CONSTRAINTS), (lost, result_codes.ENERGY_LOST), (violated, result_codes.CONTRADICTORY_ROWS)):
+        code = jnp.where((code <= result_codes.EVENT) & found_out, cause, code)
     unwatched = reason_against_watching(setup)
     result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
-    failed = result > results.EVENT
+    failed = result > result_codes.EVENT
     # a failure that no step detected happened at an unknown time
-    over = (result == results.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > results.EVENT)
-    noticed = over | (result == solved.code) | (result == results.NOT_FINITE)
+    over = (result == result_codes.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > result_codes.EVENT)
+    noticed = over | (result == solved.code) | (result == result_codes.NOT_FINITE)
     beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states and of the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
@@ -226,7 +226,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         rejected=solved.rejected,
         last_step=solved.last_step,
         crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
-        fallback=jnp.asarray(results.AS_ASKED, jnp.int32),
+        fallback=jnp.asarray(result_codes.AS_ASKED, jnp.int32),
         moved_q=moved_q,
         moved_u=moved_u,
         smallest_pivot=pivot,
@@ -278,7 +278,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
     else:
         nowhere = jnp.full(len(program.others), jnp.nan)
-        right = values.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
+        right = value_kernels.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
@@ -286,16 +286,16 @@ def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     """Return the result code, with the cause if known; later conditions take precedence."""
     start, end = begun.start, solved.y_end
     eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
-    code = jnp.where(finite(end.q, end.v), code, results.NOT_FINITE)
+    code = jnp.where(finite(end.q, end.v), code, result_codes.NOT_FINITE)
     # a pivot that changed sign or is this small means that independent speeds no longer determine the others
-    code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
-    code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, results.INCONSISTENT_START)
-    code = jnp.where((code == results.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), results.UNRESOLVED, code)
+    code = jnp.where(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION, code)
+    code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, result_codes.INCONSISTENT_START)
+    code = jnp.where((code == result_codes.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED, code)
     # if no step succeeds, however short, the accelerations themselves are at fault
-    code = jnp.where((code == results.STEP_TOO_SMALL) & (solved.accepted == 0), results.NOT_FINITE, code)
-    code = jnp.where(finite(start.q, start.u), code, results.BAD_START)
-    code = jnp.where(begun.timely, code, results.BAD_TIMES)
-    return jnp.where(begun.right, code, results.BAD_PARAMETER).astype(jnp.int32)
+    code = jnp.where((code == result_codes.STEP_TOO_SMALL) & (solved.accepted == 0), result_codes.NOT_FINITE, code)
+    code = jnp.where(finite(start.q, start.u), code, result_codes.BAD_START)
+    code = jnp.where(begun.timely, code, result_codes.BAD_TIMES)
+    return jnp.where(begun.right, code, result_codes.BAD_PARAMETER).astype(jnp.int32)
 
 
 MOST_STEP_ERRORS = 10  # times the change from N steps at their tolerance

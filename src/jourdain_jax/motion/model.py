@@ -8,32 +8,32 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from jourdain_jax.build.probed_on_graph import coordinates_on_rows
-from jourdain_jax.build.row_program import row_program
-from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
 from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows, stops
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
+from jourdain_jax.equations.scene_parts import names_of_events, names_of_invariants, names_of_position_rows, stops
+from jourdain_jax.integrate.inputs import Inputs, as_inputs
+from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.state_projection import Usual, usual_sizes
+from jourdain_jax.integrate.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
+from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered, NotLowered
+from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered
 from jourdain_jax.motion import model_file
 from jourdain_jax.motion.check import warn_of_mistakes
 from jourdain_jax.motion.facts import Conserved, Dependence, Freedoms, Rows
-from jourdain_jax.motion.inputs import Inputs, as_inputs
-from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.options import bytes_of
-from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
-from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
-from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
-from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import found_before, once_per_values
 from jourdain_jax.scene.names import Labels, Sentences, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.probes import coordinates_on_rows
+from jourdain_jax.structure.row_program import row_program
+from jourdain_jax.structure.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
 
 _BACKENDS = ("auto", "native", "xla", "dense")
 

@@ -15,15 +15,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.build.structure import Structure
-from jourdain_jax.build.trace import Variables
 from jourdain_jax.calculus.files import FilePath, check_place, parsed, read_bytes, write_whole
-from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.lowering.lowered import Lowered, Stage
+from jourdain_jax.calculus.lazy_imports import version_of
+from jourdain_jax.lowering.lowered_equations import Lowered, Stage
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.digests import digest
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.row_program import RowProgram
+from jourdain_jax.structure.structure import Structure
+from jourdain_jax.structure.trace import Variables
 
 KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram, Variables, Graph)}
 

@@ -13,13 +13,13 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, checked_whole, described, known_numbers
-from jourdain_jax.motion.integrators.explicit_steps import Method, Taylor, diffrax
-from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.integrate.explicit_steps import Method, Taylor, diffrax
+from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.names import nearest
 
 if TYPE_CHECKING:
-    from jourdain_jax.motion.vector_fields.field import Formulation
+    from jourdain_jax.integrate.vector_fields.field import Formulation
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
 

@@ -22,17 +22,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import all_finite, at_index, known_numbers
-from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, Taylor
-from jourdain_jax.motion.integrators.radau import RadauIIA
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.discrete_gradient import DiscreteGradient
+from jourdain_jax.integrate.explicit_steps import DOPRI8, Taylor
+from jourdain_jax.integrate.radau import RadauIIA
+from jourdain_jax.integrate.setup import Setup
+from jourdain_jax.integrate.vector_fields.field import Instant, VectorField, as_formulation
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.sensitivity import numbers_where_known
-from jourdain_jax.motion.setup import Setup
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import Instant, VectorField, as_formulation
 
-OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
+OUT_OF_STEPS = (result_codes.MAX_STEPS, result_codes.SHRANK)
 
 # static fields of a trajectory, which tell how a sample was repeated
 RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")
@@ -72,7 +72,7 @@ def lanes_retried(
 def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
     """Return the next retry of each sample, including all earlier changes of its run; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
-    found, codes, fallback = np.full(lanes.result.shape, results.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
+    found, codes, fallback = np.full(lanes.result.shape, result_codes.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
@@ -96,26 +96,26 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
     """Return the retries of a `motion` from `t0`: all earlier ones and one more; AS_ASKED if none is left.
     `field`: the integrated field; `options`: the original options.
     """
-    if np.all(known_numbers(motion.result) <= results.EVENT):
-        return results.AS_ASKED
+    if np.all(known_numbers(motion.result) <= result_codes.EVENT):
+        return result_codes.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
     another = field.name == "minimal" or field.lowered is not None  # the full state with dense matrices
     lost = another and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)
-    if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
-        return tried | results.FULL_STATE
+    if lost and backend in ("auto", "dense") and not tried & result_codes.FULL_STATE:
+        return tried | result_codes.FULL_STATE
     free = solver is None and backend != "native"
-    if free and not tried & results.IMPLICIT and _is_stiff(field, motion, t0):
-        return tried | results.IMPLICIT
-    return results.AS_ASKED
+    if free and not tried & result_codes.IMPLICIT and _is_stiff(field, motion, t0):
+        return tried | result_codes.IMPLICIT
+    return result_codes.AS_ASKED
 
 
 def _with_retries(retries: int, options: AllOptions) -> AllOptions:
     """Return the options for these retries."""
-    if retries & results.FULL_STATE:
+    if retries & result_codes.FULL_STATE:
         # dense matrices support no Taylor series
         solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver
         options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
-    if retries & results.IMPLICIT:
+    if retries & result_codes.IMPLICIT:
         # an implicit step costs tens of explicit ones, so allow a tenth of their number
         options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
     return options
@@ -126,16 +126,16 @@ def _marked(motion: Trajectory, retries: int) -> Trajectory:
     steps again counts as stiff.
     """
     code = motion.result
-    if retries & results.IMPLICIT:
-        code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), results.STIFF, code).astype(code.dtype)
+    if retries & result_codes.IMPLICIT:
+        code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), result_codes.STIFF, code).astype(code.dtype)
     return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
 
 
 def lost_codes(field: VectorField) -> tuple[int, ...]:
     """Return the result codes after which another form of the state may succeed."""
     guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
-    by_guards = results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP, results.UNRESOLVED
-    return results.SINGULAR_PARTITION, *(by_guards if guarded else ())
+    by_guards = result_codes.STEP_TOO_SMALL, result_codes.NOT_FINITE, result_codes.UNSOLVED_STEP, result_codes.UNRESOLVED
+    return result_codes.SINGULAR_PARTITION, *(by_guards if guarded else ())
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:

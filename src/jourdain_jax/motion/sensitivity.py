@@ -27,10 +27,10 @@ import numpy as np
 
 from jourdain_jax.calculus.markers import tap_cotangents, tap_tangents
 from jourdain_jax.calculus.reals import at_index, is_traced
-from jourdain_jax.motion.own_steps import moving_jumps
-from jourdain_jax.motion.setup import Setup
+from jourdain_jax.integrate.own_steps import moving_jumps
+from jourdain_jax.integrate.setup import Setup
+from jourdain_jax.integrate.vector_fields.field import VectorField
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import warn
 
 

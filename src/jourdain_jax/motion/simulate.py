@@ -13,25 +13,25 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.structure import is_judged
-from jourdain_jax.calculus.on_first_use import module_on_first_use
+from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import Number, Numbers, all_finite, as_array, described, is_traced, known_numbers, nan_is_a_mark, nothing_is_traced, real_type
-from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.explicit_steps import DOPRI8, TSIT5, Method, Taylor, diffrax, order_for
+from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
+from jourdain_jax.integrate.inputs import Inputs, check_inputs_in_rows, inputs_at
+from jourdain_jax.integrate.own_steps import own_steps
+from jourdain_jax.integrate.setup import LONGEST, MEMORY, Setup, times_fit
+from jourdain_jax.integrate.state_projection import State, Usual
 from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method, Taylor, diffrax, order_for
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
-from jourdain_jax.motion.own_steps import own_steps
-from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import LONGEST, MEMORY, Setup, times_fit
 from jourdain_jax.motion.start import named_start
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, vector_of_times, warn
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import is_judged
 
 if TYPE_CHECKING:
     from jourdain_jax.motion import diffrax_steps
@@ -111,7 +111,7 @@ def _integrated(setup: Setup) -> Trajectory:
         return integrate(setup)
     with nan_is_a_mark():
         motion = integrate(setup)
-    return motion if np.all(known_numbers(motion.result) <= results.EVENT) else integrate(setup)
+    return motion if np.all(known_numbers(motion.result) <= result_codes.EVENT) else integrate(setup)
 
 
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:

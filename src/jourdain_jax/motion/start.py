@@ -13,8 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.sampling import guesses_of
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.reals import (
     Number,
     Numbers,
@@ -28,17 +26,19 @@ from jourdain_jax.calculus.reals import (
     known_numbers,
     nothing_is_traced,
 )
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
-from jourdain_jax.motion.inputs import inputs_at
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.integrate.inputs import inputs_at
+from jourdain_jax.integrate.state_projection import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.motion.model import Model, modelled
-from jourdain_jax.motion.put_on_rows import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
+from jourdain_jax.structure.sampling import guesses_of
+from jourdain_jax.structure.structure import structure_of
 
 _NOTHING: Mapping = MappingProxyType({})
 

@@ -16,7 +16,7 @@ from jax.extend.core import Literal, jaxpr_as_fun
 
 from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array
-from jourdain_jax.eager.eager import uncompiled_lanes
+from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.program.graph import Unsupported
 
 

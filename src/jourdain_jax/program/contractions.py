@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jourdain_jax.eager.numpy_backend import as_matrices
 from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.numpy_backend import as_matrices
 
 _OPERATIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and", "reduce_or": "or"}
 _OF_NOTHING = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": 1.0, "or": 0.0}

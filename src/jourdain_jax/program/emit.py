@@ -17,7 +17,7 @@ from jax import lax
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.calls import EMITTED
-from jourdain_jax.program.fused import fused
+from jourdain_jax.program.fused_loop import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
 # longest chain of operations in one piece; measured: chains of links and trailers gain from 100 to 250 on,

@@ -26,7 +26,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.onto_rows import onto_rows
+from jourdain_jax.program.probe_projection import onto_rows
 
 DIGITS = 40  # bits spanned by the constants in the code of a scene before they are rescaled
 SURE = 16.0  # equal values may differ by this many bounds, because bounds are first-order

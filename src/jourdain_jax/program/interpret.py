@@ -19,9 +19,9 @@ import numpy as np
 from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.eager.numpy_backend import applied, gathered, places
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.numpy_backend import applied, gathered, places
 
 _LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # piecewise linear, with the derivative of each piece
 _HOME = f"{Path(__file__).parent.parent}{os.sep}"  # folder of this package
@@ -191,7 +191,7 @@ _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
     **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),
 }
-# All others move node indices as `eager/numpy_backend.py` moves numbers.
+# All others move node indices as `program/numpy_backend.py` moves numbers.
 _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,

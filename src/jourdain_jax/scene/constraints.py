@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real
 from jourdain_jax.calculus.rotations import vee
-from jourdain_jax.scene.held_rows import HeldRow
+from jourdain_jax.scene.contact.held_rows import HeldRow
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
 
 

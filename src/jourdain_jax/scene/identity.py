@@ -1,4 +1,4 @@
-"""Caches keyed by scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
+"""Caches keyed by scene: by class, names read by its methods (`outside_names.py`) and shapes of parameters, or
 also by values.
 
 Reference parameters replace traced parameters by numbers. Facts that hold at every state of a scene, such as
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import all_finite, is_traced_type, largest
-from jourdain_jax.scene.parameters import stacked_parameters
+from jourdain_jax.scene.parameter_fields import stacked_parameters
 
 
 def clear_caches() -> None:

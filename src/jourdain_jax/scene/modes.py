@@ -4,7 +4,7 @@ of the state.
     t_e:  c(t, q, u) falls through zero      (q, u) <- R(t, q, u),   mode <- another one
 
 Between events a mode is a constant number: the index of its value in the scene's list. Source of the
-derivatives: `motion/native/transitions.py`.
+derivatives: `integrate/loop/transitions.py`.
 """
 
 from collections.abc import Mapping

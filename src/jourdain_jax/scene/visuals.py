@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import (
     Indices,
     Matrix3,
@@ -28,7 +28,7 @@ from jourdain_jax.calculus.reals import (
     static,
 )
 from jourdain_jax.scene.bodies import _axis_index, _stack
-from jourdain_jax.scene.grounds import tangents_of
+from jourdain_jax.scene.contact.grounds import tangents_of
 
 
 class Faces:

@@ -23,16 +23,16 @@ from jaxtyping import Array, Complex, Float, Int
 
 from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, Look, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
-from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
-from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
+from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
 from jourdain_jax.calculus.reals import Indices, compiled_quickly, largest, static
-from jourdain_jax.motion.put_on_rows import State, state_of
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.names import Labels, as_names
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, table
 from jourdain_jax.scene.scene import Scene
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jourdain_jax.analysis.families.equations import Look, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
 from jourdain_jax.calculus.reals import all_finite, largest
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
 
 Targets = list[tuple[int, float]]  # indices of unknowns, and values at which a curve ends
 CLOSED = "the curve is closed"

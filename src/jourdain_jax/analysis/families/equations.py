@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.families.spectrum import Modes, null_space
-from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
-from jourdain_jax.build.assembling import coordinate_bounds
+from jourdain_jax.analysis.motion_derivatives import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.scene import Scene, state_names
+from jourdain_jax.structure.assembly import coordinate_bounds
 
 Vector = Float[np.ndarray, "unknowns"]
 PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"

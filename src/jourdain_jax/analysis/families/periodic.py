@@ -26,26 +26,26 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from jourdain_jax.analysis.families.equations import Look, Motions, Vector, sizes
-from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.spectrum import Modes
-from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, places_of, unseen
-from jourdain_jax.build.structure import structure_of
-from jourdain_jax.build.trace import event_values
+from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, instant_of, places_of, unseen
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, all_finite, checked_real, checked_whole, compiled_quickly, known_numbers, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.listed import names_of_events
-from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
-from jourdain_jax.motion.integrators.explicit_steps import diffrax
+from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.integrate.explicit_steps import diffrax
+from jourdain_jax.integrate.inputs import Inputs, as_inputs, inputs_at
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
-from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import Labels, as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed, complex_numbers
 from jourdain_jax.scene.scene import Scene, state_names
+from jourdain_jax.structure.structure import structure_of
+from jourdain_jax.structure.trace import event_values
 
 Unknowns = Float[Array, "unknowns"]
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jourdain_jax.calculus.on_first_use import module_on_first_use
+from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import largest
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene

@@ -1,1 +1,1 @@
-"""Results of motions: states over time, result codes, diagnostics, files."""
+"""Results of motions: states over time, diagnostics, labels, files. Open `trajectory.py` first."""

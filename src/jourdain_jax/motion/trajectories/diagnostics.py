@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, static, with_nan_as_a_mark
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
-from jourdain_jax.eager.eager import eager_if_concrete
-from jourdain_jax.motion.inputs import Constant, Mode, Sampled
-from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times
-from jourdain_jax.motion.trajectories.results import FALLBACKS, SINGULAR_PARTITION
-from jourdain_jax.motion.vector_fields.field import reason_for_matrices
+from jourdain_jax.integrate.inputs import Constant, Mode, Sampled
+from jourdain_jax.integrate.result_codes import FALLBACKS, SINGULAR_PARTITION
+from jourdain_jax.integrate.vector_fields.field import reason_for_matrices
+from jourdain_jax.motion.trajectories.values_in_time import Checked, Checks, Record, map_over_times
+from jourdain_jax.program.eager import eager_if_concrete
+from jourdain_jax.structure.structure import structure_of, usual_rows
 
 OverTimes = Float[Array, "*lanes times"]
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jourdain_jax.calculus.figures import MODEL, figure
-from jourdain_jax.motion.trajectories.over_times import Record
+from jourdain_jax.motion.trajectories.values_in_time import Record
 
 
 def sketch(record: Record) -> str:

@@ -30,20 +30,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import FilePath, check_depth, check_place, opened, parsed, write_whole
-from jourdain_jax.calculus.on_first_use import version_of
+from jourdain_jax.calculus.lazy_imports import version_of
 from jourdain_jax.calculus.reals import at_index, described, with_nan_as_a_mark
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.batches.rollout import Rollout
-from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
+from jourdain_jax.integrate.inputs import Inputs, Mode, Sampled
 from jourdain_jax.motion.retries import RERUN_FIELDS
-from jourdain_jax.motion.trajectories.over_times import Phases, Record, one_phase
+from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.values_in_time import Phases, Record, one_phase
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.trace import velocity_quantities
 
 # without `work`, which may be absent
 _ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))

@@ -7,27 +7,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.markers import nan_where
 from jourdain_jax.calculus.reals import checked_real, nan_is_a_mark
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.listed import names_of_bodies
+from jourdain_jax.equations.scene_parts import names_of_bodies
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.inputs import inputs_at
+from jourdain_jax.integrate.state_projection import State, known_faults_at
 from jourdain_jax.lowering.kinks import bent_load
-from jourdain_jax.motion.inputs import inputs_at
-from jourdain_jax.motion.put_on_rows import State, known_faults_at
 from jourdain_jax.motion.start import consistent
-from jourdain_jax.motion.trajectories import labelled, over_times, results
+from jourdain_jax.motion.trajectories import labels, values_in_time
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, lost_of, summary, warnings_of
-from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
+from jourdain_jax.motion.trajectories.values_in_time import Record, map_over_times
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import Labels, Sentences, UnknownNameError, check_name, nearest
-from jourdain_jax.scene.parameters import parameter_faults
+from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import state_names
+from jourdain_jax.structure.structure import usual_rows
 
 
 class Trajectory(Record, Printed):
@@ -64,7 +65,7 @@ class Trajectory(Record, Printed):
     @property
     def succeeded(self) -> Bool[Array, "*lanes"]:
         """Return whether the motion reached the end of its span or an event. It works under jit and vmap."""
-        return jnp.asarray(self.result) <= results.EVENT
+        return jnp.asarray(self.result) <= result_codes.EVENT
 
     @property
     def valid(self) -> Bool[Array, "*lanes times"]:
@@ -87,7 +88,7 @@ class Trajectory(Record, Printed):
         switches it, the value afterwards.
         """
         check_name(mode, self.scene.modes.names, f"`{type(self.scene).__name__}` has no mode `{mode}`")
-        return map_over_times(over_times.InputOf(mode), self)
+        return map_over_times(values_in_time.InputOf(mode), self)
 
     def motions(self) -> Motion:
         """Return poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
@@ -99,43 +100,43 @@ class Trajectory(Record, Printed):
         """
         local = checked_real(local, f"point of body `{body}`", (3,),
             advice="pass three components in its body frame, m")
-        return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
+        return map_over_times(values_in_time.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
         """Return kinetic and potential energy, and the integrated work, in J. `.balance` is
         constant for a correct motion.
         """
-        kinetic, potential = map_over_times(over_times.energies, self)
+        kinetic, potential = map_over_times(values_in_time.energies, self)
         return Energies(kinetic, potential, self.work, lost_of(self))
 
     def accelerations(self) -> Accelerations:
         """Return accelerations, multipliers, rank and smallest singular value at all times."""
         # samples of a batch differ in parameters
         usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))
-        return map_over_times(over_times.AccelerationsBySvd(usual), self, by_inputs=True)
+        return map_over_times(values_in_time.AccelerationsBySvd(usual), self, by_inputs=True)
 
     def constraint_forces(self) -> RowReactions:
         """Return constraint forces per constraint and per body at all times, eqs. (68)-(70);
         `.forces_on("disc")` by constraint, in N, inertial frame.
         """
-        return map_over_times(over_times.reactions, self, by_inputs=True)
+        return map_over_times(values_in_time.reactions, self, by_inputs=True)
 
     def contact_forces(self) -> dict[str, ContactForce]:
         """Return, for every rolling contact at all times, the normal and tangential force (N) on the body and
         the friction coefficient that it needs.
         """
-        return map_over_times(over_times.contacts, self, by_inputs=True)
+        return map_over_times(values_in_time.contacts, self, by_inputs=True)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Return residuals of the geometric constraints (and quaternion norms), and of the
         velocity constraints, at all times.
         """
-        return map_over_times(over_times.residuals, self)
+        return map_over_times(values_in_time.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
         """Return the quantities that the scene declares conserved, by name at all times; without the energy.
         """
-        return map_over_times(over_times.invariants, self)
+        return map_over_times(values_in_time.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
@@ -143,13 +144,13 @@ class Trajectory(Record, Printed):
         `units`: name of a coordinate or speed -> its unit, stored as `attrs["units"]`, because a scene states
         only units of parameters. ImportError without xarray.
         """
-        return labelled.to_xarray(self, units)
+        return labels.to_xarray(self, units)
 
     def to_pandas(self):
         """Return coordinates and speeds as a `pandas.DataFrame`, one row per time
         (s). ImportError without pandas.
         """
-        return labelled.to_pandas(self)
+        return labels.to_pandas(self)
 
     def _text(self) -> str:
         with nan_is_a_mark():
@@ -163,11 +164,11 @@ class Trajectory(Record, Printed):
     def message(self) -> str:
         """Return a message on how the motion ended."""
         code = int(self.result)
-        text = results.MESSAGES[code]
-        if code == results.EVENT:
+        text = result_codes.MESSAGES[code]
+        if code == result_codes.EVENT:
             return f"{text} `{self.event_names[int(self.event)]}`"
         named = f" ({', '.join(faults)})" if (faults := self.faults) else ""
-        return text + named + "; check where it was computed" * (code == results.BAD_PARAMETER)
+        return text + named + "; check where it was computed" * (code == result_codes.BAD_PARAMETER)
 
     @property
     @of_known_numbers
@@ -180,7 +181,7 @@ class Trajectory(Record, Printed):
         this precision; contacts that would have to pull. They are computed on request and need concrete
         numbers: not under jit or vmap.
         """
-        failure = () if int(self.result) <= results.EVENT else (self.message,)
+        failure = () if int(self.result) <= result_codes.EVENT else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
 
     @property
@@ -196,11 +197,11 @@ class Trajectory(Record, Printed):
         bodies, contacts and gravity; if steps became short, a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
-        if code in (results.STICKS, results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
+        if code in (result_codes.STICKS, result_codes.MAX_STEPS, result_codes.SHRANK, result_codes.STEP_TOO_SMALL, result_codes.STIFF):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
             said = " jumps, or has a kink, at the last state; smooth it over a short range, as by `jnp.tanh`"
-            return (f"{load}{'' if code == results.STICKS else said}",) if load else ()
-        if code != results.BAD_PARAMETER:
+            return (f"{load}{'' if code == result_codes.STICKS else said}",) if load else ()
+        if code != result_codes.BAD_PARAMETER:
             return ()
         if self.wrong_parameters:
             return tuple(f"`{name}`" for name in self.wrong_parameters)
@@ -228,7 +229,7 @@ class Trajectory(Record, Printed):
         Raises DifferentiationModeError under `jit` and `vmap`, where numbers are
         unknown; use `nan_if_failed` there.
         """
-        if int(self.result) > results.EVENT:
-            raise results.SimulationError(
+        if int(self.result) > result_codes.EVENT:
+            raise result_codes.SimulationError(
                 f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
         return self

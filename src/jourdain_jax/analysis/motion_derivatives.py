@@ -1,0 +1,247 @@
+"""A motion at one instant with its derivatives, for linearisation, steady motions and families.
+
+    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: closures;  p: varying parameters
+
+The scalar program of a class of scenes gives du/dt of its independent speeds and of requested ones; others
+are zero. It depends only on t, q and the independent speeds: a dependent speed enters only phi. Scenes
+without such a program use dense matrices.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.calculus.reals import Entries, Indices, array_module, compiled_quickly, real_type
+from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.integrate.loop.value_kernels import nodes_called, values_of_nodes
+from jourdain_jax.kernels import ffi
+from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.lowering.lower import lower
+from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered
+from jourdain_jax.program.derivative import derivatives, jacobian
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import once_per_class
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.row_program import row_program
+from jourdain_jax.structure.structure import structure_of, usual_rows
+
+Slopes = tuple[Float[Entries, "values"], Float[Entries, "values columns"], Float[Entries, "_ _"]]
+Nodes = Int[np.ndarray, "_ _"]
+
+
+class Places(NamedTuple):
+    """Positions of the parts of v and of the columns of D. In g, geometric constraints come first."""
+
+    qdot: np.ndarray
+    udot: np.ndarray
+    g: np.ndarray
+    phi: np.ndarray
+    t: np.ndarray
+    q: np.ndarray
+    u: np.ndarray
+    f: np.ndarray
+    geometric: np.ndarray
+
+
+def places_of(scene: Scene) -> Places:
+    """Return the positions for a scene."""
+    n, m, geometric = len(scene.coordinate_names.entries), len(scene.speed_names.entries), len(names_of_position_rows(scene))
+    of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
+    return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
+
+
+def _ranges(*counts: int) -> list[np.ndarray]:
+    return np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+
+
+class Sloped:
+    """Values of nodes v, their Jacobian D and optionally another matrix, as a function of numbers that may be
+    traced. Runs as machine code or on NumPy.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        v: Sequence[int],
+        columns: Sequence[int],
+        given: Sequence[int],
+        guards: Sequence[int],
+        matrix: Nodes | None = None,
+    ) -> None:
+        D, column = np.full((len(v), len(columns)), graph.zero), {x: k for k, x in enumerate(columns)}
+        for row, slopes in zip(D, jacobian(graph, v, columns), strict=True):
+            row[[column[x] for x in slopes]] = [*slopes.values()]
+        matrix = np.zeros((0, 0), int) if matrix is None else matrix
+        parts = [np.array(v, int), D, matrix, np.array(guards, int)]
+        nodes = np.unique(np.concatenate([*map(np.ravel, parts)])).tolist()
+        self._which, self._parts = [np.searchsorted(nodes, part) for part in parts], (graph, nodes, given)
+        self.is_made = is_made(graph, nodes)
+        self._known = _evaluated(*self._parts)
+
+    @cached_property
+    def _traced(self) -> Callable[[Array], Array]:
+        return differentiable(*self._parts)
+
+    def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
+        """Return v, D and the other matrix; NaN if a guard is not positive."""
+        xp = array_module(numbers)
+        found = (self._traced if xp is jnp else self._known)(numbers)
+        *values, guards = (found[which] for which in self._which)
+        v, D, matrix = (xp.where(xp.all(guards > 0), x, xp.nan) for x in values)
+        return v, D, matrix
+
+
+class ByProgram:
+    """v, D and the mass matrix (unless it is too large) of a class of scenes, as one scalar program. Its
+    input is one vector of all numbers: parameters, t, q, u, inputs.
+    """
+
+    def __init__(self, scene: Scene, program: Lowered, asked: Indices, varied: Indices = ()) -> None:
+        rows = row_program(scene)
+        if rows is None:
+            raise NotLowered(f"the constraints of `{type(scene).__name__}` have no scalar program")
+        graph, of, n, m = Graph(), program.traced, len(program.coordinates), len(program.speeds)
+        first = sum(np.size(leaf) for leaf in jax.tree.leaves(scene))
+        given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
+        t, q, u = given[first], given[first + 1 :][:n], given[first + 1 + n :][:m]
+        of_rates = [program.qdot, program.ydot, program.z if asked else (), program.guards]
+        qdot, ydot, z, self.guards = _copied(graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given)
+        M, self.has_masses = rows.M or {}, rows.M is not None
+        g, phi, of_masses = _copied(graph, [rows.g, rows.phi, M.values()], rows.graph, (rows.parameters, rows.t, rows.q, rows.u, rows.inputs), given)
+        udot = dict(zip(program.independent, ydot, strict=True))
+        if asked:
+            motion = {t: graph.one} | dict(zip(q, qdot, strict=True)) | {u[k]: node for k, node in udot.items()}
+            dependent = dict(zip(program.dependent, z, strict=True))
+            udot |= dict(zip(asked, derivatives(graph, [dependent[k] for k in asked], motion), strict=True))
+        self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
+        self.v = [*qdot, *(udot.get(k, graph.zero) for k in range(m)), *g, *phi]
+        self.columns = [*given[first:], *(given[k] for k in varied)]
+        matrix = np.full((m, m), graph.zero)
+        for (i, k), node in zip(M, of_masses, strict=True):
+            matrix[i, k] = matrix[k, i] = node
+        self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
+
+    def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
+        """Return v, D and the mass matrix of a scene at an instant."""
+        return self.of(numbers_of(scene, t, q, u, f))
+
+
+def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
+    """Return all numbers as one vector: parameters, t, q, u, inputs."""
+    xp = array_module((scene, t, q, u, f))
+    parts = [*jax.tree.leaves(scene), t, q, u, f]
+    return xp.concatenate([xp.ravel(xp.asarray(x, real_type())) for x in parts])
+
+
+@dataclass(frozen=True)
+class ByMatrices:
+    """v, D and the mass matrix from a scene's dense matrices, differentiated by JAX, with accelerations of
+    the speeds `constant`.
+    """
+
+    constant: Indices
+
+    def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
+        """Return v, D and the mass matrix of a scene at an instant."""
+        return _by_matrices(scene, self.constant, t, q, u, f)
+
+
+@compiled_quickly
+def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
+    at = places_of(scene)
+
+    def instant(x):
+        t, q, u, f = x[at.t[0]], x[at.q], x[at.u], x[at.f]
+        equations, rows = equations_and_rows(scene, t, q, u, f)
+        problem = scaled(equations, rows.judged_by(usual_rows(scene)))
+        udot = problem.c * Privileged(constant).solve(problem)[0]
+        return jnp.concatenate([coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]), equations.M
+
+    x = jnp.concatenate([t[None], q, u, f])
+    v, slope, M = jax.linearize(instant, x, has_aux=True)
+    return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
+
+
+def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":
+    """Return the program that evaluates a scene at single instants, with these speeds constant or
+    independent. `masses`: whether the mass matrix of these speeds is needed.
+    """
+    if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
+        return ByMatrices(constant)
+    try:
+        program = lower(scene)
+        found = by_program(as_scene(scene), program, tuple(k for k in constant if k not in program.independent))
+    except NotLowered:
+        return ByMatrices(constant)
+    return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)
+
+
+def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
+    """Return names of the coordinates that do not affect accelerations; for a quaternion, names of its parts.
+    """
+    return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
+
+
+def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
+    """Return names of coordinates; for a quaternion or an angular velocity, names of its parts."""
+    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    return {entry for name in names for entry in groups.get(name, (name,))}
+
+
+by_program = once_per_class(ByProgram)  # of a class of scenes; raises `NotLowered` if there is none
+
+
+def on_rows(scene: Scene) -> np.ndarray:
+    """Return the coordinates on which geometric constraints and unit norms depend at some probed state.
+    Coordinates that cancel there are omitted, even if they occur in the graph.
+    """
+    return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
+
+
+def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:
+    """Return copies of lists of nodes of another graph, in which its parameters (by leaf), t, q, u and inputs
+    are replaced.
+    """
+    parameters, *rest = variables
+    places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]
+    new = graph.copied([n for part in parts for n in part], of, {n: x for n, x in zip(places, given, strict=True) if n >= 0})
+    return [[new[n] for n in part] for part in parts]
+
+
+def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy, one
+    operation at a time.
+    """
+    if jax.config.jax_enable_x64 and is_made(graph, nodes):
+        kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
+        return lambda given: np.asarray(kernel(given))
+    return lambda given: Probes(graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True)))(nodes)[:, 0]
+
+
+def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Return values of nodes as a function that JAX differentiates: by machine code if possible, otherwise by
+    XLA.
+    """
+    if is_made(graph, nodes):
+        return values_of_nodes(graph, nodes, variables)
+    return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])
+
+
+def is_made(graph: Graph, nodes: Sequence[int]) -> bool:
+    """Return whether the nodes can be compiled to machine code."""
+    return not ffi.reason_against() and not unsupported(graph, nodes)

@@ -1,1 +1,0 @@
-"""Studies of many motions: designs, interruptible runs, storage, statistics, sensitivity indices."""

@@ -1,0 +1,269 @@
+"""The posterior density of the unknowns of a fit, as a function of any real numbers, for samplers.
+
+    log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
+
+L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from
+a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the shortest
+interval, with a uniform prior (Jeffreys' prior of AR(1) noise). Source: A. Gelman et al., Bayesian Data
+Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Unpack
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Indices, Scalar, compiled, holds, is_traced, real_type, static
+from jourdain_jax.identification.data.estimate import Estimate, Range, positive
+from jourdain_jax.identification.data.experiment import Data
+from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits
+from jourdain_jax.identification.inference.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
+from jourdain_jax.identification.report.fit_result import Fit
+from jourdain_jax.identification.solve.layout import Layout, PossibleInertia
+from jourdain_jax.identification.solve.runs import Run, equal_runs
+from jourdain_jax.identification.solve.unknowns import Places, check_starts, unknowns_of
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.identity import reference_parameters
+from jourdain_jax.scene.names import Labels, check_names
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import Reference
+
+Point = Float[Array, "unknowns"]
+Points = Float[Array, "*batch unknowns"]
+
+
+class LogDensity(eqx.Module):
+    """`log p(z)` of a vector z of real numbers, up to a constant. It can be called under `jit`, `grad` and
+    `vmap`.
+
+    `labels` names the unknowns, as in a `Fit`; an estimated sigma is `"lean.sigma"`, a correlation time
+    `"lean.correlation_time"` (s).
+    """
+
+    scene: Scene
+    groups: tuple[Run, ...]  # runs of equal structure, stacked
+    options: AllOptions
+    fixed: Places  # first guesses and known values of all entries of a layout
+    guess: Float[np.ndarray, "unknowns"]  # in their units
+    prior_mean: Places
+    prior_rows: Float[np.ndarray, "places places"]  # of priors (see `Unknowns`)
+    prior_height: float  # logarithm of the maximum of all priors
+    centre: Float[np.ndarray, "unknowns"]
+    factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
+    labels: Labels = static()
+    units: Labels = static()
+    layout: Layout = static()
+    runs: tuple[Indices, ...] = static()  # indices of the runs of each group
+    places: Indices = static()  # indices of the unknowns other than sigmas
+    sigmas: Labels = static()  # channels with unknown sigma, next among the unknowns
+    with_memory: Labels = static()  # channels with unknown correlation time, last among the unknowns
+    ranges: tuple[Range, ...] = static()  # of all unknowns
+
+    def __call__(self, z: Point) -> Scalar:
+        """Return the logarithm of the density; -inf if the motion fails."""
+        return _density(self, self._checked(z), Reference(self.scene, self.layout.parameters))
+
+    def _at(self, z: Point, reference: Reference) -> Scalar:
+        x = self._spread(z)
+        theta, slopes = self._each(Range.constrain, x), self._each(Range.log_slope, x)
+        count, end = len(self.places), len(self.places) + len(self.sigmas)
+        known = self.prior_rows @ (theta[:count] - self.prior_mean)
+        # the prior of a sigma is flat in its logarithm, which is x
+        logs = jnp.sum(slopes[:count]) + jnp.sum(slopes[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + self.prior_height - 0.5 * known @ known
+        shared, local = self._split(theta)
+        scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
+        tau = dict(zip(self.with_memory, theta[end:], strict=True))
+
+        def one(run: Run, local: Float[Array, "local"]) -> Scalar:
+            here = run.at(self.layout, shared, local)
+            weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
+            memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
+            return of_run(scene, here._replace(weights=weights, correlation_time=memory), options=self.options)
+
+        with reference.stands_in():
+            return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
+
+    @property
+    def initial(self) -> Point:
+        """Return z at the first guess of all unknowns."""
+        return self.unconstrain({})
+
+    def constrain(self, z: Points) -> Points:
+        """Return the unknowns at z, in their units and in the order of `labels`; for one vector or many."""
+        return self._each(Range.constrain, self._spread(self._checked(z)))
+
+    def named(self, z: Points) -> dict[str, Float[Array, "*batch"]]:
+        """Return the unknowns at z by name, in their units, for one vector or many."""
+        theta = self.constrain(z)
+        return {label: theta[..., i] for i, label in enumerate(self.labels)}
+
+    def unconstrain(self, values: Mapping) -> Point:
+        """Return z for these values of unknowns by name, in their units. Omitted unknowns are at their first
+        guess.
+
+        Raises ValueError for names that are not unknown, and for values at or beyond a bound.
+        """
+        check_names(values, self.labels, "`{}` is not among the unknowns")
+        theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), real_type()) for i, label in enumerate(self.labels)])
+        x = self._each(Range.unconstrain, theta)
+        if not holds(np.isfinite, x):
+            off = int(np.argmin(np.isfinite(x)))
+            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound; "
+                "give a value between the bounds")
+        return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
+
+    def scene_at(self, z: Point) -> Scene:
+        """Return the scene with the parameters at z."""
+        return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
+
+    def whitened(self, fit: Fit) -> "LogDensity":
+        """Return the density in transformed unknowns z, independent with unit variance according to a fit of
+        the same data, so that samplers need few steps.
+
+        `constrain` and `named` convert back to the unknowns. At the minimum of the fit z is zero. Raises
+        ValueError for a fit of other unknowns, for a batch, and for unknowns without a standard error
+        (undetermined, or at a bound).
+        """
+        of_noise = set(self.sigmas) <= set(fit.sigma) and set(self.with_memory) <= set(fit.correlation_time)
+        if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not of_noise:
+            raise ValueError(
+                f"the unknowns of the fit are {', '.join(fit.labels)}, those of the density "
+                f"{', '.join(self.labels)}; give the fit of the same unknowns and data"
+            )
+        for label, error in zip(fit.labels, fit.standard_errors, strict=True):
+            if not np.isfinite(error):
+                raise ValueError(
+                    f"`{label}` has no standard error in the fit, so its scale is unknown; give it a prior, "
+                    "or omit it from `free`"
+                )
+        noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
+        theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
+        x = np.array(self._each(Range.unconstrain, jnp.asarray(theta)))
+        x[end:] = np.clip(x[end:], -4.0, 4.0)  # a correlation time may be at an end of its range
+        slopes = np.exp(-np.asarray(self._each(Range.log_slope, jnp.asarray(x))))
+        covariance = np.zeros((len(theta), len(theta)))
+        covariance[: fit.values.size, : fit.values.size] = fit.covariance
+        for i, name in enumerate((*self.sigmas, *self.with_memory), fit.values.size):
+            samples = np.concatenate([np.ravel(run[name][np.isfinite(run[name])]) for run in fit.whitened if name in run])
+            # sum of squares in units of sigma: degrees of freedom
+            covariance[i, i] = theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < end else 1 / samples.size
+        factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
+        return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
+
+    def _checked(self, z) -> Array:
+        z = jnp.asarray(z, real_type())
+        if z.shape[-1:] != (len(self.labels),):
+            raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number "
+                f"for each of {', '.join(self.labels)}")
+        return z
+
+    def _spread(self, z: Points) -> Points:
+        return self.centre + z @ self.factor.T
+
+    def _each(self, of: Callable, x: Points) -> Points:
+        """Return the results of the method called `of` of the range of each unknown, for these numbers."""
+        return jnp.stack([of(one, x[..., i]) for i, one in enumerate(self.ranges)], axis=-1)
+
+    def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
+        shared, local = self.layout.sizes
+        every = jnp.asarray(self.fixed).at[np.array(self.places, int)].set(theta[: len(self.places)])
+        return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
+
+
+_density = compiled(LogDensity._at)
+
+
+@shown_from_users_lines
+def log_density(
+    scene: Scene | BuiltFor,
+    data: Data,
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
+    *,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
+) -> LogDensity:
+    """Return the posterior density of the unknowns of `fit`, as a function of an unconstrained vector, for
+    samplers such as those of BlackJAX and NumPyro.
+
+    **Arguments**
+
+    - `scene`, `data`, `free`, `options`, `by_name`: as in `fit`. Unknowns are free parameters, unknown start
+      values, estimated numbers of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
+    - Priors: `Normal` if an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
+      itself, in the logarithm of a sigma, and in arcsin rho, rho = exp(-h / tau), of an estimated correlation
+      time tau, where h is the shortest interval between samples of its channel. A flat prior without bounds
+      has no integral: if the data do not determine an unknown, the posterior has none either, and a sampler
+      diverges.
+
+    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain`
+    convert between the vector and the unknowns. It includes the logarithms of the transforms' derivatives. It
+    is a pure function: it works under `jit`, `vmap` and `grad`.
+
+    **Raises** ValueError as in `fit`.
+
+    **Example**
+
+        density = jj.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
+        sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
+        draws = density.named(positions)["radius"]                               # m, at the sampled positions (draws, unknowns)
+    """
+    settled = as_fit_options(scene, options, by_name, "log_density")
+    scene = as_scene(scene)
+    runs = as_runs(scene, data)
+    sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
+    with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
+    limits = [correlation_limits(runs, name) for name in with_memory]
+    intervals = np.array([low / SHORTEST for low, _ in limits])
+    angles = [Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h)) for h, ends in zip(intervals, limits, strict=True)]
+    unknowns = unknowns_of(scene, runs, free)
+    with reference_parameters(scene, unknowns.layout.parameters):
+        if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
+            check_starts(scene, runs, unknowns)
+        grouped = equal_runs(runs)
+        guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
+    guesses += (intervals / np.log(2)).tolist()  # neighbouring samples have a correlation of one half
+    places = unknowns.estimated
+    size, weights = len(places) + len(guesses), unknowns.prior_weight[unknowns.prior_weight > 0]
+    return LogDensity(
+        scene=scene,
+        groups=tuple(group for _, group in grouped),
+        options=settled,
+        fixed=unknowns.guess,
+        guess=np.concatenate([unknowns.guess[places], guesses]),
+        prior_mean=unknowns.prior_mean[places],
+        prior_rows=unknowns.prior_rows,
+        prior_height=float(np.sum(np.log(weights / np.sqrt(2 * np.pi))) + np.linalg.slogdet(unknowns.whitening)[1]),
+        centre=np.zeros(size),
+        factor=np.eye(size),
+        labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas), *(f"{name}.correlation_time" for name in with_memory)),
+        units=(*unknowns.units, *("" for _ in sigmas), *("s" for _ in with_memory)),
+        layout=unknowns.layout,
+        runs=tuple(numbers for numbers, _ in grouped),
+        places=tuple(places.tolist()),
+        sigmas=sigmas,
+        with_memory=with_memory,
+        ranges=(*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles),
+    )
+
+
+def _rms(scene: Scene, groups: Sequence[Run], name: str, options: AllOptions) -> float:
+    """Return the root mean square of a channel's residuals at the first guess, with unit weights, as first
+    guess of sigma.
+    """
+    of = partial(Run.residuals, scene=scene, simulate=simulate, options=options)
+    residuals = [mapped(lambda run: of(run)[name], group) for group in groups]
+    samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
+    found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))
+    if not np.isfinite(found):
+        raise ValueError(
+            f"the motion fails at the first guess, so that the sigma of channel `{name}` has no first guess; "
+            "examine the motion with `simulate`"
+        )
+    return max(found, 1e-12)

@@ -1,0 +1,395 @@
+"""Estimates of a fit: values with their uncertainty, residuals, the fitted scene, and undetermined
+combinations.
+
+    interval      estimate -+ q e,  within the bounds      e: standard error, q: quantile (see `spread`)
+                  at a bound: up to a limit by profile likelihood
+    freedom       samples - rank + tr(C P)                 P: information of priors, C: covariance
+
+Also detected: events of fitted motions before samples (a disc that has fallen), missing observed events, and
+jumps of loads.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.calculus.reals import Entries, described, largest, static
+from jourdain_jax.identification.data.channels import LATEST, StopEvent
+from jourdain_jax.identification.inference.information import Information, derived, hidden_combinations, standard_errors, variances, weak_combinations
+from jourdain_jax.identification.inference.likelihood import oddities
+from jourdain_jax.identification.inference.standard_errors import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
+from jourdain_jax.identification.solve.levenberg_marquardt import Minimum
+from jourdain_jax.identification.solve.piecewise import Shot
+from jourdain_jax.identification.solve.problem import Asked, Problem
+from jourdain_jax.identification.solve.runs import run_of
+from jourdain_jax.identification.solve.unknowns import Unknowns
+from jourdain_jax.integrate.inputs import as_inputs
+from jourdain_jax.integrate.own_steps import moving_jumps
+from jourdain_jax.motion.model import modelled
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.scene.names import Sentences, UnknownNameError, check_name, nearest
+from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.plausibility import impossible_bodies
+
+
+def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentences:
+    """Return one sentence for each run whose motion, with these unknowns, meets an event before its last
+    sample, misses the observed event, or crosses a jump of its loads.
+    """
+    shared, local = problem.unknowns.split(theta)
+    found, layout, options = [], problem.unknowns.layout, problem.asked.options
+    for index, run in enumerate(problem.runs):
+        one = run_of(run).at(layout, shared, local[index])
+        scene = layout.scene(problem.scene, shared)
+        motion = partial(one.motion, scene, simulate, options=options)
+        jumps = partial(moving_jumps, modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
+        if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
+            found.append(
+                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: "
+                "derivatives and standard errors omit the shift of jump times; make the jumps gradual"
+            )
+        if type(scene).events is Scene.events:
+            continue
+        if run.ended_by:
+            if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
+                found.append(
+                    f"the motion of run {index} does not reach `{run.ended_by}` before {LATEST:g} times the "
+                    "observed time; use a closer first guess"
+                )
+            continue
+        motion = motion(one.ts)
+        late = np.asarray(one.ts) > float(motion.t_end)
+        samples = sum(int(np.count_nonzero(weight[late])) for weight in one.weights.values())
+        if motion.event >= 0 and samples:
+            event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
+            found.append(
+                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as "
+                "if it continued; omit these, or give the observed time of the event in `events`"
+            )
+    return tuple(found)
+
+
+Counts = Int[np.ndarray, "*repeats"]
+Marks = Bool[np.ndarray, "*repeats"]
+PerRepeat = Float[np.ndarray, "*repeats"]
+PerUnknown = Float[np.ndarray, "*repeats unknowns"]
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Statistics of a minimum, apart from its position."""
+
+    scene: Scene  # with the estimates
+    starts: tuple[dict[str, Float[Entries, "..."]], ...]  # initial values of each run, with the estimates
+    sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
+    standard_errors: PerUnknown  # NaN if not identifiable
+    low: PerUnknown  # ends of the 95 % intervals; NaN if not identifiable
+    high: PerUnknown
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # without a standard error, with a one-sided interval
+    quantiles: PerUnknown  # q
+    information: Information  # covariance in blocks, and undetermined directions
+    # of each run by channel: (prediction - value) / sigma; NaN if missing
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    # residuals minus their prediction from the previous sample, if noise is correlated
+    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    sigma: dict[str, PerRepeat]  # of channels with estimated noise
+    correlation_time: dict[str, PerRepeat]  # s, of channels with an estimate; near zero: white
+    untold: Sentences  # channels that do not determine their sigma, in any repeat
+    chi_square: PerRepeat  # sum of squared whitened residuals; NaN if the motion fails
+    samples: Counts  # with a finite sigma
+    degrees_of_freedom: PerRepeat  # samples minus the directions that they determine; priors reduce these
+    of_rise: PerUnknown  # divisor of 2 (F - F_min), for an interval that ends where it is `RISE_95`
+    from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
+    oddities: Sentences  # sentences about oddities of the runs
+    # sentences about events before the end of a run, or missed; empty for a batch or multiple shooting
+    events_met: Sentences
+    too_narrow: Sentences  # sentences about intervals that bounds make too narrow; empty for a batch
+
+
+@np.errstate(over="ignore", invalid="ignore")  # for unknowns without bounds that grew enormously
+def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
+    """Return the statistics of the minimum."""
+    unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
+    places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
+    here = lambda x: one(x[:, places])  # noqa: E731
+    low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
+    limit = here(at_bounds.limit)
+    about = spread(problem, found, bound)
+    levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
+    residuals, white = (
+        tuple({name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()} for run in range(len(problem.runs))) for flag in (False, True)
+    )
+    over = lambda r: tuple(range(0 if single else 1, r.ndim))  # noqa: E731
+    samples = sum(np.sum(np.isfinite(r), axis=over(r)) for run in residuals for r in run.values())
+    determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
+
+    too_narrow = []
+    if single and found.converged[0]:
+        too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
+        if problem.asked.errors == "sigmas":
+            too_narrow += too_narrow_near_bounds(problem, found, at_bounds, about.rise.errors[0])
+    values = here(theta)
+    shared, local = unknowns.split(theta)
+    scene = unknowns.layout.scene(problem.scene, one(shared))
+    if not single:
+        scene = jax.tree.map(lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))), scene, problem.scene)
+    return Statistics(
+        scene=scene,
+        starts=tuple(unknowns.layout.start(run.start, one(shared), one(local[:, i])) for i, run in enumerate(problem.runs)),
+        sizes=here(size),
+        standard_errors=known.standard_errors,
+        low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
+        high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
+        at_bound=here(bound),
+        quantiles=one(about.quantiles),
+        information=known,
+        residuals=residuals,
+        whitened=white,
+        sigma={name: one(levels.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
+        correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
+        untold=tuple(name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()),
+        chi_square=np.where(one(fails), np.nan, sum(np.nansum(r**2, axis=over(r)) for run in white for r in run.values())),
+        samples=np.asarray(samples),
+        degrees_of_freedom=np.asarray(samples - one(determined)),
+        of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.rise.of_rise)),
+        from_prior=(values - unknowns.prior_mean[places]) * unknowns.prior_weight[places],
+        oddities=oddities(problem.scene, problem.runs, not single),
+        events_met=events_met(problem, theta[0]) if single and problem.asked.shooting is None else (),
+        too_narrow=tuple(too_narrow),
+    )
+
+
+def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
+    """Return the number of unknowns determined by the samples: rank - tr(C P)."""
+    p, weight = len(unknowns.whitening), unknowns.prior_weight
+    rows = unknowns.whitening * weight[:p]
+    of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
+    return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, p:] @ weight[p:] ** 2
+
+
+class Estimated(Printed, eqx.Module):
+    """One unknown, in its unit; NaN if the measurements do not determine it."""
+
+    value: PerRepeat
+    standard_error: PerRepeat
+    low: PerRepeat  # ends of the 95 % interval
+    high: PerRepeat
+    unit: str = static()
+
+    def _text(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if self.value.ndim:
+            return f"{described(self.value)}{unit}: its fields `value`, `standard_error`, `low`, `high` have that shape"
+        if np.isnan(self.low + self.high):
+            return f"{self.value:.6g}{unit}, not determined by the measurements"
+        error = f"standard error {self.standard_error:.2g}" if np.isfinite(self.standard_error) else "at its bound"
+        return f"{self.value:.6g}{unit}, {error}, 95 % interval [{self.low:.6g}, {self.high:.6g}]"
+
+
+class ChannelResiduals(Printed, eqx.Module):
+    """Residuals of one channel of one run, in units of sigma. Good fits have mean near 0 and rms near 1."""
+
+    run: int
+    channel: str
+    samples: int
+    mean: float
+    rms: float
+    largest: float  # in magnitude
+
+    @staticmethod
+    def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
+        """Return the summary of a channel's residuals `r`, NaN for missing samples."""
+        r = r[~np.isnan(r)]
+        numbers = (r.mean(), np.sqrt((r**2).mean()), largest(r)) if r.size else (np.nan,) * 3
+        return ChannelResiduals(run, name, r.size, *map(float, numbers))
+
+    def _text(self) -> str:
+        of = f"{self.samples} samples, mean {self.mean:.2g}, rms {self.rms:.3g}, largest {self.largest:.3g}"
+        return f"residuals of `{self.channel}` of run {self.run}, in sigmas: {of}"
+
+
+
+
+GONE = {
+    "bootstrap": "`Fit.profiles` gives intervals of nonlinear scenes; for repeats, draw data about "
+                 "`simulate` of `scene` and `starts`, and pass them to `fit_batch`"
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimates(Printed):
+    """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene.
+
+    After `fit_batch`, every array has a leading axis `repeats`, also the arrays of `scene`. Results at the
+    minimum are computed on first access: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`,
+    `residuals`, `whitened`, `sigma`, `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and
+    the other fields of `Statistics`.
+    """
+
+    values: PerUnknown
+    # for an estimate at a bound: distance in standard errors to the data's optimum beyond it; NaN elsewhere
+    beyond: PerUnknown
+    converged: Marks
+    stuck: Marks  # no step lowers the sum of squares, but this is no minimum
+    steps: Counts  # number of tried steps
+    grown: Marks  # whether growing spans found the minimum, far from the result of the first guess
+    agreeing: Counts  # number of first guesses that led to this minimum; zero for a batch
+    shooting: Shot | None  # results of multiple shooting
+    # objective, and F initially and after each tried step; empty for a batch
+    trace: tuple[tuple[str, tuple[float, ...]], ...]
+    asked: Asked  # arguments of `fit`, among them `guesses` and `errors`
+    unknowns: Unknowns  # with `labels`, `units` and `layout`
+    work_out: Callable[[], Statistics]
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """Return the statistics at the minimum."""
+        return self.work_out()
+
+    def __getstate__(self) -> dict:
+        # compiled programs stay in their process
+        return vars(self) | {"statistics": self.statistics, "work_out": None}
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an entry of `statistics`, such as `standard_errors`, of the arguments of the fit, or of the
+        unknowns.
+        """
+        parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
+        for part in (part for part, names in parts.items() if name in names):
+            return getattr(getattr(self, part), name)
+        raise AttributeError(f"`{name}` was removed: {GONE[name]}" if name in GONE else "`Fit` has no "
+            f"`{name}`; {nearest(name, dir(self))}")
+
+    def __getitem__(self, name: str) -> Estimated:
+        check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
+        i = self.labels.index(name)
+        return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
+
+    @property
+    def estimates(self) -> dict[str, Estimated]:
+        """Return all estimates by name."""
+        return {name: self[name] for name in self.labels}
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
+        """Return the covariance of the estimates in the order of `labels`, to first order; NaN for unknowns
+        that are not identifiable.
+        """
+        return self.information.covariance
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
+        """Return the correlation of the estimates."""
+        return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
+
+    @property
+    def reduced_chi_square(self) -> PerRepeat:
+        """Return the sum of squared residuals per degree of freedom. It is near 1 for a correct scene and
+        correct sigmas, and NaN without degrees of freedom.
+        """
+        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
+
+    # For a single fit, not a batch.
+    # ------------------------------------------------------------------------------------
+
+    @property
+    def agreement(self) -> str:
+        """Return a text with the number of first guesses that led to the minimum."""
+        return f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to {'this' if self.agreeing else 'a'} minimum"
+
+    @property
+    def not_identifiable(self) -> Sentences:
+        """Return undetermined combinations of unknowns, one sentence each."""
+        if not np.isfinite(self.chi_square):
+            return ()
+        return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
+
+    @property
+    def correlated(self) -> Sentences:
+        """Return pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first,
+        one sentence each.
+        """
+        some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
+        found = np.triu(self.correlation[np.ix_(some, some)], 1)
+        pairs = sorted(zip(*np.nonzero(np.abs(found) >= 0.98), strict=True), key=lambda ij: -abs(found[ij]))
+        return tuple(
+            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at "
+            f"{np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: the data determine a combination "
+            "of them far better than either"
+            for i, j in pairs
+        )
+
+    @property
+    def weak(self) -> Sentences:
+        """Return poorly determined shared unknowns and combinations (relative standard error of at least
+        0.1), weakest first, one sentence each.
+        """
+        return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
+
+    @property
+    def impossible(self) -> Sentences:
+        """Return one sentence for each body of the fitted scene whose inertia no distribution of mass can
+        have.
+        """
+        q, _, _ = self.scene.named(**self.starts[0])
+        return impossible_bodies(self.scene, q)
+
+    @property
+    def autocorrelation(self) -> dict[str, tuple[float, float]]:
+        """Return the correlation of neighbouring whitened residuals of each channel over all runs, and the
+        limit 3.5 / sqrt(pairs), which white noise rarely exceeds.
+        """
+        found = {}
+        for name in dict.fromkeys(name for run in self.whitened for name in run):
+            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
+            products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
+            squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
+            pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
+            if pairs and size > 0:
+                found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
+        return found
+
+    def residual_summary(self) -> tuple[ChannelResiduals, ...]:
+        """Return count, mean, rms and largest residual per run and channel."""
+        return tuple(ChannelResiduals.of(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+
+    def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
+        """Return a number, or an array of them, that depends on the parameters, with its standard error and
+        95 % interval.
+
+            found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
+
+        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first
+        order (the delta method). A combination may have an interval even if its parts are not identifiable
+        separately. The result is NaN if it depends on an undetermined direction, or on an unknown at its
+        bound.
+
+        - `function`: plain JAX, of a scene; returns an array of any shape. `unit`: of the result, for
+          `print`.
+
+        **Returns** value, standard error and ends of the interval in that shape; for a batch with a leading
+        axis `repeats`. **Raises** ValueError if the function returns no numbers. Source: C. R. Rao, Linear
+        Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
+        """
+        shared = self.layout.sizes[0]
+        value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
+        sizes, at_bound, quantiles = (x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles))
+        error = standard_errors(self.information, slopes, sizes, at_bound, self.asked.control.cutoff)
+        of_numbers = quantiles.reshape(*quantiles.shape[:-1], *(1,) * (slopes.ndim - quantiles.ndim), shared)
+        reach = error * np.max(np.where(slopes != 0, of_numbers, 0.0), axis=-1, initial=0.0)
+        return Estimated(value, error, np.asarray(value - reach), np.asarray(value + reach), unit)
+
+    @property
+    def tied(self) -> dict[str, Estimated]:
+        """Return the parameters that depend on unknowns through a function or a possible inertia in `free`,
+        in the form of `derived`.
+        """
+        units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
+        return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}

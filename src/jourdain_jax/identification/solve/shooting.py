@@ -1,0 +1,193 @@
+"""Multiple shooting: runs are divided into pieces with their own starts, joined by continuity.
+
+    piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
+    continuity                              x(t_i+1; s_i, theta) = s_i+1                            an equation, not a residual
+
+With delayed sensors, pieces overlap: a sample belongs to the piece that contains its earliest possible time,
+and that piece extends beyond t_i+1. The output of a sensor's low-pass filter is part of s.
+
+Over a short piece a motion depends almost linearly on its unknowns, even if the whole run is chaotic. Source:
+H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder,
+GAMM-Mitteilungen 30 (2007) 376.
+
+Nodes are the states s = (q, u, y) between pieces: coordinates, speeds, and filter outputs y.
+
+A piece begins at the nearest state on the constraints, and continuity holds for all numbers of s. It thus
+needs no chart of the constraint manifold, which could be singular.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.calculus.reals import Number, checked_real, checked_whole
+from jourdain_jax.identification.data.experiment import Experiment
+from jourdain_jax.identification.data.sensors import FEWEST_INTERVALS, latest
+from jourdain_jax.integrate.inputs import Inputs, Sampled
+from jourdain_jax.integrate.state_projection import state_of
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.scene import Scene
+
+Ends = Int[np.ndarray, "ends"]
+NODE, LAST = "node of a piece", "time of the next node"  # keys in the start of a piece of a run
+
+
+def begin(scene: Scene, start: dict, t0):
+    """Return the initial values for `simulate`: the start of a run, or for a later piece its node, which
+    `simulate` projects onto the constraints.
+    """
+    if NODE in start:
+        q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
+        return state_of(scene, t0, q, u)
+    return {name: value for name, value in start.items() if name != LAST}
+
+
+def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], start: dict, ts: Float[Array, "times"]) -> dict[str, Float[Array, "states"]]:
+    """Return the end state of a piece; empty for a whole run. `ts`: the times of the motion."""
+    if LAST not in start:
+        return {}
+    last = jnp.argmin(jnp.abs(ts - start[LAST]))
+    # among the residuals, after all channels
+    return {"~end of a piece": jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}
+
+
+@dataclass(frozen=True)
+class MultipleShooting:
+    """Fit each run in pieces with their own starts, each ending where the next one begins.
+
+        jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
+
+    - `duration`: approximate length of a piece, s. Choose the time over which neighbouring motions diverge by
+      a factor of two to five.
+    - `pieces`: number of pieces of each run; give either this or `duration`.
+
+    Use it for motions that are unstable or chaotic over the whole run: the steps are those of an almost
+    linear problem. The objective and its minimum equal those of a fit without `shooting`. Pieces begin at
+    samples; if a sensor has a delay, they overlap by its largest possible value.
+
+    **Raises** ValueError unless exactly one of the two is given: a positive finite duration, or at least two
+    pieces. Raises it in `fit` for a run with too few samples.
+    """
+
+    pieces: int | None = None
+    duration: float | None = None  # s
+
+    def __post_init__(self):
+        if (self.pieces is None) == (self.duration is None):
+            raise ValueError(
+                "`MultipleShooting` expects either `pieces` (number per run) or `duration` (of a piece, in "
+                "s), such as `duration=0.5`"
+            )
+        if self.pieces is not None:
+            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for "
+                "one piece omit `shooting`")
+        else:
+            number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(
+                    f"`duration` of `MultipleShooting` is {self.duration} s, expected a positive finite time"
+                )
+
+
+def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
+    """Return the samples at which pieces begin, and the last sample. Raises ValueError if there are fewer
+    intervals than pieces, or if an event ended the run.
+    """
+    if run.ended_by:
+        raise ValueError(
+            f"run {index} has a measured time of its event `{run.ended_by}`, which `shooting` does not use; "
+            "omit it, and the samples after it"
+        )
+    ts = np.asarray(run.ts)
+    count = len(ts) - 1
+    pieces = shooting.pieces
+    if pieces is not None:
+        if pieces > count:
+            raise ValueError(
+                f"run {index} has {len(ts)} samples, too few for {pieces} pieces; give at most {count} pieces"
+            )
+        return np.round(np.linspace(0, count, pieces + 1)).astype(int)
+    at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
+    after = np.clip(np.searchsorted(ts, at), 1, count)
+    nearest = np.where(at - ts[after - 1] < ts[after] - at, after - 1, after)
+    return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
+
+
+def numbers_of_filters(run: Experiment) -> int:
+    """Return the number of filter outputs of the sensors of a `checked` run."""
+    return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
+
+
+def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
+    """Return, for each channel, the first sample of each piece, and the number of samples.
+
+    A sample at a node belongs to the later piece. With a delayed sensor, a sample belongs to a later piece
+    only if that piece began at least the largest delay before the sample.
+    """
+    ts, found = np.asarray(run.ts, float), {}
+    for name in run.values:
+        late = latest(run.sensors[name].delay) if name in run.sensors else 0.0
+        inner = np.searchsorted(ts, ts[ends[1:-1]] + late - 1e-9 * (ts[-1] - ts[0]))
+        found[name] = np.concatenate([[0], inner, [len(ts)]])
+    return found
+
+
+def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
+    """Return the pieces of a `checked` run. Each but the first begins at a node of `states` numbers; `ends`:
+    their first and last samples.
+    """
+    found, firsts = [], owned(run, ends)
+    for k, (first, end) in enumerate(pairwise(ends)):
+        last = max(end, *(own[k + 1] - 1 for own in firsts.values()))
+        here, of_piece = slice(first, last + 1), np.arange(first, last + 1)
+        values = {}
+        for name, x in run.values.items():
+            begin, after = firsts[name][k : k + 2]
+            counts = (of_piece >= begin) & (of_piece < after)
+            part = np.asarray(x[here], float)
+            values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan)
+        begins = first == ends[0]
+        t0 = run.t0 if begins else np.asarray(run.ts[first])
+        piece = run.changed(
+            ts=run.ts[here],
+            t0=t0,
+            values=values,
+            sigma={name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
+            start=(run.start if begins else {NODE: np.zeros(states)}) | {LAST: np.asarray(run.ts[end])},
+            unknown_start=run.unknown_start if begins else {},
+            # a grid may end one interval later
+            inputs=_cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),
+        )
+        found.append(piece)
+    return found
+
+
+def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
+    """Return the inputs with only the samples around this span. Actuators keep all samples, since their
+    unknown delays move them.
+    """
+    if not isinstance(run.inputs, Inputs):
+        return run.inputs
+    driven = {drive.index for drive in run.drives.values()}
+
+    def between(index: int, signal):
+        if index in driven or not isinstance(signal, Sampled):
+            return signal
+        ts = np.asarray(signal.ts)
+        first = max(int(np.searchsorted(ts, t0, "right")) - 1, 0)
+        some = slice(first, max(min(int(np.searchsorted(ts, t1)), len(ts) - 1), first) + 1)
+        return Sampled(ts[some], np.asarray(signal.values)[some])
+
+    return Inputs(tuple(between(k, x) for k, x in enumerate(run.inputs.channels)))
+
+
+def check_shooting(shooting) -> None:
+    """Raise ValueError unless `shooting` is a `MultipleShooting` or None."""
+    if shooting is not None and not isinstance(shooting, MultipleShooting):
+        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, "
+            "`jj.MultipleShooting(pieces=...)`, or None")

@@ -1,0 +1,400 @@
+"""The first stop event of a step and its time, located by trials of shorter steps
+from the last state before it.
+
+One source serves JAX arrays and machine code (`w`, `integrate/loop/step.py`). Values of events are lists.
+
+An event happens where its value falls through zero. A motion that starts with a value of zero (to round-off)
+continues if the value is positive after a first step h, whether its rate raises it or a later derivative:
+
+    |c_0| <= noise c_0'   or   |c_0|, |h c_0'| <= noise/h |c(h) - c_0|,   noise = eps^0.6 span
+
+Otherwise the step is halved, down to that noise, so that the search does not find the zero at the start. If
+the value is negative there, or none of these steps raises it, the event has happened at the start.
+
+All event values are positive at t_b, or rise from zero there, and at least one is not positive at t_a. NaN is
+not positive, so it lies beyond the event. Of the values that are not positive at t_a, the search follows the
+one whose secant from t_b falls to zero first. The first trial uses the cubic through values and rates at both
+ends, later ones Chandrupatla's method (inverse quadratic interpolation if safe, otherwise bisection). If a
+trial finds an earlier event, the search continues with that. A value may stay zero beyond the event: such an
+end of the bracket counts as negative, and the bracket is halved.
+
+Trial times have no derivatives. Near the event, Newton shifts follow,
+
+    t <- t - c/cdot,   y <- y + (shift of t) f
+
+but not if c is NaN beyond it. `put_tangents` then sets the tangents of the event's time and state.
+
+Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
+"""
+
+import math
+import operator
+from functools import reduce
+from typing import Any, NamedTuple
+
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.loop.lanes import Form, Lanes, Number, StepWriter, each_row
+from jourdain_jax.integrate.loop.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
+from jourdain_jax.integrate.relation_sides import leaving, on_their_way
+
+RUNNING, LOCATING = -1, -2  # codes of a running motion, and of one that locates an event
+MOST_STEPS = 72
+DIFFERENTIABLE = 2
+# a value that falls through zero at less than this part of its mean rate counts as a multiple root
+FLAT = 1e-8
+LEAVES = 0.6  # exponent of round-off
+LATE = 0.98  # fraction of a step: a later dip is left to the next step
+
+Values = Any  # one per event
+
+
+def any_of(found: Values):
+    """Return whether any condition holds."""
+    return reduce(operator.or_, found)
+
+
+def no_event(values: Values):
+    """Return whether all values are positive, which NaN is not."""
+    return reduce(operator.and_, [c > 0.0 for c in values])
+
+
+def chosen(w, index, values: Values):
+    """Return the value with this index, by default the first."""
+    found = values[0]
+    for i in range(1, len(values)):
+        found = w.where(w.equal(index, i), values[i], found)
+    return found
+
+
+def _each(w, condition, a: Values, b: Values) -> tuple:
+    return tuple(w.where(condition, x, y) for x, y in zip(a, b, strict=True))
+
+
+def reach_of_noise(w, span):
+    """Return the time in which a value rises by as much as round-off may make it negative at the start."""
+    return w.eps**LEAVES * w.magnitude(span)
+
+
+def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
+    """Return the events that happened at a start, and values near zero there that a step `h` leaves there."""
+    sunk, sinks, noise = [], [], reach_of_noise(w, span)
+    for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
+        rate, change = slope * direction, w.magnitude(b - a)
+        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # what a straight line changes it by
+        level = ~(a > 0.0) & (change > 0.0) & (straight * w.magnitude(h) <= noise * change)
+        rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
+        sunk.append(~(a > 0.0) & ~rises)
+        sinks.append(rises & ~(b > 0.0))
+    return sunk, sinks
+
+
+def first_event(w, before: Values, after: Values):
+    """Return the index of the first event to happen, by its secant."""
+    best, first = None, 0.0
+    for i, (b, a) in enumerate(zip(before, after, strict=True)):
+        share = b / (b - a)
+        share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
+        if best is not None:
+            first = w.where(share < best, i, first)
+        best = share if best is None else w.where(share < best, share, best)
+    return first
+
+
+def cubic(h, a, slope_a, b, slope_b) -> tuple:
+    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and
+    s = 1, the ends of a step h."""
+    m_0, m_1, rise = h * slope_a, h * slope_b, b - a
+    return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+
+
+def falls_through(w, h, a, slope_a, b, slope_b):
+    """Return the fraction of a step at which the cubic, or else the straight line, falls to zero."""
+    m, A, B = cubic(h, a, slope_a, b, slope_b)
+    s = line = a / (a - b)
+    for _ in range(4):
+        s = s - (a + s * (m + s * (A + s * B))) / (m + s * (2.0 * A + s * (3.0 * B)))
+    left = a + s * (m + s * (A + s * B))
+    return w.where((s > 0.0) & (s < 1.0) & (w.magnitude(left) < 1e-3 * (a - b)), s, line)
+
+
+def trial(w, t, c, step, last, guess) -> tuple:
+    """Return the next trial time in a step of length `step`, and whether the last one is near enough. `t` and
+    `c` are times and values of a bracket. The first trial divides it by the fraction `guess`. With `last` the
+    search ends at a finite value."""
+    eps = w.eps
+    (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
+    width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
+    xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
+    safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
+    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
+    share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
+    share = w.where(w.magnitude(share) < math.inf, share, 0.5)
+    least = w.smaller(tiny / w.magnitude(width), 0.5)
+    # Near in time by the slope, and small relative to the other end: one alone is not enough for flat or
+    # jumping values, nor is the mean slope of the whole step before any trial.
+    slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
+    slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
+    small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
+    zero = w.equal(c_1, 0.0)  # at the event, or beyond it if the value stays zero
+    near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
+    closed = (w.magnitude(width) <= 2.0 * tiny) | last
+    clipped = w.smaller(w.larger(share, least), 1.0 - least)
+    return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
+
+
+class Search(NamedTuple):
+    """Bounds of the event's time: three times with the values of all events. They are the last trial, a time
+    on the other side of the event, and an earlier bound."""
+
+    t: Values
+    c: Any
+    step: Any  # length of the step with the event
+    left: Any  # remaining steps; 0: found
+    shift: Any  # the next step, signed
+    slope: Values  # magnitude of the mean rate of the values over that step
+
+    @property
+    def trying(self):
+        """Return whether trials start at the last state before the event, rather than Newton shifts."""
+        return self.left > DIFFERENTIABLE + 1.0
+
+
+def search_of(form: Form, p: Lanes) -> Search:
+    """Return the search in the rows of lanes."""
+    values, count = p.every("search_c"), form.events
+    c = tuple(values[i * count : (i + 1) * count] for i in range(3))
+    step, left, shift = (p[f"search_{name}"] for name in ("step", "left", "shift"))
+    return Search(p.every("search_t"), c, step, left, shift, p.every("search_slope"))
+
+
+def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
+    """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time,
+    values of all events, rates). `begins`: whether the event is in this step. Returns the index of the
+    event that the search follows."""
+    old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
+    # narrowed bracket: the trial time, one on the other side of the event, and one of the former two
+    same = ~(no_event(c_1) ^ no_event(old.c[0]))
+    narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
+    narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
+    t = _each(w, begins, (t_1, t_0, math.inf), _each(w, old.trying, narrowed_t, old.t))
+    fresh_c = c_1, c_0, [math.nan] * len(c_1)
+    c = [_each(w, begins, a, _each(w, old.trying, b, kept)) for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True)]
+    step = w.where(begins, w.magnitude(t_1 - t_0), old.step)
+    left = w.where(begins, float(MOST_STEPS), w.larger(old.left - 1.0, 0.0))
+    is_before = no_event(c[0])
+    before, after = _each(w, is_before, c[0], c[1]), _each(w, is_before, c[1], c[0])
+    first = first_event(w, before, after)
+    guess = 1.0 - falls_through(w, t_1 - t_0, *(chosen(w, first, x) for x in (c_0, rate_0, c_1, rate_1)))
+    tried, near = trial(w, t, [chosen(w, first, x) for x in c], step, left <= DIFFERENTIABLE + 3.0, guess)
+    trying = begins | old.trying
+    left = w.where(trying & near, DIFFERENTIABLE + 1.0, left)
+    slack = math.sqrt(w.eps) * step
+    value, rate = chosen(w, first, c_1), chosen(w, first, rate_0)
+    # stay within the bracket; a value that was zero shortly before belongs to another event
+    to = t_1 - value / rate
+    usable = (old.left > 0.0) & (to > w.smaller(t[0], t[1]) - slack) & (to < w.larger(t[0], t[1]) + slack) & (w.magnitude(rate) < math.inf)
+    slope = []
+    for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
+        mean = w.magnitude((b - a) / (t_1 - t_0))
+        slope.append(w.where(begins, w.where(mean < math.inf, mean, 0.0), kept))
+    # its value beyond the event may be NaN
+    newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)
+    shift = w.where(trying, w.where(near, 0.0, tried - t_0), newton)
+    rows = {"t": t, "c": [x for part in c for x in part], "step": [step], "left": [left], "shift": [shift], "slope": slope}
+    for name, values in rows.items():
+        p.put(f"search_{name}", _each(w, changes, values, p.every(f"search_{name}")))
+    return first
+
+
+def is_flat(w, c_dot, slope):
+    """Return whether a value has no slope at its zero, relative to its mean `slope` over the step."""
+    return w.magnitude(c_dot) <= FLAT * slope
+
+
+def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
+    """Return the fraction of a step `h` at which the first value that dips below zero between the
+    ends is lowest; 1 if there is none: p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s =
+    -m_0/(A + sqrt(A^2 - 3 B m_0))."""
+    share = None
+    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
+        m_0, A, B = cubic(h, a, slope_a, b, slope_b)
+        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
+        value = a + s * (m_0 + s * (A + s * B))
+        dips = (b > 0.0) & (m_0 < 0.0) & (h * slope_b > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
+        found = w.where(dips, s, 1.0)
+        share = found if share is None else w.smaller(share, found)
+    return share
+
+
+def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
+    """Return half the fraction of a step `h`, at most a half, for which values
+    rising from zero stay positive."""
+    share = w.number(0.5)
+    for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
+        m, A, B = cubic(h, a, slope_a, b, slope_b)
+        back = m / (w.root(w.larger(A * A - 4.0 * B * m, 0.0)) - A)  # half of the root of m + A s + B s^2
+        share = w.where(sinking & (back > 0.0) & (back < share), back, share)
+    return share
+
+
+def monitored(
+    w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
+) -> dict[str, Number]:
+    """Return the result of a step `h` that may contain an event, or in which an event is being located;
+    update `y1`. `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`:
+    whether it is a step of the motion."""
+    count, y, t = form.events, p.pointer, p["t"]
+
+    def events(t: Number, y: Number, slope: Number) -> list[list[Number]]:
+        values, rates = w.room(count), w.room(count)
+        w.run("events", p.pointer, t, y, slope, values, rates)
+        return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
+
+    def armed(found: list[list[Number]]) -> list[list[Number]]:
+        """Exclude events that have not been left since they happened, and ignored ones."""
+        if not form.goes_on:
+            return found
+        found = leaving(w, form, p, found)
+        over = [w.literal(stops and not form.stopping, w.truth) for stops in form.stops]
+        disarmed = [(off > 0.0) | passed for off, passed in zip(p.every("disarmed"), over, strict=True)]
+        return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
+
+    def with_rises(found: list[list[Number]]) -> list[list[Number]]:
+        """Reverse the sign of events that were not left: rising above zero and falling
+        again in a step counts as new."""
+        if not form.goes_on:
+            return found
+        off = p.every("disarmed")
+        return [[w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)] for pair in zip(found, armed(found), strict=True)]
+
+    at_begin = events(t, y, k[0])
+    c_0, rate_0 = armed(at_begin)
+    at_end = events(new["t"], y1, k[1])
+    c_1, rate_1 = armed(at_end)
+    locating = w.equal(p["code"], LOCATING)
+    # a motion that starts beyond an event ends at once; a NaN state is not an event
+    sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
+    fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
+    share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
+    sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
+    if form.goes_on:
+        sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
+    again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
+    half = w.room()
+    w.store(0.5, half)
+    w.if_any(again, lambda: w.store(ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), half))
+    dips, share = accept & ((share < 1.0) | again), w.where(again, w.load(half), share)
+    # the trial passed a second zero of a value that rises from zero: use a shorter step
+    restarts = locating & again
+    happened = accept & ~dips & ~no_event(c_1)
+    was_trying, changes, first = search_of(form, p).trying, happened | (locating & ~restarts), w.room()
+    w.store(p["event"], first)
+
+    def follow() -> None:
+        w.store(w.literal(_follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1)), w.real), first)
+
+    w.if_any(changes, follow)
+    search = search_of(form, p)
+    # trials start at the last state before the event; a step over a dip is repeated up to its bottom
+    found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
+    over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
+    stays = back | dips | restarts | over
+
+    def state(i: int | Number) -> Number:
+        after = w.load(y1, i)
+        return w.where(stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after))
+
+    each_row(w, form.integrated, y1, state)
+    which = float(count - 1)
+    for i in reversed(range(count - 1)):
+        which = w.where(sunk[i] | sinks[i], i, which)
+    code = w.where(happened, LOCATING, w.where(found, result_codes.EVENT, w.where(locating, LOCATING, new["code"])))
+    code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
+    shorter = share * w.magnitude(h)
+    p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of Taylor series, whose steps have no `h`
+    changed = {
+        "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
+        "h": w.where(over, p["h"], w.where(dips | restarts, shorter, w.where(locating, p["h"], new["h"]))),
+        "code": w.where(over, result_codes.EVENT, code),
+        "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
+        "rejected": w.where(over, p["rejected"], new["rejected"] + w.where(dips | restarts, 1.0, 0.0)),
+        "event": w.where(over, which, w.where(happened | (locating & was_trying), w.load(first), p["event"])),
+        "taken": w.where(stays, 0.0, new["taken"]),
+    }
+    ends = found
+    if form.goes_on:
+        goes = goes_on(w, form, changed["event"]) & (found | over)
+        # an event just beyond the end of its step by rounding happens there; the saved state is that after it
+        now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
+        changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
+        follows = over & (p["passed"] + p["crossings"] > 0.0)
+        at_once = follows & ~goes  # right after a transition, which determines its time
+        ends = at_once | (found & ~goes)
+        p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
+        noise = reach_of_noise(w, p["last_goal"])
+        left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
+        p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
+        rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
+        side = is_side(w, form, changed["event"])  # one may vanish together with another
+        flat = ~side & (over | is_flat(w, rate, slope))
+        quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
+        passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
+        stuck, repeats = w.room(), follows & any_of(sinks)
+        w.store(0.0, stuck)
+        w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
+        passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
+        too_many = repeats | (why > 0.0) | (passed > float(form.transitions))
+        why = w.where(why > 0.0, why, float(result_codes.TOO_MANY_TRANSITIONS))
+        changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
+        changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
+        # counted as trial steps, so that they end
+        changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
+        changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
+        changed["event"] = w.where(goes, -1.0, changed["event"])
+    if form.moving:
+        put_tangents(w, form, p, k[0], ends, new["t"], rate_0, y1)
+    return new | changed
+
+
+def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
+    """Return whether the value of a lane's event has no slope where it falls through zero."""
+    return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
+
+
+def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
+    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each
+    time tangent shifts the state along the directions e of which it is composed (values and rates before
+    the event; NaN without slope),
+
+        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0"""
+    count, times = form.events, form.rows["dt"]
+
+    def put() -> None:
+        k_now = k
+        values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
+        slope = chosen(w, p["event"], rate)
+        usable = found & w.differs(slope, 0.0) & (w.magnitude(slope) < math.inf)
+        flat = found & slope_is_flat(w, p, slope)
+        for part, row in enumerate(times, 1):
+            if part > 1:  # rates at the shifted state
+                k_now = w.room(form.integrated)
+                w.run("rates", p.pointer, t, y1, k_now, pivots)
+            w.run("event_tangents", p.pointer, t, y1, values)
+            dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
+            dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
+            w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
+            for other in range(len(times) + 1):
+                if not other & part:
+                    _move_rows(w, form, y1, k_now, (other | part) * form.y, other * form.y, dt, usable | flat)
+
+    w.if_any(found, put)
+
+
+def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
+    """Add `dt` times rows of `k`, from row `rates` on, to rows of `y`, from row `rows` on."""
+
+    def moved(i: int | Number) -> Number:
+        before = w.load(y, i + rows)
+        return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
+
+    w.each(range(form.y), lambda i: w.store(moved(i), y, i + rows))

@@ -1,0 +1,86 @@
+"""Implicit methods of this package's loop, with the equations of a step solved by Newton's method.
+
+Batches run under `vmap`. Structure-preserving methods preserve something exactly or nearly so (an
+energy, a quadratic integral, a symmetry under time reversal), but only with constant steps and without
+an error estimate, so they have a `step`. Between two times at which a step must end they take the fewest
+equal steps no longer than that.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jourdain_jax.calculus.reals import Flag, Number, Scalar, checked_unless_traced
+from jourdain_jax.integrate.vector_fields.field import VectorField
+from jourdain_jax.scene.scene import Scene
+
+
+class Solution(NamedTuple):
+    """Changes by a step."""
+
+    change: PyTree  # of the state; zero if the equations of the step were not solved
+    error: PyTree | None  # None: the method has no estimate
+    solved: Flag  # whether they were
+
+
+class ImplicitMethod(eqx.Module):
+    """Method whose steps are solutions of equations."""
+
+    order: ClassVar[int]  # a step of h has an error of about h^order
+    even: ClassVar[bool] = False  # whether it takes equal steps
+    needed: ClassVar[int] = 3  # stored slopes per step: at its start, middle and end
+    at_the_end: ClassVar[int] = 2
+
+    @property
+    def name(self) -> str:
+        """Return the name of the method, as shown in a trajectory."""
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def solve(self, args: tuple, t: Scalar, y: PyTree, h: Scalar) -> Solution:
+        """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards);
+        `args`: as in `integrands.py`.
+        """
+
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """Return the form of the state that is integrated in place of `field`.
+
+        Raises ValueError if the method does not apply to the `scene`, or to the state requested by
+        its `Formulation` (`asked`).
+        """
+        return field
+
+
+class FixedStepMethod(ImplicitMethod):
+    """Base of the structure-preserving methods."""
+
+    step: Number | None = eqx.field(kw_only=True)  # longest step, s; None if a program receives it separately
+    order: ClassVar[int] = 2
+    even: ClassVar[bool] = True
+
+    def __check_init__(self):
+        step = checked_unless_traced(self.step, f"`step` of `{self.name}`", (),
+            advice="pass the length of steps in s")
+        if isinstance(step, np.ndarray) and not 0 < float(step) < np.inf:
+            raise ValueError(
+                f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length in s")
+
+
+def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
+    """Return the size of each unknown, relative to which round-off is judged: the state x plus
+    its change; 1 if both are zero.
+    """
+    size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(change))
+    return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))
+
+
+def even_step(longest: Scalar, rest: Scalar) -> Scalar:
+    """Return the length of the fewest equal steps, none longer than `longest`, that cover a `rest`. A ratio
+    1e-9 above an integer counts as that integer.
+    """
+    return rest / jnp.maximum(jnp.ceil(rest / longest - 1e-9), 1)

@@ -1,0 +1,382 @@
+"""Reverse mode of the loop over steps: cotangents of the start from the cotangents of the states and the end.
+
+All lanes of a block begin and end together here. On the forward pass every trial step leaves a slot
+(`record.py`): the state before it, the slopes of its stages, the advance of the state (zero if the
+step was rejected or the lane had ended), and the number of times saved before it. On the backward
+pass, with a fixed step size,
+
+    Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
+
+and if a motion ended at a stop event, at the time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, first
+
+    s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
+
+In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by cotangents
+of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g' be the
+change of g along a tangent. The result is dS/dx, where x is the initial state and the known numbers. Its
+change is d(dS)/dx, where dS is the sum of states times g' and of their tangents times g: the cotangents are
+g' for the states and g for their tangents.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.derivatives import filled
+from jourdain_jax.calculus.reals import Indices
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.event_search import RUNNING, chosen, slope_is_flat
+from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.loop.handover import Start, constant_rows
+from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, set_goal
+from jourdain_jax.integrate.loop.loop import (
+    COUNT,
+    MOST_KERNELS,
+    TIMES,
+    begin_lane,
+    goal_of,
+    with_tangents,
+    write_functions,
+    write_job,
+)
+from jourdain_jax.integrate.loop.rate_functions import write_pulled
+from jourdain_jax.integrate.loop.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
+from jourdain_jax.integrate.loop.samples import pass_knot
+from jourdain_jax.integrate.loop.step import near_rank_loss, put_near_rows, squares_of, weighted
+from jourdain_jax.integrate.loop.transitions import is_noted, reset_back, write_reset_back
+from jourdain_jax.integrate.loop.value_kernels import called
+from jourdain_jax.kernels.ffi import OfLane, of_lane, taken_in, write_handler
+from jourdain_jax.kernels.ir import Value
+
+
+def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
+    """Write the module; `asked`: indices of the numbers whose cotangents are needed; `memory`: bytes
+    for the records of all threads.
+    """
+    write_functions(w, form, method)
+    write_pulled(w, form, asked)
+    prepare(w, form, method, memory)
+    _write_begin(w, form)
+    _write_note(w, form)
+    _write_added(w, form)
+    if form.projects:
+        _write_project_back(w, form)
+    _write_step_back(w, form, method, len(asked))
+    if form.has_events:
+        _write_event_back(w, form, len(asked))
+    if form.goes_on:
+        write_reset_back(w, form, asked)
+        _write_transition_back(w, form, len(asked))
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        write_record(w, form, method, len(asked), memory, job)
+        w.give(w.null)
+    write_handler(
+        w,
+        4 + arguments_of_samples(form) + w.device,
+        1,
+        lambda arguments, results: write_job(w, form, arguments, results),
+    )
+
+
+def _write_begin(w: MachineWriter, form: Form) -> None:
+    """Write `begin(job, state, who, lane)`: begin, in a lane, the sample with this index in the batch."""
+    with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
+        number = w.load(who, lane, "i64")
+        begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
+
+
+def _write_note(w: MachineWriter, form: Form) -> None:
+    """Write `note(job, state, who, saved)`: count the times reached, set the next one, and end
+    lanes that have reached all.
+    """
+    with w.procedure("note", "job state who saved") as (job, state, who, saved):
+        lanes = Lanes(w, form, state)
+        with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.each_lane() as lane:
+            times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
+            with w.repeated() as leave:
+                leave(~(lanes.of("code", lane).equals(RUNNING) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
+                before, goals = w.converted("fptosi", w.load(saved, lane, "double"), "i64"), w.load(job, GOALS, "ptr")
+                if form.sampled:
+                    at_knot = lanes.of("t", lane).differs(goal_of(w, job, goals, number, before))
+                    with w.when(at_knot):
+                        pass_knot(w, lanes, lane)
+                    reached = before + w.where(at_knot, w.literal(0, "i64"), 1)
+                else:
+                    reached = before + 1
+                w.store(w.converted("sitofp", reached, "double"), w.at(saved, lane, "double"))
+                with w.when(reached >= times):
+                    lanes.set("code", lane, result_codes.SUCCESS)
+                with w.when(reached < times):
+                    set_goal(w, lanes, lane, goal_of(w, job, goals, number, reached))
+
+
+def _write_added(w: MachineWriter, form: Form) -> None:
+    """Write `added(job, who, first, end, g)`: add the cotangents of the states saved at the times with
+    indices `first` to `end - 1`.
+    """
+    count = form.integrated
+    with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
+        firsts, ends = w.room(), w.room()
+        w.store(first, firsts)
+        w.store(end, ends)
+        with w.when(w.any(first < end)), w.each_lane() as lane:
+            number, times = w.load(who, lane, "i64"), w.load(job, TIMES, "i64")
+            with w.when(number >= 0):
+                a, b = (w.converted("fptosi", w.load(x, lane, "double"), "i64") for x in (firsts, ends))
+                states = of_lane(
+                    w, w.load(job, TO_STATES, "ptr"), w.load(job, COUNT, "i64"), times * count, number
+                )
+                with w.counted(b, first=a) as k, w.counted(count) as row:
+                    more = w.load(states.place(k * count + row), type="double")
+                    place = w.at(g, row * w.lanes + lane, "double")
+                    w.store(w.load(place, type="double") + more, place)
+
+
+def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
+    """Write `step_back(state, here, g, by_known)`: go back over the step in the slot `here`,
+    in lanes that advanced in it.
+    """
+    with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
+        step_back(w, form, method, asked, state, here, g, by_known)
+
+
+def _used(method: Method) -> list[int]:
+    """Return the stages on which the end of a step depends, the last one first."""
+    found: list[int] = []
+    for stage in reversed(range(method.needed)):
+        if method.b[stage] != 0 or any(method.A[j][stage] != 0 for j in found):
+            found.append(stage)
+    return found
+
+
+def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Number, here: Number, g: Number, by_known: Number) -> None:
+    """Go back over the step in the slot `here`, in lanes that advanced in it."""
+    slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
+    h, t = w.load(here, slot.taken), w.load(here, slot.t)
+    took, k = w.differs(h, 0.0), w.at(here, slot.y)
+    w.in_step(t, h)
+    g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * n, max(asked, 1)))
+    copied(w, count, g, g1)
+    each_row(w, asked, added, lambda i: 0.0)
+    if form.projects:
+        each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
+        w.run("project_back", state, t + h, at, g1, added)
+    A, columns, b, c, order = (w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n], used))
+    near = None
+    if form.squares:
+        pivots = w.room(len(form.monitored))
+        w.run("rates", state, t, here, v, pivots)
+        near = near_rank_loss(squares_of(w, form, pivots))
+
+    def stage(number, _: tuple) -> tuple:
+        stage = order[number]
+        of_stage, time = w.at(G, stage * count), w.fma(h, c[stage], t)
+
+        def state_at(row: int | Number) -> Number:
+            start = w.load(here, row)
+            return start if w.is_first(stage) else w.fma(h, weighted(w, A[stage], k, form, row), start)
+
+        def cotangent(i: int | Number) -> Number:
+            total = w.load(g1, i) * b[stage]
+            for j in used:
+                if w.may_count(columns[stage], j):
+                    total = w.fma(w.load(G, i + j * count), columns[stage][j], total)
+            return h * total
+
+        def put_back(near) -> None:
+            each_row(w, count, at, state_at)
+            pulled, more = w.room(count), w.room(max(asked, 1))
+            copied(w, count, of_stage, pulled)
+            copied(w, asked, added, more)
+            w.run("project_back", state, time, at, pulled, more)
+            copied(w, count, pulled, of_stage, near)
+            copied(w, asked, more, added, near)
+
+        each_row(w, count, at, state_at)
+        each_row(w, count, v, cotangent)
+        is_near = None if near is None or w.is_first(stage) else w.at_first(stage, w.literal(0, w.truth), near)
+        if is_near is not None:
+            put_near_rows(w, form, state, is_near, time, at)
+        w.run("pull_rates", state, time, at, v, of_stage, added)
+        if is_near is not None:
+            w.if_any(is_near, lambda: put_back(is_near))
+        return ()
+
+    w.over_stages(len(used), stage, ())
+
+    def total(i: int | Number) -> Number:
+        found = w.load(g1, i)
+        for stage in used:
+            found = found + w.load(G, i + stage * count)
+        return w.where(took, found, w.load(g, i))
+
+    each_row(w, count, g, total)
+    each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
+
+
+def _write_project_back(w: MachineWriter, form: Form) -> None:
+    """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into cotangents of
+    the state `free` before the projection.
+    """
+    moves, count = form.moves, form.integrated
+    with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
+        before = w.room(count * len(moves))
+        for number, q_moves in enumerate(moves):
+            copied(w, count, free, w.at(before, number * count))
+            w.run("projected_once", state, t1, free, w.literal(q_moves, "i1"))
+        out = w.room(count)
+        for number, q_moves in reversed(list(enumerate(moves))):
+            w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
+            copied(w, count, out, g)
+
+
+def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
+    """Write `event_back(job, state, who, g, by_known)`, which calls the Python function `event_back` with
+    cotangents of the end's time from the job.
+    """
+    with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
+        located = is_located(w, Lanes(w, form, state))
+        with w.when(w.any(located)):
+            g_t = w.room(1 + len(form.moving))
+            with w.each_lane() as lane:
+                number = w.load(who, lane, "i64")
+                end = _cotangents_of_end(w, form, job, w.where(number >= 0, number, 0))
+                taken_in(w, 1 + len(form.moving), end.after(form.integrated), g_t, lane)
+            event_back(w, form, asked, state, located, g_t, g, by_known)
+
+
+def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
+    """Write `reset_back(job, state, who, left, g, by_known)`, which calls the Python function `reset_back`
+    with cotangents of the transition's time from the job.
+    """
+    with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
+        lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
+        w.store(w.where(is_noted(w, form, w.load(left)), w.load(left), 0.0), numbers)
+        each_row(w, 1 + len(form.moving), g_t, lambda i: 0.0)
+        with w.each_lane() as lane:
+            number = w.load(who, lane, "i64")
+            with w.when(w.load(numbers, lane, "double").differs(0.0) & (number >= 0)):
+                passed = lanes.of("passed", lane) - 1.0
+                lanes.set("passed", lane, passed)
+                with w.when(passed < float(form.transitions)):
+                    end, first = (
+                        _cotangents_of_end(w, form, job, number),
+                        w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving)),
+                    )
+                    for part in range(1 + len(form.moving)):
+                        g_of = w.load(end.place(first + part * form.transitions), type="double")
+                        w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))
+        reset_back(w, form, asked, state, left, g_t, g, by_known)
+
+
+def _cotangents_of_end(w: MachineWriter, form: Form, job: Value, lane: Value) -> OfLane:
+    """Return the cotangents of the end of a sample and of the times of its transitions."""
+    return of_lane(w, w.load(job, TO_ENDS, "ptr"), w.load(job, COUNT, "i64"), form.ends, lane)
+
+
+def is_located(w: StepWriter, lanes: Lanes) -> Number:
+    """Return which lanes ended at an event located by a search."""
+    return w.equal(lanes["code"], result_codes.EVENT) & (lanes["accepted"] > 0.0)
+
+
+def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Number, g_t: Number, g: Number, by_known: Number) -> None:
+    """Turn cotangents of a state at a fixed time into cotangents at the time and state of an event."""
+    lanes, count = Lanes(w, form, state), form.integrated
+    f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
+    values, rates, weights = (w.room(form.events) for _ in range(3))
+    t = lanes["t"]
+    w.run("rates", state, t, state, f, pivots)
+    if form.moving:  # the tangent and its rates at a fixed time
+        dy, dt = w.at(state, form.y), lanes["dt"]
+        each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(w.differs(dt, 0.0), dt * w.load(f, i), 0.0))
+        lanes["dt"] = w.number(0.0)
+        w.run("rates", state, t, state, f, pivots)
+    w.run("events", state, t, state, f, values, rates)
+    rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(form.events)])
+    usable = located & w.differs(rate, 0.0) & (w.magnitude(rate) < math.inf)
+    each_row(w, asked + 1, added, lambda i: 0.0)
+    total = w.load(g_t)
+    if form.moving:
+        total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
+    for i in range(count):
+        total = w.fma(w.load(g, i), w.load(f, i), total)
+    flat = located & slope_is_flat(w, lanes, rate) & w.differs(total, 0.0)
+    by_value = w.where(usable & ~flat, -total / rate, 0.0)
+    for i in range(form.events):
+        w.store(w.where(w.equal(lanes["event"], i), by_value, 0.0), weights, i)
+    w.run("pull_events", state, t, state, weights, out, added)
+
+    def with_event(before: Number, more: Number) -> Number:
+        return before + w.where(flat, math.nan, w.where(usable, more, 0.0))
+
+    each_row(w, count, g, lambda i: with_event(w.load(g, i), w.load(out, i)))
+    each_row(w, asked, by_known, lambda i: with_event(w.load(by_known, i), w.load(added, i)))
+
+
+def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
+    """Return the time derivative of an event's contribution to a tangent. It changes the cotangents `g` of
+    the state and adds to the others.
+    """
+    (g, g_dt), (out, added) = cotangents, rooms
+    given, count = w.room(form.integrated + 2), form.integrated
+    copied(w, count, g, given)
+    w.store(g_dt, given, count)
+    w.store(lanes["event"], given, count + 1)
+    w.run("pull_moved", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
+    each_row(w, count, g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
+    return w.load(added, asked)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable:
+    """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
+    (with its time last), and the goals.
+
+    It returns cotangents of the initial state, and of the requested numbers among the known ones (`asked`). A
+    state is followed by its tangent.
+    """
+    count = form.integrated + len(asked)
+    run_rows = called(
+        lambda w: write_back(w, form, method, asked, memory),
+        lambda *_: ((count,),),
+        arguments_of_samples(form),
+        constant=constant_rows(form),
+    )
+    return lambda *arguments: run_rows(*arguments)[0]
+
+
+def flow_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable[..., Float[Array, "found"]]:
+    """Return a function that returns cotangents of the start's state and of the requested known numbers
+    (`asked`). Its arguments are the start, and cotangents of the states at the goals, of the end and of the
+    end's time.
+    """
+    n = form.y
+
+    @jax.custom_jvp
+    def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):
+        return _pulled(kernel_back(form, method, asked, memory), start, g, ends)
+
+    @partial(own.defjvp, symbolic_zeros=True)
+    def rule(primals, tangents):
+        (start, g, ends), (along, dg, dends) = primals, tangents
+        dg, dends = filled(dg), filled(dends)
+        raised, more = with_tangents(form, start, along)
+        # of the state and its tangent, at the goals, at the end, and of its time
+        parts = [x for a, b in pairwise((0, n, n + 1, len(ends))) for x in (dends[a:b], ends[a:b])]
+        both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
+        # events need the slopes of samples
+        raised = replace(raised, time_moves=form.has_events and bool(form.sampled))
+        d = _pulled(kernel_back(raised, method, asked, memory), more, *both)
+        return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
+
+    return own
+
+
+def _pulled(kernel: Callable, start: Start, g, ends) -> Float[Array, "found"]:
+    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals)

@@ -1,0 +1,372 @@
+"""The loop over steps in machine code, as a function of JAX: from starts and times
+to save, to states and ends.
+
+Lanes run in several threads, in the widest registers. When a sample has ended, the next one takes its lane. A
+single motion runs in narrow registers, whose instructions are faster. Results do not depend on the width. A
+call takes two arrays with one row per sample: the rows of `Form.given`, and the times to save. It returns the
+states at these times, and the rows of the final progress with the number of times reached in order. Tables
+and knots of sampled inputs come first (`samples.py`).
+
+The derivative of a motion is a motion of states with their tangents. The loop itself finds the tangent of an
+event's time; all other times are numbers (`native_motion.py`). Tolerances and the first step have no
+derivative, nor have samples.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import groupby
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
+from jourdain_jax.integrate.event_search import LOCATING, RUNNING
+from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.loop.handover import Found, Start, constant_rows
+from jourdain_jax.integrate.loop.lanes import (
+    Form,
+    Lanes,
+    MachineWriter,
+    arguments_of_samples,
+    room_of_lanes,
+    set_goal,
+)
+from jourdain_jax.integrate.loop.rate_functions import check_derivatives, write_events, write_projection, write_rates
+from jourdain_jax.integrate.loop.samples import WORDS_OF_SAMPLES, begin_samples, pass_knot, store_samples, write_sampled_inputs
+from jourdain_jax.integrate.loop.step import IDLE, write_step
+from jourdain_jax.integrate.loop.taylor import TaylorSteps, products
+from jourdain_jax.integrate.loop.transitions import write_reset
+from jourdain_jax.integrate.loop.value_kernels import called
+from jourdain_jax.kernels.ffi import (
+    Given,
+    OfLane,
+    handed_out,
+    last_size,
+    next_lane,
+    of_lane,
+    product,
+    share,
+    start_counting,
+    taken_in,
+    write_handler,
+)
+from jourdain_jax.kernels.ir import Value
+
+Loop = Callable[[Start], Found]
+
+# Words of a job, shared by all threads: number of samples, number of times, index of the next sample, size of
+# a kernel's scratch memory in doubles (`ffi.py`), on a GPU a pointer to the shared rows and the number of
+# rows of times (one, or one per sample), words of samples, then pointers to the arrays
+COUNT, TIMES, NEXT, OWN, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(7)
+FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
+STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
+
+
+def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
+    """Write the module."""
+    write_functions(w, form, method)
+    _write_begin(w, form)
+    _write_serve(w, form)
+    if isinstance(method, TaylorSteps):
+        _write_save_within(w, form, method)
+    _write_loop(w, form, method)
+    write_handler(
+        w,
+        2 + arguments_of_samples(form) + w.device,
+        2,
+        lambda arguments, results: write_job(w, form, arguments, results),
+    )
+
+
+def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
+    """Write `step` and the functions that it calls."""
+    if form.sampled:
+        write_sampled_inputs(w, form, form.time_moves)
+    write_rates(w, form)
+    if form.projects:
+        write_projection(w, form)
+    if form.has_events:
+        write_events(w, form)
+    if form.goes_on:
+        write_reset(w, form)
+    write_step(w, form, method)
+
+
+def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
+    """Compute all samples in this thread and others that it starts and joins; the last argument is
+    an array of samples and times.
+    """
+    common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
+    of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
+    arrays = [x.data for x in (*arguments, *results)]
+    job = w.room(FIRST_ARRAY + len(arrays), "i64")
+    for word, pointer in enumerate(arrays):
+        w.store(pointer, job, FIRST_ARRAY + word)
+    count = w.room(type="i64")
+    w.store(product(w, results[-1], 1), count)
+    w.store(w.load(count, type="i64"), job, COUNT)
+    w.store(last_size(w, times), job, TIMES)
+    start_counting(w, job, NEXT)
+    if common:
+        for word, value in ((OWN, w.own[1]), (COMMON, common.data), (ROWS_OF_TIMES, product(w, times, 1))):
+            w.store(value, job, word)
+    if form.sampled:
+        store_samples(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
+    share(w, job, w.load(count, type="i64"))
+
+
+def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
+    """Write `loop(job)`: run lanes until no sample is left."""
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        _write_lanes(w, form, method, job)
+        w.give(w.null)
+
+
+def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
+    # for each lane the index of its sample and the number of its saved times; then the number of busy lanes
+    state, who, k = (
+        room_of_lanes(w, form),
+        w.room(2 * w.lanes + 1, "i64"),
+        w.room(form.integrated * method.needed),
+    )
+    w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
+    with w.counted(form.all) as row:
+        w.store(1.0, state, row)
+    lanes = Lanes(w, form, state)
+    with w.each_lane() as lane:
+        w.run("begin", job, state, who, lane)
+        w.run("serve", job, state, who, lane)
+    with w.repeated() as leave:
+        leave(~w.together(w.load(who, 2 * w.lanes, "i64").differs(0)))
+        w.run("step", state, k)
+        if isinstance(method, TaylorSteps):
+            w.run("save_within", job, state, who, k)
+        code = lanes["code"]
+        on_its_way = (code.equals(RUNNING) & lanes["t"].differs(lanes["goal"])) | code.equals(LOCATING) | code.equals(IDLE)
+        with w.when(w.any(~on_its_way)), w.each_lane() as lane:
+            w.run("serve", job, state, who, lane)
+
+
+def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
+    """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with
+    the data of the first sample.
+    """
+    if form.sampled:
+        begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
+    if w.device:
+        w.store(w.load(job, COMMON, "ptr"), lanes.pointer, form.all)
+    with w.when(there):
+        for rows, numbers in _starts(w, form, job, number):
+            taken_in(w, len(rows), numbers, w.at(lanes.pointer, rows.start), lane)
+        set_goal(w, lanes, lane, goal_of(w, job, goals, number, 0))
+    with w.when(~there):
+        lanes.set("code", lane, IDLE)
+    lanes.set("taken", lane, 0.0)
+    lanes.set("bound", lane, math.inf)
+    if form.has_events:
+        lanes.set("search_left", lane, 0.0)
+    for row in (row for name in ("begun", "disarmed", "left") for row in form.rows.get(name, ())):
+        w.store(w.literal(0.0, "double"), w.at(lanes.pointer, lane + row * w.lanes, "double"))
+
+
+def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
+    """Return the rows of a lane's start as contiguous ranges, each with its source.
+
+    On a GPU, shared numbers that steps do not change are not copied.
+    """
+    count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
+    found, shared = [], w.common if w.device else [False] * form.given
+    sources = {False: of_lane(w, w.load(job, STARTS, "ptr"), count, form.given, lane)}
+    if w.device:
+        sources[True] = OfLane(w.load(job, COMMON, "ptr"), 1)
+    for (is_shared, stays), run in groupby(
+        range(form.given), lambda row: (shared[row], shared[row] and row >= form.rows["known"].start)
+    ):
+        rows = [*run]
+        if not stays:
+            found.append((range(rows[0], rows[-1] + 1), sources[is_shared].after(places[is_shared])))
+        places[is_shared] += len(rows)
+    return found
+
+
+def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:
+    """Return the saved time with this index for a sample."""
+    rows = w.load(job, ROWS_OF_TIMES if w.device else COUNT, "i64")
+    if w.device:
+        lane = w.where(lane < rows, lane, 0)
+    return w.load(of_lane(w, goals, rows, w.load(job, TIMES, "i64"), lane).place(number), type="double")
+
+
+def _write_begin(w: MachineWriter, form: Form) -> None:
+    """Write `begin(job, state, who, lane)`: start the next sample of the batch in this lane."""
+    with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
+        number = next_lane(w, job, NEXT)
+        there = number < w.load(job, COUNT, "i64")
+        begin_lane(w, form, job, w.load(job, _GOALS, "ptr"), Lanes(w, form, state), lane, number, there)
+        with w.when(there):
+            w.store(number, who, lane)
+            w.store(w.literal(0, "i64"), who, lane + w.lanes)
+        with w.when(~there):
+            w.store(w.load(who, 2 * w.lanes, "i64") - 1, who, 2 * w.lanes)
+
+
+def _write_serve(w: MachineWriter, form: Form) -> None:
+    """Write `serve(job, state, who, lane)`: save due states; if the sample has ended,
+    return it and begin the next one.
+    """
+    with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
+        lanes = Lanes(w, form, state)
+        with w.repeated() as leave:
+            code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
+            runs = code.equals(RUNNING)
+            leave(code.equals(IDLE) | code.equals(LOCATING) | (runs & t.differs(goal)))
+            if form.sampled:
+                number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
+                next_time = goal_of(w, job, w.load(job, _GOALS, "ptr"), number, saved)
+                at_knot = runs & t.differs(next_time)
+                with w.when(at_knot):
+                    pass_knot(w, lanes, lane)
+                    set_goal(w, lanes, lane, next_time)
+                with w.when(~at_knot):
+                    _save(w, form, job, who, lanes, lane, runs)
+            else:
+                _save(w, form, job, who, lanes, lane, runs)
+
+
+def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> None:
+    """Write `save_within(job, state, who, k)`: save due states before the end of a step, from the Taylor
+    coefficients `k` at its start.
+    """
+    with w.procedure("save_within", "job state who k") as (job, state, who, k):
+        lanes = Lanes(w, form, state)
+        every, flags, y = form.integrated, w.room(), w.room(form.integrated)
+        times, goals, states = (w.load(job, TIMES, "i64"), *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)))
+        with w.repeated() as leave:
+            goal = lanes["goal"]
+            due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
+            leave(~w.any(due))
+            s = goal - lanes["before"]
+            with w.counted(every) as row:
+                total = w.load(k, row + method.order * every)
+                for j in reversed(range(method.order)):
+                    total = w.fma(total, s, w.load(k, row + j * every))
+                w.store(total, y, row)
+            if form.projects:
+                w.run("project", state, goal, y)
+            w.store(w.where(due, 1.0, 0.0), flags)
+            with w.each_lane() as lane, w.when(w.load(flags, lane, "double") > 0.0):
+                saved = w.load(who, lane + w.lanes, "i64")
+                number = w.load(who, lane, "i64")
+                handed_out(
+                    w,
+                    every,
+                    y,
+                    lane,
+                    of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
+                )
+                w.store(saved + 1, who, lane + w.lanes)
+                # never due again if an event was found just beyond the last time by rounding
+                lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)
+                with w.when((saved + 1) < times):
+                    lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))
+
+
+def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
+    """Save the state of a lane at a due time. At the end, save it for all remaining
+    times and begin the next sample.
+    """
+    times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
+    goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
+    number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
+    last = w.where(runs, saved + 1, times)
+    with w.counted(last, first=saved) as k:
+        handed_out(
+            w, every, lanes.pointer, lane, of_lane(w, states, count, times * every, number).after(k * every)
+        )
+    w.store(last, who, lane + w.lanes)
+    with w.when(last < times):
+        set_goal(w, lanes, lane, goal_of(w, job, goals, number, last))
+    with w.when(last >= times):
+        end = of_lane(w, ends, count, form.returned + 1, number)
+        handed_out(w, form.returned, lanes.pointer, lane, end)
+        w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end.place(form.returned))
+        w.run("begin", job, lanes.pointer, who, lane)
+
+
+MOST_KERNELS = 64  # number of cached kernels; their machine code lives as long as the process
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
+    """Return the kernel of the integrated form, by a tableau or by Taylor series of an order."""
+    steps = method if order is None else TaylorSteps(order)
+
+    def shapes(*arguments):
+        return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
+
+    run = called(
+        lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form), constant=constant_rows(form)
+    )
+
+    @jax.custom_batching.custom_vmap
+    def motion(start: Start) -> Found:
+        states, end = run(*start.of_samples, (*start.y, *start.numbers()), start.goals)
+        return Found.of(form, states, end[:-1], end[-1:])
+
+    @motion.def_vmap
+    def motions(count, batched: Sequence, start: Start):
+        (given,) = batched
+        found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
+        return found.shared(given)
+
+    return motion
+
+
+OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; use `jj.simulate(..., backend="xla")`'
+
+
+def flow(form: Form, method: Method, order: int | None) -> Loop:
+    """Return the motion by a kernel. `order`: order of a Taylor series, which replaces the tableau."""
+
+    def motion(form: Form) -> Loop:
+        # above 36_000 products of coefficients, Taylor steps with second derivatives
+        # are replaced by the tableau
+        too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
+        return kernel(form, method, None if too_many else order)
+
+    def check(form: Form, along: Start) -> None:
+        if not all(map(is_zero, along.of_samples[:1])):
+            raise DifferentiationModeError(OF_SAMPLES)
+        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
+
+    return differentiated(motion, form, check)
+
+
+def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
+    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`
+    raises an error if that form is not supported.
+    """
+    own = jax.custom_jvp(motion(form))
+
+    @partial(own.defjvp, symbolic_zeros=True)
+    def rule(primals, tangents):
+        (start,), (along,) = primals, tangents
+        check(form, along)
+        raised, more = with_tangents(form, start, along)
+        both = differentiated(motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check)(more)
+        found, d = (Found(*(part[half] for part in both[:4]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
+        return found, d._replace(rest=jnp.zeros_like(found.rest))
+
+    return own
+
+
+def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
+    """Return the form and the start with these tangents added."""
+    every = (tuple(range(len(start.known[0]))), *form.moving)
+    moves = [[not is_zero(dx) for dx in part] for part in along.known]
+    moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))
+    known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
+    more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
+    return replace(form, moving=(*form.moving, *moving)), more

@@ -1,0 +1,264 @@
+"""Record of the steps of a motion for reverse mode (`adjoint.py`): one slot per trial
+step, for all lanes of a block.
+
+The memory of the model, shared by all threads, limits the number of slots; on a CPU the record
+grows up to this limit. If a motion takes more steps, its lanes run forward again for each window of
+slots, the last window first.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jourdain_jax.integrate.event_search import LOCATING, RUNNING
+from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.implicit_steps import ImplicitMethod
+from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, copied, each_row, room_of_lanes
+from jourdain_jax.integrate.loop.loop import COUNT, NEXT, OWN, STARTS, TIMES
+from jourdain_jax.kernels.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, of_lane, taken_in
+from jourdain_jax.kernels.ir import Value
+
+TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
+
+
+class Slot(NamedTuple):
+    """Rows of a slot: the state, its derivatives, and finally the rows of a transition; `all`: their number.
+    """
+
+    y: int
+    t: int
+    taken: int
+    saved: int
+    left: int
+    all: int
+
+    @staticmethod
+    def of(form: Form, method: Method | ImplicitMethod) -> "Slot":
+        y = form.integrated
+        t = y * (1 + method.needed)
+        return Slot(y, t, t + 1, t + 2, t + 3, t + 3 + len(form.rows.get("left", ())))
+
+
+class _Rooms(NamedTuple):
+    """Memory of a block: for each lane the index in the batch, the number of saved times and its
+    cotangents; the number of slots used.
+    """
+
+    state: Value
+    who: Value
+    saved: Value
+    g: Value
+    by_known: Value
+    tries: Value
+
+    @staticmethod
+    def of(w: MachineWriter, form: Form, asked: int) -> "_Rooms":
+        state, rows = room_of_lanes(w, form), (form.integrated, max(asked, 1))
+        g, by_known = (w.room(count) for count in rows)
+        return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
+
+
+class _Places(NamedTuple):
+    """Locations of slots; each function takes the index of a trial step."""
+
+    slots: Value  # number of slots
+    free: Callable[[Value], Value]  # where to write the slot
+    keep: Callable[[Value], None]  # to be called afterwards
+    kept: Callable[[Value], Value]  # where to read the slot
+    lost: Callable[[], Value]  # whether memory is exhausted
+
+
+def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
+    """Write, inside a function, the forward and backward passes of all lanes until no sample is left."""
+    slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
+    lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
+    places = _on_gpu(w, slot, job) if w.device else _on_cpu(w, slot, memory)
+    with w.repeated() as leave:
+        leave(~w.together(lanes_taken(w, job, NEXT) < w.load(job, COUNT, "i64")) | places.lost())
+        _take(w, job, rooms.who)
+        w.store(w.literal(2**62, "i64"), end)
+        with w.repeated() as done:
+            _write_start(w, form, job, rooms)
+            with w.repeated() as ended:
+                code, number = lanes["code"], w.load(count, type="i64")
+                on_its_way = w.any(code.equals(RUNNING) | code.equals(LOCATING))
+                ended(~w.together(on_its_way & (number < w.load(end, type="i64"))))
+                here = places.free(number)
+                ended(places.lost())
+                _write_try(w, form, slot, job, rooms, here)
+                places.keep(number)
+            done(places.lost())
+            with w.when(w.load(end, type="i64").equals(2**62)):
+                _write_ends(w, form, asked, job, rooms)
+            first = w.load(count, type="i64") - places.slots
+            w.store(w.where(first > 0, first, 0), end)
+            with w.repeated() as at_start:
+                number = w.load(count, type="i64") - 1
+                at_start(~w.together(number >= w.load(end, type="i64")))
+                _write_try_back(w, form, slot, job, rooms, places.kept(number))
+            done(~w.together(w.load(end, type="i64") > 0))
+        leave(places.lost())
+        _write_found(w, form, asked, job, rooms)
+    if not w.device:
+        with w.when(places.lost()):
+            _give_nan(w, form, asked, job, rooms.who)
+        w.external("free", "void", places.kept(w.literal(0, "i64")))
+
+
+def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
+    """Write the parts of the module that a record of this size in bytes needs."""
+    if w.device:
+        w.scratch = Slot.of(form, method).all, memory
+    else:
+        _write_more_room(w)
+
+
+def _write_more_room(w: MachineWriter) -> None:
+    """Write `more_room(old, bytes)`: allocate twice as many bytes and copy the old content. The result
+    is null if there is no memory.
+    """
+    with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
+        new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
+        there = w.converted("ptrtoint", new, "i64").differs(0)
+        with w.when(there):
+            w.external("memcpy", "ptr", new, old, size)
+        w.external("free", "void", old)
+        w.give(new)
+
+
+def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
+    """Return slots that fit into a third of each thread's memory. While the record
+    doubles, the old one still exists.
+    """
+    size = slot.all * w.lanes * 8
+    most = max(memory // (3 * size * w.threads), 1)
+    # memory for 64 slots at first, then doubled
+    slots, first = w.literal(most, "i64"), w.literal(min(64, most) * size, "i64")
+    record, bytes_there = w.room(type="ptr"), w.room(type="i64")
+    w.store(first, bytes_there)
+    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), first), record)
+
+    def kept(number: Value) -> Value:
+        return w.at(w.load(record, type="ptr"), w.binary("srem", number, slots) * slot.all)
+
+    def free(number: Value) -> Value:
+        with w.when((number < slots) & ((number + 1) * size > w.load(bytes_there, type="i64"))):
+            w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
+            w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
+        return kept(number)
+
+    return _Places(slots, free, lambda number: None, kept, lambda: w.converted("ptrtoint", w.load(record, type="ptr"), "i64").equals(0))
+
+
+def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
+    """Return slots that fit into a thread's memory. The numbers of neighbouring threads are interleaved."""
+    here, (thread, threads) = w.room(slot.all), w.thread()
+    record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
+    slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
+
+    def place(number: Value, row: int | Value) -> Value:
+        return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads)
+
+    def keep(number: Value) -> None:
+        w.each(range(slot.all), lambda row: w.store(w.load(here, row), place(number, row)))
+
+    def kept(number: Value) -> Value:
+        w.each(range(slot.all), lambda row: w.store(w.load(place(number, row)), here, row))
+        return here
+
+    return _Places(slots, lambda number: here, keep, kept, lambda: w.literal(0, "i1"))
+
+
+def _take(w: MachineWriter, job: Value, who: Value) -> None:
+    """Take the next samples of the batch into `who`; -1 if there is none."""
+    with w.each_lane() as lane:
+        number = next_lane(w, job, NEXT)
+        w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
+
+
+def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> None:
+    """Set all lanes to their starts."""
+    with w.counted(form.all) as row:
+        w.store(1.0, rooms.state, row)
+    with w.each_lane() as lane:
+        w.run("begin", job, rooms.state, rooms.who, lane)
+    w.store(0.0, rooms.saved)
+    w.run("note", job, rooms.state, rooms.who, rooms.saved)
+    w.store(w.literal(0, "i64"), rooms.tries)
+
+
+def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+    """Write a trial step and its slot `here`."""
+    lanes = Lanes(w, form, rooms.state)
+    copied(w, form.integrated, rooms.state, here)
+    w.store(lanes["t"], here, slot.t)
+    w.store(w.load(rooms.saved), here, slot.saved)
+    w.run("step", rooms.state, w.at(here, slot.y))
+    w.store(lanes["taken"], here, slot.taken)
+    if form.goes_on:
+        copied(w, len(form.rows["left"]), w.at(rooms.state, form.rows["left"].start), w.at(here, slot.left))
+    w.run("note", job, rooms.state, rooms.who, rooms.saved)
+    w.store(w.load(rooms.tries, type="i64") + 1, rooms.tries)
+
+
+def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+    """Initialise the cotangents with the cotangents of the end states of a block."""
+    g = rooms.g
+    each_row(w, asked, rooms.by_known, lambda i: 0.0)
+    each_row(w, form.integrated, g, lambda i: 0.0)
+    ends = w.load(job, TO_ENDS, "ptr")
+    with w.each_lane() as lane:
+        number = w.load(rooms.who, lane, "i64")
+        with w.when(number >= 0):
+            taken_in(
+                w, form.integrated, of_lane(w, ends, w.load(job, COUNT, "i64"), form.ends, number), g, lane
+            )
+    # unreached times repeat the last state
+    all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
+    w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
+    if form.has_events:
+        w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
+
+
+def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+    """Go back over the trial step in a slot."""
+    before = w.load(here, slot.saved)
+    w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
+    w.store(before, rooms.saved)
+    if form.goes_on:
+        with w.when(w.any(w.load(here, slot.left).differs(0.0))):
+            w.run("reset_back", job, rooms.state, rooms.who, w.at(here, slot.left), rooms.g, rooms.by_known)
+    with w.when(w.any(w.load(here, slot.taken).differs(0.0))):
+        w.run("step_back", rooms.state, here, rooms.g, rooms.by_known)
+    w.store(w.load(rooms.tries, type="i64") - 1, rooms.tries)
+
+
+def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+    """Write the results of a block."""
+    g = rooms.g
+    w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
+    found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
+    with w.each_lane() as lane:
+        number = w.load(rooms.who, lane, "i64")
+        with w.when(number >= 0):
+            numbers = of_lane(w, found, w.load(job, COUNT, "i64"), each, number)
+            handed_out(w, form.integrated, g, lane, numbers)
+            handed_out(w, asked, rooms.by_known, lane, numbers.after(form.integrated))
+
+
+def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:
+    """Return NaN for this block and all remaining samples, because memory is exhausted."""
+    found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
+
+    def lost(number: Value) -> None:
+        with w.counted(each) as row:
+            w.store(w.literal(math.nan, "double"), found, number * each + row)
+
+    with w.each_lane() as lane:
+        number = w.load(who, lane, "i64")
+        with w.when(number >= 0):
+            lost(number)
+    with w.repeated() as leave:
+        number = next_lane(w, job, NEXT)
+        leave(number >= w.load(job, COUNT, "i64"))
+        lost(number)

@@ -1,0 +1,106 @@
+"""Inputs that are functions of time, on the scalar graph: their substitution into a program, and their jumps.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, TimeProgram
+from jourdain_jax.lowering.lowered_equations import NODES, Lowered
+from jourdain_jax.lowering.relations import jumps, sided, switches
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+from jourdain_jax.structure.trace import Variables
+
+# limit per function of time; each number is a row of a lane, so use `jj.Sampled` for long tables
+MOST_NUMBERS = 200
+
+
+def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
+    """Return the program with functions of time substituted, or why that is not possible."""
+    if not inputs.programs:
+        return program
+    return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
+
+
+@lru_cache(maxsize=64)
+def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
+    """Return the program with these functions substituted for inputs, or why that is not possible. Their
+    numbers come last among the `fixed` ones.
+    """
+    numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
+    if numbers > MOST_NUMBERS:
+        return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
+    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
+        return "the scene keeps parts as calls, and an input is a function of time"
+    graph = Graph(keeps_rules=True)
+    new = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
+    t, known = new[program.traced.t], []
+    try:
+        for node, function in zip(program.traced.inputs.tolist(), functions, strict=True):
+            if function is not None:
+                own, new[node] = _on_graph(graph, function, t, f"{node}")
+                known += own
+    except (Unsupported, ValueError) as error:
+        return f"an input is a function of time without scalar form ({error})"
+    nodes = {name: getattr(program, name) for name in NODES}
+    of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
+    by_functions = switches(graph, of_functions)
+    probes = _random(graph, [*by_functions, *of_functions])
+    go_on = sided(graph, by_functions, of_functions, probes)
+    new = graph.copied([program.power, *(n for part in nodes.values() for n in part)], program.graph, new)
+    on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
+    on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
+    on_it["sided"] += go_on
+    on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
+    stays = [i for i, function in enumerate(functions) if function is None]
+    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are not variables
+    q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
+    return replace(
+        program,
+        traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
+        inputs=tuple(program.inputs[i] for i in stays),
+        fixed=(*(new[n] for n in program.fixed), *known),
+        power=new[program.power],
+        **on_it,
+        z=(),  # quantities of saved states are computed from the values of inputs
+    )
+
+
+def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
+    """Return random times and numbers for functions."""
+    generator = np.random.default_rng(11)
+    # states used to detect jumps of functions
+    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
+
+
+def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[list[int], int]:
+    """Return the nodes of a function's numbers, and the node of its value at time t."""
+    given = [
+        [graph.input(f"{name} {k} {i}", True) for i in range(math.prod(shape))]
+        for k, shape in enumerate(function.shapes)
+    ]
+    arguments = [Nodes(np.reshape(part, shape)) for part, shape in zip(given, function.shapes, strict=True)]
+    value = interpret(graph, function.closed, [*arguments, Nodes(t)])[0]
+    return [n for part in given for n in part], int(as_nodes(graph, value))
+
+
+def may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
+    """Return whether a function of time jumps. With `varies`, count only jumps at times that
+    depend on one of these numbers.
+    """
+    graph = Graph(keeps_rules=True)
+    try:
+        numbers, value = _on_graph(graph, function, graph.input("t", True), "")
+    except (Unsupported, ValueError):
+        return False
+    places = list(switches(graph, [value]))
+    found = jumps(graph, places, [value], _random(graph, [*places, value])) if places else ()
+    moving = [n for n, moves in zip(numbers, varies, strict=True) if moves] if varies is not None else None
+    return bool(found) and (moving is None or any(depend_on(graph, found, moving)))

@@ -1,0 +1,373 @@
+"""Modules of LLVM IR as functions of JAX; with them, values of graph nodes and quantities
+outside the steps of a motion.
+
+Arguments have no batch axis; under `vmap` the whole batch goes to one call. Many lanes run in
+the widest registers; a single one runs in narrow registers, whose instructions are faster.
+Results do not depend on the width.
+
+    o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
+
+Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
+programs that are too large, JAX differentiates the program run by XLA.
+
+Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies at
+saved states. XLA computes speeds of few operations (`lowering/lowered_equations.py`). Machine code saves XLA's tracing
+and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.interpreters import batching, mlir
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
+from jourdain_jax.calculus.markers import entries_of, lanes_of
+from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
+from jourdain_jax.integrate.loop.lanes import MachineWriter
+from jourdain_jax.integrate.loop.operands import Operands
+from jourdain_jax.kernels import ffi, gpu, host, nvidia
+from jourdain_jax.kernels.ffi import write_rows
+from jourdain_jax.kernels.scalar_program import as_real, unsupported, written_in_turn
+from jourdain_jax.lowering.lowered_equations import Lowered, smallest_pivot
+from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.row_program import RowProgram
+
+
+def called(
+    write: Callable[[MachineWriter], None],
+    shapes: Callable,
+    of_samples: int = 0,
+    effort: int = 2,
+    constant: Mapping[int, float] | None = None,
+) -> Callable:
+    """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: returns the
+    shapes of results for arguments.
+
+    The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. If some rows
+    of a start are `constant`, one more argument holds all the others: vectors of the state, then numbers.
+    """
+
+    @cache
+    def handler(lanes: int, threads: int) -> str:
+        w = MachineWriter(lanes, host.fuses(), threads)
+        write(w)
+        return ffi.registered(w.text, effort)
+
+    @cache
+    def kernel(shared: tuple[bool, ...]) -> gpu.Kernel:
+        w = MachineWriter(1, True, device=True)
+        w.common = shared
+        write(w)
+        return gpu.registered(w.text, w.scratch)
+
+    def call(lanes: int, threads: int, batch: tuple[int, ...], ranks: tuple[int, ...], arguments: tuple):
+        others = len(arguments) - of_samples - (constant is not None)
+        operands = Operands(batch, ranks, of_samples, others, tuple((constant or {}).items()))
+        how = {
+            "handler": handler,
+            "kernel": kernel,
+            "lanes": lanes,
+            "threads": threads,
+            "shapes": shapes,
+            "operands": operands,
+        }
+        return tuple(_call_p.bind(*jax.tree.leaves(arguments), **how))
+
+    @jax.custom_batching.custom_vmap
+    def run(*arguments):
+        # 2 lanes for a single motion; measured: 64 us with 2, 66 with 1 or 4, 99 with
+        # 8 (10 s of a disc at 1e-8)
+        return call(2, 1, (), tuple(map(jnp.ndim, jax.tree.leaves(arguments))), arguments)
+
+    @run.def_vmap
+    def run_many(count, batched: list[bool], *arguments):
+        ranks = tuple(
+            x.ndim - has_axis for x, has_axis in zip(*map(jax.tree.leaves, (arguments, batched)), strict=True)
+        )
+        found = call(host.lanes(), host.threads(), (count,), ranks, arguments)
+        return found, (True,) * len(found)
+
+    return run
+
+
+def _results(*arguments, shapes: Callable, operands: Operands, **_) -> list:
+    return [
+        arguments[-1].update(shape=(*operands.batch, *shape), weak_type=False) for shape in shapes(*arguments)
+    ]
+
+
+def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
+    """Return the call with one more leading batch axis; operands without batch axes stay so."""
+    count, every = lanes_of(values, axes), []
+    for x, axis, rank in zip(values, axes, operands.ranks, strict=True):
+        has_lanes = x.ndim - (axis is not None) > rank
+        if axis is not None:
+            x = jnp.moveaxis(x, axis, 0)
+            x = x if has_lanes else jnp.expand_dims(x, tuple(range(1, 1 + len(operands.batch))))
+        every.append(jnp.broadcast_to(x, (count, *x.shape)) if axis is None and has_lanes else x)
+    found = _call_p.bind(*every, operands=operands._replace(batch=(count, *operands.batch)), **how)
+    return found, [0] * len(found)
+
+
+def _made(
+    ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
+) -> tuple[mlir.LoweringRuleContext, Sequence]:
+    """Return the operands that `make` computes from operands of a call, and the context for a call with them.
+    """
+    made = jax.make_jaxpr(make)(*ctx.avals_in)
+    lower = mlir.lower_fun(jaxpr_as_fun(made))
+    return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)
+
+
+def on_cpu(
+    ctx: mlir.LoweringRuleContext,
+    *values,
+    handler: Callable,
+    lanes: int,
+    threads: int,
+    operands: Operands,
+    **_,
+):
+    """Return the call in a program for the CPU."""
+    _check_here(ctx)
+    ctx, arguments = _made(ctx, values, operands.side_by_side)
+    return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
+
+
+def _on_nvidia(ctx: mlir.LoweringRuleContext, *values, kernel: Callable, operands: Operands, **_):
+    """Return the call in a program for an NVIDIA GPU."""
+    _check_here(ctx)
+    if reason := nvidia.reason_against():
+        raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
+    own = kernel(operands.shared(ctx.avals_in))
+    ctx, arguments = _made(ctx, values, operands.given_once)
+    return gpu.lowered(ctx, arguments, own, operands.batch, operands.samples)
+
+
+def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
+    """Raise the error for programs on any other device."""
+    raise OtherDeviceError(f"for JAX's platforms {', '.join(ctx.module_context.platforms)}")
+
+
+def _check_here(ctx: mlir.LoweringRuleContext) -> None:
+    """Raise an error for a program that may run in another process."""
+    if ctx.module_context.lowering_parameters.for_export:
+        raise OtherDeviceError("to be exported")
+    if len(ctx.module_context.platforms) > 1:
+        _nowhere(ctx)
+
+
+# The call itself: machine code is compiled when a program that contains it is lowered,
+# not when it is only traced.
+_call_p = Primitive("jourdain_machine_code")
+_call_p.multiple_results = True
+_HOW = "handler", "kernel", "lanes", "threads", "shapes", "operands"
+_call_p.def_impl(jax.jit(lambda *arguments, **how: _call_p.bind(*arguments, **how), static_argnames=_HOW))
+_call_p.def_abstract_eval(_results)
+mlir.register_lowering(_call_p, _nowhere)
+mlir.register_lowering(_call_p, on_cpu, platform="cpu")
+mlir.register_lowering(_call_p, _on_nvidia, platform="cuda")
+batching.primitive_batchers[_call_p] = _more_lanes
+
+
+def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
+    """Return values of nodes of a graph as a function of the values of the variables."""
+
+    def write(w: MachineWriter) -> None:
+        with w.procedure("row", "state found") as (state, found):
+            known = {n: w.load(state, k) for k, n in enumerate(variables)}
+            for k, value in written_in_turn(w, graph, nodes, known):
+                w.store(as_real(w, value), found, k)
+        write_rows(w, len(variables), len(nodes))
+
+    kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
+    return lambda x: kernel(x)[0]
+
+
+def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Return values of nodes as a function of the values of the variables. Structural zeros cost nothing."""
+    graph, nodes, variables = on_its_own(graph, nodes, variables)
+    by_xla, by_machine_code = _both(graph, nodes, variables)
+    there = np.flatnonzero([n != graph.zero for n in nodes])
+
+    @cache
+    def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
+        """Return the derivative as a function of the concatenation of x, v or g, and w; None if it is too
+        large or without machine code.
+        """
+        weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
+        w = [graph.input(f"w {i}", True) for i in range(len(variables))]
+
+        def along(nodes, direction: list[int]) -> list[int]:
+            return derivatives(graph, nodes, dict(zip(variables, direction, strict=True)))
+
+        try:
+            first = along(nodes, w) if order == 2 else nodes
+            found = cotangents(graph, [first[i] for i in there], weights, variables) if back else along(first, weights)
+        except Unsupported:
+            return None
+        # limit on operations; machine code of this size takes 1.4 MB of stack and 0.3 s to compile
+        if unsupported(graph, found) or graph.operations(found) > 40_000:
+            return None
+        return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
+
+    def linear(back: bool) -> Callable[[Array, Array], Array]:
+        """Return a function of x and v, or with `back` of x and g; its derivative along x
+        is machine code if possible.
+        """
+
+        def taken(v):
+            return v[there] if back else v
+
+        @jax.custom_jvp
+        def first(x, v):
+            if (by_graph := derivative(back, 1)) is not None:
+                return by_graph(jnp.concatenate([x, taken(v)]))
+            return jax.vjp(by_xla, x)[1](v)[0] if back else jax.jvp(by_xla, (x,), (v,))[1]
+
+        @partial(first.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (x, v), (dx, dv) = at, tangents
+            found, second = first(x, v), None if is_zero(dx) else derivative(back, 2)
+            if not is_zero(dx) and second is None:
+                return jax.jvp(first.fun, at, (dx, filled(dv)))
+            rates = [] if is_zero(dv) else [first(x, dv)]
+            rates += [second(jnp.concatenate([x, taken(v), dx]))] if second else []
+            return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
+
+        return first
+
+    along, back = linear(False), linear(True)
+
+    def push(arguments, tangents):
+        return values(*arguments), along(*arguments, *tangents)
+
+    def pull(perturbed, arguments, found, g):
+        return (back(*arguments, g),)
+
+    values = with_rules(by_machine_code, Rules(push, pull))
+    return values
+
+
+def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
+    """Return values of nodes as a function of the values of the variables, by XLA and by
+    machine code. Machine code returns only the nonzero numbers, because the whole matrix of 32
+    trailers would not fit on its stack.
+    """
+    number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
+    which = np.array([number.get(n, len(number)) for n in nodes], int)
+    in_order = bool(number) and np.array_equal(which, np.arange(len(number)))
+    kernel = nodes_called(graph, list(number), variables, effort=0)
+
+    def placed(found, x):
+        return found if in_order else jnp.append(found, jnp.zeros((), x.dtype))[which]
+
+    def by_xla(x):
+        found = [jnp.asarray(value, x.dtype) for value in run(graph, list(number), dict(zip(variables, x, strict=True)))]
+        return placed(jnp.stack(found) if found else x[:0], x)
+
+    return by_xla, lambda x: placed(kernel(x), x)
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Machine code for quantities outside the steps of a program: functions of fixed values, time,
+    coordinates, independent speeds and inputs.
+    """
+
+    program: Lowered
+    needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
+    fixed: Callable[[Array], Array]  # function of those entries
+    speeds: Callable[..., Array] | None  # all speeds; None if XLA is faster
+    numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
+    at_start: Callable[..., Array]  # `Lowered.at_start`
+
+    def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
+        """Return the values of `Lowered.fixed_values`."""
+        parameters = entries(scene, self.needed)
+        if not self.program.fixed or not parameters:  # nothing to pass, or nothing requested
+            return self.program.fixed_values(scene)
+        return entries_of(self.fixed(jnp.concatenate(parameters)))
+
+    def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Speeds, Scalar]:
+        """Return the values of `Lowered.speeds_and_pivot`."""
+        of = self.speeds or self.program.all_speeds
+        return of(fixed, t, q, y, inputs), smallest_pivot(self.numbers(fixed, t, q, y, inputs)[:-2])
+
+    def energies_at(self, *state) -> Float[Array, "2"]:
+        """Return the values of `Lowered.energies_at`."""
+        return self.numbers(*state)[-2:]
+
+
+@lru_cache(maxsize=64)
+def beside(program: Lowered) -> Beside | None:
+    """Return the machine code outside the steps of a program; None if it cannot be compiled."""
+    graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
+    # limit of 60_000 operations
+    if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
+        return None
+    used = set(graph.reachable(program.fixed))
+    needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
+    given = [n for leaf in needed for n in leaf if n >= 0]
+    numbers, speeds = _at_state(program, [*program.pivots, *program.energies], nodes_called), None
+    # Operations from which speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers
+    # (228 operations) 0.69 and 0.54, of 16 (436) 2.6 and 1.8, whose derivatives compile in 13 and 6 s; 256
+    # bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of 4 trailers (124) 44 and 39, their
+    # gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
+    if program.graph.operations(program.z) >= 100:
+        every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
+        speeds = _at_state(program, [every[i] for i in np.argsort([*program.independent, *program.dependent])], values_of_nodes)
+    return Beside(
+        program,
+        needed,
+        values_of_nodes(graph, program.fixed, given),
+        speeds,
+        lambda *state: numbers(*jax.lax.stop_gradient(state)),
+        _at_state(program, program.at_start, values_of_nodes),
+    )
+
+
+def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
+    """Return machine code of nodes, which takes only the fixed numbers that it needs."""
+    used = set(program.graph.reachable(nodes))
+    which = [k for k, n in enumerate(program.fixed) if n in used]
+    run = function(program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]])
+
+    def values(fixed, t, q, y, inputs) -> Float[Array, "nodes"]:
+        known = jnp.stack([*(fixed[k] for k in which), t])
+        return run(jnp.concatenate([jnp.asarray(x, real_type()) for x in (known, q, y, inputs)]))
+
+    return values
+
+
+def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
+    """Return the entries of a scene's parameters that have a node; `nodes`: the node of each
+    entry of each leaf, -1 for none.
+    """
+    found = []
+    for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
+        needed = np.flatnonzero(np.ravel(np.asarray(of_leaf, int)) >= 0)
+        if needed.size:
+            flat = jnp.reshape(jnp.asarray(leaf, real_type()), (-1,))
+            found.append(flat if needed.size == flat.shape[0] else flat[needed])
+    return found
+
+
+def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
+    """Return whether parameters, and the bodies and contacts that depend on them, are valid as defined by
+    `parameter_faults` and `faults_at`.
+    """
+    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs, others]
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    given = [*parameters, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    run = nodes_called(program.graph, [program.right], given)
+    return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0

@@ -1,0 +1,279 @@
+"""This package's loop over steps as an integrator with derivatives: by machine code if possible, otherwise in
+JAX, where batches of a scalar program run in blocks of `width` samples.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import compress
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, pushed_by_jax, with_rules
+from jourdain_jax.calculus.reals import Indices, is_traced
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.arrays import array_motion as on_arrays
+from jourdain_jax.integrate.arrays.array_functions import joined
+from jourdain_jax.integrate.arrays.array_loop import Loop
+from jourdain_jax.integrate.explicit_steps import Method, method_of
+from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
+from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
+from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.loop.handover import Start
+from jourdain_jax.integrate.loop.lanes import Form
+from jourdain_jax.integrate.loop.loop import OF_SAMPLES, flow
+from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
+from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
+from jourdain_jax.integrate.loop.time_functions import driven, may_jump
+from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
+from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
+from jourdain_jax.lowering.lowered_equations import Lowered
+from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.lowering.sides import with_sides
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.graph import ARRAYS
+from jourdain_jax.scene.scene import Scene
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class OwnSteps(Integrator):
+    """This package's loop over steps, by a Runge-Kutta tableau, an implicit method or Taylor series."""
+
+    solver: Method | ImplicitMethod
+    alongside: bool  # whether one run gives values and tangents, for `jvp` and `jacfwd` only
+    max_steps: int
+    event_names: tuple[str, ...]
+    native: bool  # whether machine code may integrate
+    order: int | None  # order of the Taylor series, which machine code uses instead of the solver's tableau
+    memory: int  # limit in bytes for the record of reverse mode
+    most: int  # maximum number of events after which a motion continues
+    stopping: bool  # whether other events end it
+    own: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        return self.solver.name if self.order is None else "Taylor"
+
+    def reason_against_machine_code(self, setup: Setup) -> str:
+        if not self.native:
+            return "another backend was requested"
+        if not isinstance(self.solver, Method):
+            return "the solver is implicit"
+        return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
+
+    def solved(self, setup: Setup, begun: Begun) -> Solved:
+        if setup.reason_against_machine_code:
+            run, pull, mover, reason = self._on_arrays, self._pulled_on_arrays, on_arrays.mover, lambda: SECOND_ORDER_MESSAGE
+        else:
+            form = self._form(setup)
+            run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)
+            reason = lambda: reason_against_derivatives(form, 2)  # noqa: E731
+        rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
+        run = run if self.alongside else with_rules(run, rules)
+        return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
+
+    def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
+        """Return the loop in JAX, its arguments, and the number of samples per block."""
+        program = setup.field.lowered
+        at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
+        return *on_arrays.loop_of(self.solver, setup, begun, self._events(setup)), at_once
+
+    def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
+        of, start, at_once = self._loop(setup, begun)
+        return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
+
+    def _pulled_on_arrays(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
+        """Return cotangents of varying values from the cotangents of the motion."""
+        setup, begun = arguments
+        of, start, at_once = self._loop(setup, begun)
+        varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
+        asked = tuple(i for i, v in enumerate(varies) if v)
+        states = native_motion.cotangents_of_states(g)
+        ends = g.y_end.rows, g.t_end, g.passed.ts[: of.form.transitions]
+        by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, *ends)
+        args = joined(of.rest, [dict(zip(asked, by_known, strict=True)).get(i) for i in range(len(varies))])
+        return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
+
+    def _form(self, setup: Setup) -> Form:
+        return native_motion.form_of(setup.field, setup.inputs, **self._events(setup))
+
+    def _events(self, setup: Setup) -> dict[str, Any]:
+        sides = setup.field.lowered.sides if setup.field.lowered else ()
+        return {"has_events": bool(self.event_names or sides), "most": self.most, "stopping": self.stopping}
+
+    def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
+        form, start = self._form(setup), native_motion.start_of(setup, begun)
+        assert isinstance(self.solver, Method)
+        return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
+
+    def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
+        """Return cotangents of varying values from the cotangents of the motion."""
+        setup, begun = arguments
+        sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
+        if any(jax.tree.leaves(sampled)):
+            raise DifferentiationModeError(OF_SAMPLES)
+        asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
+        assert isinstance(self.solver, Method)
+        start = native_motion.start_of(setup, begun)
+        by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, start, asked, self.memory, g)
+
+        def args(by_args: tuple) -> tuple:
+            field, scene, inputs, fixed, origin = by_args
+            return field, scene, native_motion.with_known(inputs, by_known[len(fixed) :]), tuple(by_known[: len(fixed)]), origin
+
+        return _by_start(perturbed, arguments, by_start, args)
+
+
+def _by_start(perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]) -> tuple:
+    """Return cotangents of a setup and of its start from the cotangents of the state
+    and of the rates' arguments.
+    """
+    by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments)
+    return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None)
+
+
+def own_steps(solver, **static) -> OwnSteps | None:
+    """Return this package's loop if it supports the solver, otherwise None (use diffrax)."""
+    method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
+    if method is None:
+        return None
+    if isinstance(method, FixedStepMethod):
+        # another step size needs no other program
+        method = eqx.tree_at(lambda method: method.step, method, None)
+    return OwnSteps(method, **static)
+
+
+def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
+    """Return the motion of `run`, whose times have no derivatives, with start and saved states shifted to the
+    setup's times so that they have derivatives.
+
+    A reached time equals its goal; the loop itself gives the time of a stop event. A time that was not
+    reached keeps its distance from the start.
+    """
+    numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
+    goals, later = setup.goals(setup.ts), start - numbers(start)
+    y0 = mover(begun.args)(begun.y0, start, -later)
+    times = begun.plain.times if begun.plain else {name: getattr(setup, name) for name in ("ts", "t0", "t1")}
+    setup = setup._replace(**jax.tree.map(numbers, times))
+    found = run(
+        setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, setup.t0)))
+    )
+    passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
+    transitions = passed.times(numbers(start), setup.ts, number[:-1], direction)
+    moved = mover((field, scene, in_phases(inputs, transitions, passed.modes, direction), fixed, start))
+    event = (found.code == result_codes.EVENT) & (found.accepted > 0)
+    t_end = numbers(found.t_end)
+    by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))
+    by = jnp.where(by_goal, goals - number + later, jnp.where(event, 0.0, later))
+    at = numbers(start) + jnp.where(by_goal, number, t_end)
+    return eqx.tree_at(
+        lambda s: (s.ts, s.ys, s.y_end, s.t_end, s.passed.ts),
+        found,
+        (
+            goals[:-1],
+            jax.vmap(moved)(found.ys, at[:-1], by[:-1]),
+            moved(found.y_end, at[-1], by[-1]),
+            found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
+            passed.ts - later,
+        ),
+    )
+
+
+def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
+    """Return the motion with a mode and an event for each relation (`lowering/sides.py`), and with functions
+    of time merged into its program.
+    """
+    field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
+    if _reason_against_sides(setup) or not isinstance(field, ByProgram):
+        return setup, begun
+    has_events = bool(setup.integrator.event_names)
+    program, numbers = _relations(field.program, inputs, has_events)
+    if not numbers:
+        return setup, begun
+    if program is not field.program:
+        functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
+        fixed += tuple(jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel))
+        inputs = Inputs(tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)))
+    program = with_sides(program, has_events, native_motion.modes_among(inputs))
+    inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * len(program.sides)))
+    field = replace(field, program=program, stops=program.stops)
+    setup = setup._replace(field=field, inputs=inputs)
+    return setup, eqx.tree_at(lambda b: b.args, begun, (field, scene, inputs, fixed, origin))
+
+
+def reason_against_watching(setup: Setup) -> str:
+    """Return why steps do not monitor all relations of a scene's loads or stop events; empty if they do, or
+    there are none. JAX calls may hide some.
+    """
+    program = setup.field.lowered
+    hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
+    return _reason_against_sides(setup) or ("the scene keeps parts as calls" if hides else "")
+
+
+def _reason_against_sides(setup: Setup) -> str:
+    """Return why steps do not monitor the relations of the scalar program; empty
+    if they do, or there are none.
+    """
+    if setup.field.lowered is None:
+        jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
+        return "the scene has no scalar program" if jump else ""
+    program, numbers = _relations(setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names))
+    if not numbers:
+        return ""
+    if not setup.integrator.own:
+        return "solvers of diffrax do not"
+    if getattr(setup.integrator.solver, "even", False):
+        return "fixed-step methods do not"
+    if has_events and not setup.field.lowers_events:
+        return "an event has no scalar form"
+    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
+        return "the scene keeps parts as calls"
+    sampled = [n for n, channel in zip(program.traced.inputs.tolist(), others_of(setup.inputs), strict=True) if isinstance(channel, Sampled)]
+    if set(sampled) & set(program.graph.reachable(numbers)):
+        return "one depends on samples"
+    return f"they are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
+
+
+def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
+    """Return whether rates may jump at a time whose derivatives are neglected: a time that
+    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`:
+    whether steps end at relations.
+    """
+    traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
+    if field.lowered is None:
+        functions = [(x.program, numbers_of(y)) for x, y in zip(inputs.channels, traced, strict=True) if isinstance(x, FunctionOfTime)]
+        return loads_may_jump(scene) or any(may_jump(program, varies) for program, varies in functions)
+    program, _ = _relations(field.lowered, inputs, False)
+    left_out = [n for n in program.jumps if not watched or n not in program.sided]
+    if not left_out:
+        return False
+    lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
+    numbers = [varies for channel in compress(traced, lowered) for varies in numbers_of(channel)]
+    others = [any(jax.tree.leaves(channel)) for channel, is_lowered in zip(traced, lowered, strict=True) if not is_lowered]
+    count = len(program.traced.q) + len(program.independent)
+    varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
+    return any(depend_on(program.graph, left_out, compress(program.variables, varies)))
+
+
+def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, Indices]:
+    """Return the program, with functions of time merged into it, and its relations."""
+    found = driven(program, inputs)
+    program = program if isinstance(found, str) else found
+    return program, program.watched(has_events)
+
+
+def width(program: Lowered) -> int:
+    """Return the number of samples of a lowered scene that run in lockstep.
+
+    A block lasts until its slowest sample ends, and its data should fit a core's fastest cache, so small
+    blocks are best if they have little overhead. On a CPU this is so if XLA compiles the whole loop into one
+    function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise it starts every
+    operation separately, and many samples must share that cost.
+    """
+    # larger loops use too much memory to become one function (the bicycle, with 2016 operations, still does)
+    return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

@@ -1,0 +1,196 @@
+"""Setup of a motion for an integrator, and the results of an integrator.
+
+Integrators use the time since the start, tau = t - t0, because a clock far from zero has few digits;
+time-independent scenes are then equally accurate at any t0. Rates, projection and events receive tau, the
+scene and its inputs t0 + tau.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module, eps_of
+from jourdain_jax.integrate.explicit_steps import Method, diffrax
+from jourdain_jax.integrate.implicit_steps import ImplicitMethod
+from jourdain_jax.integrate.inputs import knots_between
+from jourdain_jax.integrate.state_projection import State, Usual
+from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import Reference
+
+MEMORY = 2**32  # bytes, unless a model sets a limit
+LONGEST = 1 / 16  # default of the longest step, relative to the span
+
+
+class Passed(eqx.Module):
+    """Events after which a motion continued."""
+
+    ts: Float[Entries, "transitions *lanes"]  # since the start; infinite after the last one
+    events: Int[Entries, "transitions *lanes"]
+    lost: Float[Entries, "transitions *lanes"]  # loss of energy, J
+    modes: Float[Entries, "modes transitions *lanes"]  # after each event
+
+    def times(
+        self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
+    ) -> Float[Array, "transitions"]:
+        """Return the times of transitions, rounded consistently with the saved times. `goals` are the saved
+        times `ts` measured from the start; a transition before a goal must also precede its saved time.
+
+        Adding the `origin` to a time since the start may round it onto the wrong side.
+        """
+        if not len(self.ts):
+            return jnp.asarray(self.ts)
+        found = origin + self.ts
+        known = jax.lax.stop_gradient((ts, origin + goals, self.ts, goals, found))
+        ts, also, tau, goals, now = (direction * x for x in known)
+        number = jnp.searchsorted(goals, tau)  # number of saved states before it
+        least = jnp.append(-jnp.inf, jnp.nextafter(jnp.maximum(ts, also), jnp.inf))[number]
+        most = jnp.append(jnp.minimum(ts, also), jnp.inf)[number]
+        return found + direction * (jnp.clip(now, least, most) - now)
+
+
+NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 0)))
+
+
+class Solved(eqx.Module):
+    """Result of an integrator."""
+
+    ts: Float[Array, "times *lanes"]  # since the start, like t_end
+    ys: PyTree
+    reached: Bool[Array, "times *lanes"]
+    t_end: PerLane
+    y_end: PyTree
+    code: Int[Array, "*lanes"]
+    event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    last_step: PerLane  # s, proposed by step-size control for the next step; NaN if unknown
+    # smallest pivot magnitude over all steps, negative after a change of sign; infinite if none was monitored
+    pivot: PerLane
+    crossings: Int[Array, "*lanes"]  # as in `Trajectory`
+    passed: Passed
+
+
+class Integrator(abc.ABC):
+    """Integrator of a motion: this package's steps (`integrate/own_steps.py`) or diffrax
+    (`motion/diffrax_steps.py`).
+
+    Numbers that change with every call are in the `Setup`.
+    """
+
+    max_steps: int
+    event_names: tuple[str, ...]
+    solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
+    own: ClassVar[bool]  # whether steps end at relations, and states are projected onto the constraints
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """Return the name of the solver, as shown in a trajectory."""
+
+    @abc.abstractmethod
+    def reason_against_machine_code(self, setup: "Setup") -> str:
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
+        """
+
+    @abc.abstractmethod
+    def solved(self, setup: "Setup", begun: "Begun") -> Solved:
+        """Return one motion."""
+
+    def lanes_solved(self, setups: "Setup", begun: "Begun") -> Solved:
+        """Return the motions of a batch; all arrays have a leading batch axis."""
+        # hide times shared by all samples from XLA, which otherwise propagates them through diffrax's
+        # `nextafter` one operation per pass
+        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, times)
+        return eqx.filter_vmap(self.solved)(timed, begun)
+
+
+class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes 50 us
+    """Motion to be integrated; in a batch all arrays have a leading batch axis."""
+
+    scene: Scene
+    start: State
+    inputs: PyTree
+    t0: Float[Entries, "*lanes"]
+    t1: Float[Entries, "*lanes"]
+    ts: Float[Entries, "*lanes times"]
+    field: VectorField
+    tolerances: tuple  # rtol, atol
+    dt0: Float[Entries, "*lanes"] | float
+    longest: Float[Entries, "*lanes"] | float  # longest step, s
+    integrator: Integrator
+    usual: Usual | None  # typical sizes for projecting the start; None if it is on its constraints
+    judged: bool  # whether probing has already checked these parameters, at many states
+    reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
+
+    def fitting(self) -> "Setup":
+        """Return the setup with times that any loop accepts: none beyond the end by round-off, and
+        inconsistent ones replaced by a short span.
+        """
+        ts, t0, t1 = self.ts, self.t0, self.t1
+        fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+        inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+        shares = {"ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype), "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
+        # 1e-9 s, for motions that are not requested
+        return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x) for name, x in shares.items()})
+
+    @property
+    def reason_against_machine_code(self) -> str:
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
+        """
+        return self.integrator.reason_against_machine_code(self)
+
+    def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
+        """Return the maximum number of steps, including those forced by sample times of inputs."""
+        return self.integrator.max_steps + (0 if knots is None else len(knots))
+
+    def goals(self, ts) -> Float[Array, "times *lanes"]:
+        """Return the times since the start at which steps must end: the saved times and the end."""
+        return jnp.concatenate([ts, self.t1[None]]) - self.t0
+
+    @property
+    def shortest(self) -> PerLane:
+        """Return the shortest step, s."""
+        return 1e-14 * jnp.abs(self.t1 - self.t0)
+
+    @property
+    def knots(self) -> Float[Array, "knots"] | None:
+        """Return the sample times of inputs at which steps must end, measured from the start."""
+        return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
+
+
+class Plain(NamedTuple):
+    """Numbers of a motion as given: without derivatives, and without a batch axis if all samples share them.
+    """
+
+    times: dict  # as in a `Setup`
+    known: tuple  # `native_motion.known_of`
+
+
+class Begun(eqx.Module):
+    """Start of the integration, marked for the adjoint."""
+
+    right: Flag  # whether parameters, masses and inertias are valid
+    timely: Flag | np.bool_  # whether the times are consistent
+    start: State
+    args: tuple  # vector field, scene, inputs, the scene's fixed values, origin of time
+    y0: Integrated
+    plain: Plain | None = None  # for GPU kernels, which receive shared numbers once
+
+
+def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
+    """Return whether the span is finite and not empty, and the saved times lie in it in
+    order; also for traced times.
+    """
+    xp = array_module((ts, t0, t1))
+    direction = xp.sign(t1 - t0)
+    # times at an end of the span may lie beyond it by four units in the last place
+    slack = 4 * eps_of(ts) * xp.maximum(xp.abs(t0), xp.abs(t1))
+    from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
+    return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)

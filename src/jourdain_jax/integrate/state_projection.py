@@ -1,0 +1,382 @@
+"""Projection of coordinates and speeds onto the constraints, by machine code if possible; otherwise,
+and for derivatives, by XLA.
+
+    g(t, q) = 0,  phi(t, q, u) = 0
+
+With machine code, constraints and mass matrix are functions that JAX can differentiate: a derivative contains
+two calls instead of the traced scene.
+
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
+    d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs
+                                 J: derived on the graph (`integrate/loop/value_kernels.py`)
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.calculus.derivatives import differentiated_as
+from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, rank_cutoff, real_type, static
+from jourdain_jax.calculus.roots import first_root
+from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
+from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.integrate.loop import projection_kernel
+from jourdain_jax.integrate.loop.projection_kernel import Rows, write
+from jourdain_jax.integrate.loop.value_kernels import called, entries, values_of_nodes
+from jourdain_jax.kernels import ffi
+from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.printing import Printed, in_digits
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import coordinate_bounds
+from jourdain_jax.structure.plausibility import elsewhere, faults_at
+from jourdain_jax.structure.probes import coordinates_on_rows
+from jourdain_jax.structure.row_program import RowProgram, row_program
+from jourdain_jax.structure.sampling import NEARLY_INSIDE
+from jourdain_jax.structure.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
+
+OFF = 1e4  # a residual above this many eps is more than round-off
+
+
+class State(Printed, eqx.Module):
+    """State on the constraints, and its distance from the guess; `state["yaw"]`, `print(state)`.
+
+    q and u are in the units of the scene's coordinates and speeds (SI, rad).
+    """
+
+    t: Scalar  # s
+    q: Float[Array, "coordinates"]
+    u: Speeds
+    moved_q: Scalar  # largest change of a coordinate by the projection
+    moved_u: Scalar  # largest change of a speed by the projection
+    residual: Scalar  # remaining residual of constraints and quaternion norms
+    names: tuple[Names, Names] = static()
+    # index of the successful guess: 0, the given values; then others (`start`). A float, so that losses can
+    # be differentiated with respect to a whole state
+    guess: Scalar = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
+
+    def __getitem__(self, name: str):
+        """Return a coordinate, speed, quaternion or angular velocity by name."""
+        coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
+        return coordinates[name] if name in coordinates else speeds[name]
+
+    def __contains__(self, name: str) -> bool:
+        return any(name in names for names in self.names)
+
+    def _text(self) -> str:
+        if self.q.ndim > 1:
+            return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
+        entries, values = (*self.names[0].entries, *self.names[1].entries), in_digits(np.concatenate([self.q, self.u]))
+        pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
+        moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
+        if int(self.guess):
+            moved += f"; from guess {int(self.guess)}: omitted coordinates start elsewhere in the domain, because the reference led to no solution"
+        return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
+
+
+def state_of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> State:
+    """Return a state of a scene before projection."""
+    t, moved_q, moved_u, residual = (jnp.asarray(x, real_type()) for x in (t, moved_q, moved_u, residual))
+    return State(t, q, u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
+
+
+class Usual(eqx.Module):
+    """Typical sizes of constraints and coordinates, and properties of the constraints."""
+
+    closures: Float[Entries, "closures"]
+    # in scaled speeds, or in plain speeds if constraints determine the free speeds
+    rows: Float[Entries, "rows"]
+    width: Float[Entries, "coordinates"]  # of the domain
+    # bounds of coordinates that constraints determine; infinite if unbounded
+    low: Float[Entries, "coordinates"]
+    high: Float[Entries, "coordinates"]
+    affine: bool = static()  # constraints are affine in the speeds
+    determined: bool = static()  # constraints determine the free speeds
+    program: RowProgram | None = static()  # program for projection by machine code; None: use XLA
+
+
+def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
+    """Return the sizes for the parameters of a scene; `determined`: as in `Usual`; `native`: whether
+    machine code may project states.
+    """
+    low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
+    width = np.where(high > low, high - low, 1.0).astype(real_type())
+    program = row_program(scene) if native and not ffi.reason_against() else None
+    try:
+        rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
+        # the stated domain, slightly widened, for coordinates on which constraints depend
+        bounded, more = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries], NEARLY_INSIDE * (high - low)
+        low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
+        affine = structure_whatever_its_faults(scene).affine
+        return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), affine, determined, program)
+    except ValueError:  # the scene is invalid, which is reported when its structure is requested
+        norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
+        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
+
+
+def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+    """Return the coordinates on the geometric constraints nearest to q, and the residual, without repeating
+    the projection if both are `known`.
+    """
+    if usual.program is not None and not usual.program.g:
+        return q, jnp.zeros(0, q.dtype)
+
+    def by_xla(by: RowFunctions, scene, t, q, free, lengths):
+        near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
+        return near_q, by.closures(by.given(scene), t, near_q)[0]
+
+    given = scene, jnp.asarray(t), q, free, usual.closures
+    if known is None:
+        return _by_either(usual, "positions", False, by_xla)(*given)
+
+    def of_known(_, *given):
+        return by_xla(functions_of_rows(usual), *given)
+
+    return differentiated_as(of_known, lambda known, *_: known)(known, *given)
+
+
+def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:
+    """Return the speeds on the velocity constraints nearest to u, and the residual."""
+    affine, determined = usual.affine, usual.determined
+    if usual.program is not None and not usual.program.phi:
+        return u, jnp.zeros(0, u.dtype)
+
+    def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
+        near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by)
+        return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
+
+    kind = "determined speeds" if determined else "speeds"
+    return _by_either(usual, kind, affine or determined, by_xla)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
+
+
+def functions_of_rows(usual: Usual) -> RowFunctions:
+    """Return the constraint functions for projection by XLA, derivatives and searches."""
+    return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
+
+
+def _by_either(usual: Usual, kind, affine: bool, by_xla):
+    of_rows = partial(by_xla, functions_of_rows(usual))
+    if usual.program is None or (rows := Rows(usual.program, kind, affine)).reason_against():
+        return of_rows
+    return differentiated_as(of_rows, partial(_put, rows))
+
+
+@lru_cache(maxsize=64)
+def _kernel(rows: Rows, given_in: np.dtype):
+    count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
+    return called(lambda w: write(w, rows, cutoff), lambda *_: ((count,),), effort=1)
+
+
+def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
+    """Return the projected quantities and the residual, by machine code."""
+    real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
+    found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
+    return found[: len(rows.moving)], found[len(rows.moving) :]
+
+
+class Guess(NamedTuple):
+    """Coordinates and speeds to project, and which of them may change."""
+
+    q: Float[Entries, "coordinates"]
+    u: Float[Entries, "speeds"]
+    free_q: Bool[Entries, "coordinates"]
+    free_u: Bool[Entries, "speeds"]
+    bounded: Bool[Entries, "coordinates"]  # whether it must end inside the scene's stated domain
+    usual: Usual
+
+    def inside(self, q) -> Bool[Array, "coordinates"]:
+        """Return which coordinates are within their bounds."""
+        q = jax.lax.stop_gradient(q)
+        return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
+
+
+def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
+    """Return which of these entries are not held."""
+    return np.array([name not in held for name in names], bool)
+
+
+def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
+    """Project a state as `consistent` does, as a part of a larger compiled function."""
+    every_q, every_u = np.ones(len(start.q), bool), np.ones(len(start.u), bool)
+    return put_onto_constraints(scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
+
+
+def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Flag]:
+    """Project the start onto the constraints; also return whether the position solve converged within the
+    domain. Without `guesses` there is no search.
+
+    The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
+    """
+    given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
+    q = given_q
+    here, at, begin = jax.lax.stop_gradient((scene, t, q))
+    near_q, g = put_positions(here, at, begin, free, usual)
+    arrived, found = _arrived(begin, near_q, g, start), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
+    if guesses is not None and len(usual.closures):
+        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)), lambda: found)
+        better = ~arrived & (left_of(other.g) <= left_of(g))
+        found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
+        q = jnp.where(better & free, found.begin, q)
+    # derivatives of Newton's method from its starting point; without a solution they would diverge
+    near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
+    near_q, guess = jnp.where(found.met, near_q, q), found.guess
+    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
+    left = jnp.concatenate([g, phi])
+    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
+    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
+    names = scene.coordinate_names, scene.speed_names
+    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(right, residual, jnp.inf), names, guess.astype(q.dtype))
+    return state, arrived
+
+
+def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
+    """Return coordinates of the states `elsewhere`, projected onto the geometric constraints; NaN
+    without a solution in the domain.
+
+    `native`: whether machine code may project them.
+    """
+    t, q, u = jax.tree.map(lambda x: jnp.asarray(x, real_type()), elsewhere(scene))
+    if not names_of_position_rows(scene):
+        return q
+    here, usual = jax.lax.stop_gradient(scene), usual_sizes(scene, False, native)
+    every = jnp.ones(q.shape[1], bool)
+
+    def put(state):
+        t, q = state
+        near_q, g = put_positions(here, t, q, every, usual)
+        return jnp.where(_arrived(q, near_q, g, Guess(q, u[0], every, every, every, usual)), near_q, jnp.nan)
+
+    return jax.lax.map(put, (t, q))  # constraints may be callbacks without batching
+
+
+@eval_numpy
+def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
+    """Return for each fault whether a concrete scene has it, at this state or elsewhere."""
+    return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
+
+
+def left_of(g: Float[Array, "closures"]) -> Scalar:
+    """Return the largest significant residual of the geometric constraints. NaN counts as
+    infinite, round-off as zero.
+    """
+    left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
+    return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
+
+
+def _arrived(q, near_q, g, start: Guess) -> Flag:
+    """Return whether the constraints are satisfied, with coordinates in their
+    permitted range and near the guess.
+    """
+    # moving a coordinate by more than ten widths of the domain counts as divergence; NaN counts as far
+    close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
+    return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
+
+
+class _Put(NamedTuple):
+    """Projected coordinates, without derivatives."""
+
+    q: Float[Array, "coordinates"]
+    g: Float[Array, "closures"]
+    guess: Count
+    begin: Float[Array, "coordinates"]  # starting point of Newton's method
+    met: Flag  # whether a solution was found
+
+
+def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
+    """Return the solution from the first successful guess. The first guess is q itself."""
+    free, usual = jnp.asarray(start.free_q), start.usual
+    size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
+    every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
+    by = functions_of_rows(usual)
+    given = by.given(scene)
+    G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
+    low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
+    # coordinates on which no constraint depends stay
+    every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)
+    d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
+    tolerance = 16 * float(eps_of(q))
+    scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
+    good = float(eps_of(q)) ** 0.5
+    found, guess = first_root(scaled, every, size, tolerance, good, low, high)
+    begin, met = jnp.where(free, found.x, q), found.left <= good
+    near_q = jnp.where(met, put_positions(scene, t, begin, free, usual)[0], begin)
+    return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, met)
+
+
+def contradiction(dtype) -> float:
+    """Return the residual (m, rad) above which given values count as contradictory. It allows for numbers
+    with few digits, and for round-off.
+    """
+    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: for numbers with few digits
+
+
+def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
+    """Return whether held values (entries that are not free) may contradict each other.
+    `known`: structure of the scene.
+
+        rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: columns of the free variables
+
+    If this holds, there is no contradiction, except at isolated configurations.
+    """
+    # otherwise the constraints determine the dependent ones
+    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))
+    of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+    if of_speeds and not known.affine:
+        return True
+    return (of_coordinates and _loses_rank(known.closure_slopes, free_q)) or (of_speeds and _loses_rank(known.row_slopes, free_u))
+
+
+def _loses_rank(matrices, free) -> bool:
+    return any(np.linalg.matrix_rank(one * free) < np.linalg.matrix_rank(one) for one in matrices)
+
+
+@lru_cache(maxsize=64)
+def row_functions(program: RowProgram) -> RowFunctions:
+    """Return g and G, phi and A, and M, by the program; parts without machine code
+    use automatic differentiation.
+    """
+    nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
+    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > projection_kernel.LARGEST_PROGRAM:
+        return BY_AUTODIFF
+    rows, speeds = len(program.phi), len(program.u)
+    closures, coordinates = len(program.g), len(program.q)
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    at = [*parameters, program.t, *program.q]
+
+    def matrix(entries: dict[tuple[int, int], int], rows: int, columns: int) -> list[int]:
+        return [entries.get((i, k), program.graph.zero) for i in range(rows) for k in range(columns)]
+
+    of_closures = values_of_nodes(program.graph, [*program.g, *matrix(program.G, closures, coordinates)], at)
+    of_rows = values_of_nodes(program.graph, [*program.phi, *matrix(program.A, rows, speeds)], [*at, *program.u, *program.inputs])
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    of_masses = values_of_nodes(program.graph, matrix(M, speeds, speeds), at)
+
+    def parameters_of(scene: Scene):
+        found = entries(scene, program.parameters)
+        return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
+
+    def in_a_row(given, t, *vectors):
+        first = parameters_of(given) if isinstance(given, Scene) else given
+        return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
+
+    def closures_at(given, t, q):
+        found = of_closures(in_a_row(given, t, q))
+        return found[:closures], found[closures:].reshape(closures, coordinates)
+
+    def rows_at(given, t, q, u, inputs):
+        found = of_rows(in_a_row(given, t, q, u, inputs))
+        return found[:rows], found[rows:].reshape(rows, speeds)
+
+    def masses_at(given, t, q):
+        return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
+
+    return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)

@@ -1,0 +1,239 @@
+"""Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a
+program, and for reductions chosen by the user.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, is_traced, static
+from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
+from jourdain_jax.dynamics.power import rate_of_work
+from jourdain_jax.equations.contact_state import At
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.kinematics import motion_at, rates_by_own_speeds
+from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
+from jourdain_jax.equations.phases import put_back
+from jourdain_jax.equations.projection import project_positions, project_speeds
+from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
+from jourdain_jax.equations.scaling import scaled, speed_scale
+from jourdain_jax.equations.scene_parts import names_of_position_rows
+from jourdain_jax.equations.virtual_power import coordinate_rates_in_modes, mass_matrix_at
+from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField, Watched
+from jourdain_jax.scene.identity import with_reference_parameters
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.probes import generic_inputs
+from jourdain_jax.structure.structure import closure_lengths, structure_whatever_its_faults, trust, usual_rows
+
+
+class UsualLengths(eqx.Module):
+    """Usual lengths of constraint rows in scaled speeds, with their rank, and of geometric constraints and
+    quaternion norms in the coordinates.
+    """
+
+    rows: UsualRows
+    closures: Float[Array, "closures"]
+    own_speeds: Float[Array, "own_speeds"]  # of the coordinate rates by each of the scene's own speeds
+
+
+def usual_lengths(scene: Scene) -> UsualLengths:
+    """Return the usual lengths for the parameters of `scene`, without derivatives."""
+    with jax.ensure_compile_time_eval():  # cached between calls, whether inside `jit` or not
+        own_speeds = _of_own_speeds(scene)
+        if not is_traced(scene):
+            return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), own_speeds)
+    return UsualLengths(*_of_traced(scene), own_speeds)
+
+
+def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
+    """Return lengths at states probed with numbers near the class's defaults. They are
+    computed while the motion runs.
+    """
+    known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
+    count = min(12, known.random)
+    t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
+    u = jnp.ones(len(scene.speed_names), q.dtype)
+
+    def lengths(t, q):
+        A = jax.jacfwd(lambda u: velocity_residual(still, t, q, u, inputs.astype(q.dtype)))(u)
+        return jnp.linalg.norm(A * speed_scale(mass_matrix_at(still, t, q)), axis=1), jnp.linalg.norm(A, axis=1)
+
+    scaled, plain = (_usual(x) for x in jax.vmap(lengths)(t, q))
+    norms = jnp.ones(len(scene.coordinates.quaternions), plain.dtype)
+    rank = jnp.asarray(known.rank, jnp.int32)
+    return UsualRows(scaled, rank), jnp.concatenate([plain[: len(names_of_position_rows(scene))], norms])
+
+
+def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
+    """Return the median over states, or the largest value if half of the values are zero, ignoring NaN."""
+    median = jnp.nanmedian(sizes, axis=0)
+    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
+
+
+def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
+    """Return the median size of the rates over probed states. For traced parameters it is a thousand times
+    larger, so that only much larger rates count as infinite.
+    """
+    known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
+    t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
+    lengths = jnp.nanmedian(jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0)
+    return jnp.where(lengths > 0, lengths, jnp.inf) / trust(scene)
+
+
+class ByMatrices(VectorField):
+    """Shared parts of both states."""
+
+    stabilisation: Baumgarte | None
+    usual: UsualLengths  # of the constraints
+    # whether constraints depend on inputs that change with time, so that rates of inputs are needed
+    inputs_in_rows: bool = static()
+    # all constraints, if some are nonlinear in the speeds and none is redundant
+    nonlinear_rows: Indices = static()
+    # singular values below it count as zero when speeds are projected; None: round-off
+    cutoff: float | None = static()
+
+    def now(self, inputs, t):
+        """Return the values of the inputs, and their rates if constraints depend on them."""
+        return inputs.near(t) if self.inputs_in_rows else inputs(t)
+
+    def solved(self, at: Instant, u) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
+        """Return the motion with these speeds, its accelerations, and the eliminated constraints that
+        are nonlinear in the speeds.
+        """
+        state = at.scene, at.t, at.y.q, u, at.inputs
+        found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
+        return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
+
+    def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
+        """Add the coordinate rates by each of the scene's own speeds, which must stay finite, to these
+        rates, pivots and constraints.
+        """
+        power = rate_of_work(at.scene, motion, found, self.of_inputs) if self.with_work else None
+        N = jax.lax.stop_gradient(rates_by_own_speeds(at.scene, at.t, at.y.q))
+        width = max(rows.shape[1], N.shape[1])
+        padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
+        pivots = jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1))
+        return Watched(Integrated(coordinate_rates_in_modes(at.scene, motion), v, power), pivots, jnp.concatenate(padded))
+
+    def project(self, at: Instant) -> Integrated:
+        scene, _, t, y, inputs = at
+        q, v = y.q, y.v
+        if scene.switching.contacts and self.projects_speeds:
+            q, v = put_back(At(scene, motion_at(scene, t, q, v, inputs)))
+        if self.projects_positions:
+            q = project_positions(scene, t, q, iterations=2, typical=self.usual.closures)
+        if self.projects_speeds:
+            v = project_speeds(scene, t, q, v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths)
+        return Integrated(q, v, y.work)
+
+
+class MinimalByMatrices(ByMatrices):
+    """State of coordinates and independent speeds."""
+
+    independent: Indices = static()
+    rows: Indices = static()  # constraints that determine the dependent speeds
+
+    @property
+    def has_pivots(self) -> bool:
+        """Return True: the sign of det A_z is monitored."""
+        return True
+
+    def speeds(self, at: Instant) -> Speeds:
+        return self._kinematics(at).u
+
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+        """Return all speeds, and the pivot with the sign of det A_z."""
+        found = self._kinematics(at)
+        return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
+
+    def rates_and_pivots(self, at: Instant) -> Watched:
+        """Return `rates` and the sign of det A_z."""
+        known = self._kinematics(at)
+        own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
+        motion, found = accelerations_of(at.scene, known, at.t, at.y.q, at.inputs) if own else self.solved(at, known.u)[:2]
+        v = found.udot[jnp.array(self.independent, jnp.int32)]
+        return self.watched(at, motion, found, v, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
+
+    def _kinematics(self, at: Instant) -> MinimalKinematics:
+        return minimal_kinematics(at.scene, self.independent, self.rows, at.t, at.y.q, at.y.v, at.inputs)
+
+
+class FullByMatrices(ByMatrices):
+    """State of coordinates and all speeds."""
+
+    # relative size of rows below which round-off decides between branches that cross at a loss
+    # of rank; None: no branches
+    undecided: float | None = static()
+    own_equations: str = static(default="")  # equations that a solver uses instead of accelerations
+
+    @property
+    def reduction_name(self) -> str:
+        if self.own_equations:
+            return f"none, {self.own_equations}"
+        return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Return False: the full state continues, with a warning."""
+        return False
+
+    @property
+    def has_pivots(self) -> bool:
+        """Return whether round-off might decide on which branch a motion continues."""
+        return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Return whether branches may cross on the constraints onto which a step is projected."""
+        return self.projects and self.undecided is not None
+
+    def speeds(self, at: Instant) -> Speeds:
+        return at.y.v
+
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+        if not isinstance(self.reduction, Privileged | GibbsAppell):
+            return at.y.v, jnp.ones(())
+        return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
+
+    def rates_and_pivots(self, at: Instant) -> Watched:
+        """Return `rates`, eliminated constraints, and 1 if the constraints determine the branch of the
+        motion, or -1 if round-off does.
+        """
+        motion, found, directions = self.solved(at, at.y.v)
+        branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
+        watched = self.watched(at, motion, found, found.udot, branch.astype(at.y.q.dtype), directions)
+        return watched._replace(sine=found.pivot) if self.near_rank_loss else watched
+
+
+def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
+    """Return the part of each row that is orthogonal to the earlier ones."""
+    Q, R = jnp.linalg.qr(jax.lax.stop_gradient(A).T)
+    return (Q * jnp.diagonal(R)).T
+
+
+def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
+    """Return the full state in place of another form, for a solver that satisfies the
+    constraints by `own_equations`.
+    """
+    return FullByMatrices(
+        independent=None,
+        reduction=field.reduction,
+        with_work=field.with_work,
+        conserves=field.conserves,
+        projects_positions=False,
+        projects_speeds=False,
+        rows_may_contradict=False,
+        of_inputs=field.of_inputs,
+        event_names=field.event_names,
+        stops=field.stops,
+        nonlinear_rows=(),
+        stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
+        usual=usual_lengths(scene),
+        inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,
+        cutoff=None,
+        undecided=None,
+        own_equations=own_equations,
+    )

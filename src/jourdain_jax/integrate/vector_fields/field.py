@@ -1,0 +1,367 @@
+"""The integrated state, and the interface of its rates.
+
+    minimal: qdot = N u + nu,  u = C y + c,  ydot = independent rows of udot     (velocity constraints hold exactly)
+    full:    qdot = N u + nu,  udot                                               (projected onto the constraints)
+
+Work of forces or constraints without a potential is integrated along with the state.
+"""
+
+import abc
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Indices, PerLane, Scalar, Speeds, check_kind, described, static
+from jourdain_jax.dynamics.accelerations import Baumgarte
+from jourdain_jax.equations.contact_state import At
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.phases import contacts_at_start
+from jourdain_jax.equations.reductions import Reduction
+from jourdain_jax.equations.virtual_power import energies_at
+from jourdain_jax.integrate.loop import value_kernels
+from jourdain_jax.lowering.lowered_equations import Lowered
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import Labels, check_name
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.structure import Structure
+from jourdain_jax.structure.trace import event_resets, event_values, stored_by_inputs
+
+_STATES = ("auto", "minimal", "full")
+
+
+class Formulation(eqx.Module):
+    """The equations that `simulate` integrates. The default is chosen for the scene.
+
+    - `state`: "minimal", coordinates q and independent speeds y; "full", coordinates and all speeds u; "auto"
+      (default), the minimal one if the independent speeds are well conditioned over the scene's domain and the
+      constraints are linear or affine.
+    - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the scene's
+      scalar program if there is one).
+    - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by construction:
+      "projection" (default) projects the state after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
+      the constraints, for comparison; None does nothing.
+
+    Raises ValueError for anything else.
+
+    **Examples**
+
+        rods = jj.models.DoublePendulumRods()
+        dense = jj.Formulation("full", reduction="kkt")                # all speeds, multipliers from one linear system
+        motion = jj.simulate(rods, t1=0.2, formulation=dense)
+        print(motion.state_form, motion.reduction)
+    """
+
+    state: Literal["auto", "minimal", "full"] = static(default="auto")
+    reduction: Reduction | GibbsAppell | str | None = None
+    stabilisation: Baumgarte | Literal["projection"] | None = "projection"
+
+    def __check_init__(self) -> None:
+        check_name(self.state, _STATES, f"unknown state form `{self.state}`")
+        stabilisation = self.stabilisation
+        if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
+            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", '
+                '`jj.Baumgarte(alpha, beta)` or None')
+
+    @property
+    def projects(self) -> bool:
+        """Return whether the state is projected onto the constraints after each step."""
+        return isinstance(self.stabilisation, str)
+
+    @property
+    def baumgarte(self) -> Baumgarte | None:
+        """Return the terms added to the constraints; None without."""
+        return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
+
+
+_DEFAULT = Formulation()
+
+
+def as_formulation(formulation) -> Formulation:
+    """Return the formulation, or the default for None; raises ValueError for anything else."""
+    if formulation is None:
+        return _DEFAULT
+    check_kind(
+        formulation, Formulation, "`formulation`",
+        "`jj.Formulation(state, reduction, stabilisation)` or None"
+    )
+    return formulation
+
+
+def reason_for_matrices(structure: Structure, constant: bool) -> str:
+    """Return why a scene with a scalar program is integrated by dense matrices; empty if the program is used.
+    `constant`: whether all inputs are constant.
+    """
+    if structure.rows_of_inputs and not constant:
+        return "velocity constraints with inputs that change with time need dense matrices"
+    return ""
+
+
+class Integrated(eqx.Module):
+    """Integrated state: coordinates, speeds (all or the independent ones), and integrated work (J)."""
+
+    q: Float[Array, "coordinates *lanes"]
+    v: Float[Array, "integrated_speeds *lanes"]
+    work: PerLane | None
+
+    @property
+    def rows(self) -> Float[Array, "rows *lanes"]:
+        """Return all values as one array."""
+        return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
+
+    @staticmethod
+    def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
+        """Return the state from these rows; `form` gives the numbers of coordinates and speeds."""
+        n, end = form.coordinates, form.q_and_v
+        return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
+
+
+class Watched(NamedTuple):
+    """Rates; pivots that must keep their signs; directions of constraints nonlinear in the speeds, which must
+    not reverse; and a sine that is small near a loss of rank.
+    """
+
+    rates: Integrated
+    pivots: Float[Array, "pivots *lanes"]
+    directions: Float[Array, "rows speeds *lanes"]
+    # smallest sine between a constraint and the earlier ones; None if constraints are solved
+    # for speeds, or there are none
+    sine: PerLane | None = None
+
+
+class Instant(NamedTuple):
+    """Arguments of a vector field."""
+
+    scene: Scene
+    fixed: tuple  # the scene's part of the rates, computed once per motion
+    t: PerLane  # s
+    y: Integrated
+    inputs: Any  # values at this time; for `rates` and `rates_and_pivots` from `now`
+
+    @property
+    def of_program(self) -> tuple[tuple, Any, Any, Any, Any]:
+        """Return the arguments of a scalar program."""
+        return self.fixed, self.t, self.y.q, self.y.v, self.inputs
+
+
+class VectorField(eqx.Module):
+    """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
+
+    independent: Indices | None = static()  # independent speeds; None: the full state
+    reduction: Reduction | GibbsAppell
+    with_work: bool = static()
+    conserves: bool = static()  # T + V is constant along every motion
+    projects_positions: bool = static()
+    projects_speeds: bool = static()
+    rows_may_contradict: bool = static()  # although the start satisfies all of them (`motion/integration.py`)
+    of_inputs: Indices = static()  # indices of loads whose potential depends on inputs
+    event_names: Labels = static()  # sorted
+    stops: tuple[bool, ...] = static()  # whether each event ends the motion
+
+    @property
+    def name(self) -> str:
+        """Return "minimal" or "full"."""
+        return "full" if self.independent is None else "minimal"
+
+    @property
+    def reduction_name(self) -> str:
+        """Return the name of the reduction, as shown in a trajectory."""
+        return getattr(self.reduction, "name", "")
+
+    @property
+    def lowered(self) -> Lowered | None:
+        """Return the scalar program of the rates; None: dense matrices."""
+        return None
+
+    @property
+    def lowers_events(self) -> bool:
+        """Return whether stop events are part of the scalar program."""
+        return False
+
+    @property
+    def projects(self) -> bool:
+        """Return whether a step projects the state onto constraints."""
+        return self.projects_positions or self.projects_speeds
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Return whether a motion ends when a pivot is small or changes its sign. With a full state
+        it continues, with a warning.
+        """
+        return True
+
+    @property
+    @abc.abstractmethod
+    def has_pivots(self) -> bool:
+        """Return whether a step is repeated if a pivot changes its sign, because the state or a
+        constraint is lost within it.
+        """
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Return whether `rates_and_pivots` reports the distance of the constraints from a loss of rank."""
+        return False
+
+    def fixed(self, scene: Scene) -> tuple:
+        """Return the scene's part of the rates, computed once per motion."""
+        return ()
+
+    def now(self, inputs, t):
+        """Return the inputs' part of the rates at a time."""
+        return inputs(t)
+
+    def pack(self, q, u) -> Integrated:
+        """Return the integrated state of (q, u)."""
+        v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
+        return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
+
+    def stored(self, scene: Scene, t, q, inputs) -> Scalar:
+        """Return the energy (J) stored in loads whose potential depends on inputs. Integrated work plus the
+        change of this energy is the work done.
+        """
+        if not (self.with_work and self.of_inputs):
+            return jnp.zeros((), q.dtype)
+        return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
+
+    @abc.abstractmethod
+    def speeds(self, at: Instant) -> Speeds:
+        """Return all speeds."""
+
+    @abc.abstractmethod
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+        """Return all speeds, and a measure of how well the independent ones determine the others. It
+        changes its sign where they do not.
+
+        For the full state it is the measure of the reduction, without a sign, or 1 if there is none.
+        """
+
+    def motion(self, at: Instant) -> Motion:
+        """Return the motion with all speeds."""
+        return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
+
+    def events(self, at: Instant) -> Float[Array, "events *lanes"]:
+        """Return values of the stop events, in the order of their names. Batches are
+        supported only if `lowers_events`.
+        """
+        return event_values(at.scene, self.motion(at))
+
+    def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
+        """Return `event_resets` for the integrated speeds. Batches are supported only if `lowers_events`."""
+        found = event_resets(at.scene, self.motion(at), self.of_inputs)
+        every = range(len(at.scene.speed_names))
+        left_out = [len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent]
+        return jnp.delete(found, np.array(left_out, int), axis=1)
+
+    def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
+        """Return the switching contacts at the start of a motion from (q, u):
+        `switching.Begun` as one vector.
+        """
+        return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
+
+    def energies(self, at: Instant) -> Float[Array, "2"]:
+        """Return the kinetic and potential energy, J, without derivatives."""
+        at = jax.lax.stop_gradient(at)
+        return jnp.stack(energies_at(at.scene, self.motion(at)))
+
+    def rates(self, at: Instant) -> Integrated:
+        """Return the time derivative of the integrated state."""
+        return self.rates_and_pivots(at).rates
+
+    @abc.abstractmethod
+    def rates_and_pivots(self, at: Instant) -> Watched:
+        """Return `rates` with the quantities monitored at all stages of a step."""
+
+    @abc.abstractmethod
+    def project(self, at: Instant) -> Integrated:
+        """Return the state projected onto geometric constraints, quaternion norms and (full
+        state) velocity constraints.
+        """
+
+
+class ByProgram(VectorField):
+    """Minimal or full state of a lowered scene."""
+
+    program: Lowered = static()
+    affine: bool = static()  # constraints are affine in the speeds
+    native: value_kernels.Beside | None = static(default=None)
+
+    @property
+    def lowered(self) -> Lowered:
+        """Return the scalar program."""
+        return self.program
+
+    @property
+    def reduction_name(self) -> str:
+        return f"{super().reduction_name}, lowered"
+
+    @property
+    def lowers_events(self) -> bool:
+        return bool(self.program.events)
+
+    @property
+    def has_pivots(self) -> bool:
+        """Return whether elimination or coordinate rates divide by numbers that must not vanish."""
+        return self.pivots > 0 or bool(self.program.directions) or self.near_rank_loss
+
+    @property
+    def pivots(self) -> int:
+        """Return the number of monitored pivots. With multipliers, only the coordinate rates have pivots."""
+        return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Return whether a small pivot ends a motion; with multipliers the state stays complete."""
+        return self.independent is not None or self.program.by_partition
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Return whether constraints are enforced by multipliers and projection."""
+        return self.projects and bool(self.program.squares)
+
+    def fixed(self, scene: Scene) -> tuple:
+        """Return the values that depend only on parameters."""
+        return (self.native or self.program).fixed_values(scene)
+
+    def speeds(self, at: Instant) -> Speeds:
+        return self.program.speeds_and_pivot(*at.of_program)[0]
+
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+        """Return all speeds, and the smallest pivot of the elimination."""
+        return (self.native or self.program).speeds_and_pivot(*at.of_program)
+
+    def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
+        state = self.fixed(scene), t, q, u, inputs
+        return self.native.at_start(*state) if self.native else self.program.values(self.program.at_start, *state)
+
+    def energies(self, at: Instant) -> Float[Array, "2"]:
+        return (self.native or self.program).energies_at(*at.of_program)
+
+    def events(self, at: Instant) -> Float[Array, "events *lanes"]:
+        if self.program.events:
+            return self.program.values(self.program.events, *at.of_program)
+        return super().events(at)
+
+    def resets(self, at: Instant) -> Float[Array, "events rows *lanes"]:
+        if self.program.events:
+            found = self.program.values(self.program.resets, *at.of_program)
+            return found.reshape(len(self.program.events), -1, *found.shape[1:])
+        return super().resets(at)
+
+    def rates_and_pivots(self, at: Instant) -> Watched:
+        """Return `rates`, the pivots of the elimination, and the eliminated constraints."""
+        y = at.y
+        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(*at.of_program, self.with_work)
+        pivots = pivots[: self.pivots]
+        monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+        rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
+        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
+
+    def project(self, at: Instant) -> Integrated:
+        """Return the state projected onto the constraints."""
+        q, v = self.program.projected(*at.of_program, self.affine)
+        return Integrated(jnp.stack(q), jnp.stack(v) if v else at.y.v, at.y.work)

@@ -1,0 +1,6 @@
+"""Machine code of CPUs and NVIDIA GPUs from scalar programs, by LLVM (llvmlite), called from JAX.
+
+`ir.py` writes instructions, `math_functions.py` and `angles.py` the functions that they call, so that all
+machines give equal bits. `host.py` compiles, `ffi.py` calls from JAX, `gpu.py` and `nvidia.py` do so on GPUs.
+Nothing here knows what a program computes. Open `ir.py` first, then `scalar_program.py`.
+"""

@@ -1,1 +1,0 @@
-"""Batches of motions: integration in lockstep, rollouts."""

@@ -1,1 +1,0 @@
-"""Explicit and implicit integration methods, and events."""

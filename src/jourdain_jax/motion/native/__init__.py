@@ -1,1 +1,0 @@
-"""Steps of a motion, and the loop over them, as machine code for several lanes at once."""

@@ -1,0 +1,257 @@
+"""Quantities along a recorded motion: a function of one state, mapped over all saved times."""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static, with_nan_as_a_mark, with_usual_promotion
+from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
+from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import NullSpaceSVD
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
+from jourdain_jax.equations.virtual_power import energies_at
+from jourdain_jax.integrate.inputs import Inputs, for_programs
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.modes import Modes
+from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.user_methods import invariants_of
+from jourdain_jax.structure.structure import structure_of
+
+
+class Phases(eqx.Module, Printed):
+    """Phases of a motion, separated by events at which it continues."""
+
+    ts: Float[Array, "transitions"]  # s, of these events; NaN after the last one
+    events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
+    modes: Float[Array, "modes phases"]  # numbers of their values in each phase
+    lost: Float[Array, "transitions"]  # J, loss of T + V at each event
+    event_names: Labels = static()
+    named: Modes = static()
+
+    @property
+    def count(self) -> Count:
+        """Return the number of events that separate the phases."""
+        return jnp.sum(jnp.isfinite(self.ts), axis=-1)
+
+    def texts(self) -> list[str]:
+        """Return one line per event: its time, its name, the modes that it switched and the energy lost."""
+        ts, events, modes, lost = (np.asarray(x) for x in (self.ts, self.events, self.modes, self.lost))
+        lines = []
+        for k in range(int(self.count)):
+            pairs = zip(self.named.pairs, modes[:, k], modes[:, k + 1], strict=True)
+            switched = [f"{name}: {values[int(new)]}" for (name, values), old, new in pairs if new != old]
+            took = [f"took {lost[k]:.4g} J"] if abs(lost[k]) > 1e-12 * np.max(np.abs(lost)) else []
+            lines.append(", ".join([f"{ts[k]:.6g} s `{self.event_names[events[k]]}`", *switched, *took]))
+        return lines
+
+    def _text(self) -> str:
+        if self.ts.ndim > 1:
+            return f"Phases of a batch of shape {self.ts.shape[:-1]}"
+        return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())])
+
+    def lost_until(self, ts: Float[Array, "*lanes times"]) -> Float[Array, "*lanes times"]:
+        """Return the loss of T + V by events until each time `ts` (s), in J."""
+        ahead = (self.ts[..., None, :] - ts[..., None]) * jnp.sign(ts[..., -1:] - ts[..., :1])[..., None]
+        return jnp.sum(jnp.where(ahead <= 0, self.lost[..., None, :], 0.0), axis=-1)
+
+
+def one_phase(event_names: Labels) -> Phases:
+    """Return the phases of a motion with a single phase, without modes."""
+    none = jnp.zeros(0)
+    return Phases(none, none.astype(jnp.int32), jnp.zeros((0, 1)), none, event_names, Modes())
+
+
+class Record(eqx.Module):
+    """Numbers of a motion; NaN at unreached times."""
+
+    scene: Scene
+    ts: Float[Array, "times"]  # s
+    q: Float[Array, "times coordinates"]
+    u: Float[Array, "times speeds"]
+    # J, since the start; None if all forces have potentials and no constraint does work
+    work: Float[Array, "times"] | None
+    t_end: Scalar  # s
+    q_end: Float[Array, "coordinates"]
+    u_end: Speeds
+    result: Count  # code, see `jourdain_jax.integrate.result_codes`
+    event: Count  # index into `event_names`, -1: none
+    accepted: Count  # steps
+    rejected: Count
+    last_step: Scalar  # s, proposed by step-size control for the next step; NaN if unknown
+    # number of sign changes of relations (`<`, `abs`, `floor`, ...) in loads, poses and
+    # constraints; -1: not monitored
+    crossings: Count
+    fallback: Count  # how the motion was repeated, see `results.FALLBACKS`; 0: as requested
+    moved_q: Scalar  # change of the start by its projection
+    moved_u: Scalar
+    # smallest pivot of the independent speeds along the motion (lowered: of the elimination,
+    # relative to its usual size), negative if it changed sign; for the full state with dense
+    # matrices, of the reduction, or 1 without
+    smallest_pivot: Scalar
+    inputs: Inputs
+    phases: Phases
+    state_form: str = static()  # "minimal" or "full"
+    reduction: str = static()
+    solver: str = static()
+    projected: bool = static()
+    unwatched: str = static()  # why steps do not monitor relations; empty if they do, or there are none
+    event_names: Labels = static()
+
+
+@with_usual_promotion
+def map_over_times(f, record: Record, by_inputs: bool = False):
+    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at unreached times. f must be a named function
+    or a module, because it is a cache key.
+
+    `by_inputs`: whether f needs the rates of the inputs, because constraints depend on varying ones. For a
+    batch of motions the batch axes come first.
+    """
+    first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))  # noqa: E731  of a batch, the first
+    # accelerations depend on the rates of the inputs
+    by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs
+    known = not is_traced((f, record))
+    # for one concrete motion NumPy finishes before a program is compiled (contact forces of a bicycle at
+    # 101 times: 1 s instead of 7)
+    if known and record.q.ndim == 2 and len(record.ts) <= 1000:
+        return _on_numpy(f, record, by_inputs)
+    mapped = _compiled(record.inputs.programs)
+    # then NaN is not a marker
+    whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))
+    return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs)
+
+
+def _mapped(f, record: Record, by_inputs: bool):
+    if record.q.ndim > 2:
+        return eqx.filter_vmap(lambda record: _mapped(f, record, by_inputs))(record)
+
+    one = partial(_at_one_time, f, record, by_inputs)
+    count, most = len(record.ts), _largest_block(record)
+    if count <= most:
+        return jax.vmap(one)(record.ts, record.q, record.u)
+    # a divisor, because a remainder would be compiled separately
+    block = next(k for k in range(most, 0, -1) if count % k == 0)
+    return jax.lax.map(lambda state: one(*state), (record.ts, record.q, record.u), batch_size=block)
+
+
+_compiled = for_programs(_mapped)
+
+
+def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
+    """Return `f` at one state. For an unreached time, f is evaluated at the end of the motion, and
+    its result is replaced by NaN.
+    """
+    reached = jnp.all(jnp.isfinite(q))
+    t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
+    values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
+    return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
+
+
+def _largest_block(record: Record) -> int:
+    """Return the number of times at which quantities are computed together."""
+    # limit on entries of square matrices of the coordinates: for 200 trailers at 201 times, derivatives of
+    # all poses took more than 23 GB
+    return max(1, 4_000_000 // record.q.shape[-1] ** 2)
+
+
+@with_nan_as_a_mark
+def _on_numpy(f, record: Record, by_inputs: bool):
+    by_time, size = (record.ts, record.q, record.u), _largest_block(record)
+    blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
+    return jax.tree.map(lambda *parts: jax.device_put(np.concatenate(parts)), *blocks)
+
+
+_uncompiled = eval_numpy(_at_one_time)
+
+
+class BodyPoint(eqx.Module):
+    """Position (m, inertial frame) of the point of a body with coordinates `local` (m, body
+    frame, from the mass centre).
+    """
+
+    body: str = static()
+    local: Vector3
+
+    def __call__(self, scene, t, q, u, inputs):
+        return motion_at(scene, t, q, u, inputs)[self.body].place(self.local)
+
+
+def energies(scene, t, q, u, inputs):
+    """Return the kinetic and potential energy, J."""
+    return energies_at(scene, motion_at(scene, t, q, u, inputs))
+
+
+class InputOf(eqx.Module):
+    """Input with a given name."""
+
+    name: str = static()
+
+    def __call__(self, scene, t, q, u, inputs) -> Scalar:
+        return inputs[scene.inputs.entries.index(self.name)]
+
+
+class AccelerationsBySvd(eqx.Module):
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint
+    rows, None: those of the scene.
+    """
+
+    usual: UsualRows | None = None
+
+    def __call__(self, scene, t, q, u, inputs) -> Accelerations:
+        return accelerations(scene, t, q, u, inputs, reduction=NullSpaceSVD(), usual=self.usual)
+
+
+def reactions(scene, t, q, u, inputs):
+    """Return the constraint forces per constraint and per body."""
+    return row_reactions(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
+
+
+def contacts(scene, t, q, u, inputs):
+    """Return normal and tangential force and the friction coefficient needed, for every rolling contact."""
+    return contact_forces(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
+
+
+def residuals(scene, t, q, u, inputs):
+    """Return residuals of the geometric constraints and quaternion norms, and of the velocity constraints."""
+    return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
+
+
+def invariants(scene, t, q, u, inputs):
+    """Return the quantities that the scene declares conserved."""
+    return invariants_of(scene, motion_at(scene, t, q, u, inputs))
+
+
+class Checked(NamedTuple):
+    """Diagnostic quantities along a motion."""
+
+    energies: tuple[Array, Array]  # kinetic and potential
+    residuals: tuple[Array, Array]  # of the geometric and of the velocity constraints
+    rank: Array
+    smallest_singular_value: Array
+    invariants: dict[str, Array]
+    contacts: dict[str, ContactForce]
+
+
+class Checks(eqx.Module):
+    """`Checked` at one state; `usual`: typical constraint rows."""
+
+    usual: UsualRows
+
+    def __call__(self, scene, t, q, u, inputs) -> Checked:
+        found = AccelerationsBySvd(self.usual)(scene, t, q, u, inputs)
+        return Checked(
+            energies(scene, t, q, u, inputs),
+            residuals(scene, t, q, u, inputs),
+            found.rank,
+            found.smallest_singular_value,
+            invariants(scene, t, q, u, inputs),
+            contact_forces(scene, t, q, u, found, inputs),
+        )

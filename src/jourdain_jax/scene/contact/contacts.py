@@ -1,0 +1,267 @@
+"""Rolling contacts without slip, of balls, ellipsoids, discs and wheels, on planes, cylinders, spheres,
+surfaces and height maps.
+
+A contact contributes two velocity constraints (no slip along the two tangents of the ground). With
+`height="row"` it also contributes one geometric constraint (zero gap). With `height="coordinates"` the
+coordinates keep the contact point on the ground, and the normal force follows from Newton's equations (row
+S1) instead of a multiplier. Spin about the normal is free.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, TypedDict, Unpack, get_args
+
+import equinox as eqx
+from jaxtyping import Array
+
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real, described
+from jourdain_jax.scene.bodies import RigidBody, _axis_index
+from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
+from jourdain_jax.scene.contact.grounds import Ground, Plane
+from jourdain_jax.scene.motion_state import BodyPose
+from jourdain_jax.scene.names import Labels
+
+_HEIGHTS = ("coordinates", "row")
+IMPACTS = ("moreau", "newton", "poisson", "energetic")
+
+
+class Coulomb(eqx.Module):
+    """Coulomb's law of friction, with coefficient `sliding` for a slipping contact and `static` >= `sliding`
+    for one at rest (default: equal).
+    """
+
+    sliding: Scalar
+    static: Scalar
+
+    def __init__(self, sliding, static=None):
+        self.sliding = checked_real(sliding, "coefficient of friction", ())
+        self.static = self.sliding if static is None else checked_real(static, "coefficient of static "
+            "friction", ())
+
+
+class Slipping(TypedDict, total=False):
+    """Options of contacts that slip, fly and strike."""
+
+    friction: Parameter | Coulomb | None
+    restitution: Parameter
+    impact: str
+
+
+class Contact(eqx.Module):
+    """A point contact of a body with the ground, rolling without slip; for contacts beyond `ball_contact` and
+    similar functions.
+
+    - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point of contact.
+    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a
+      ground z = 0 at rest).
+    - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`, shown in pictures.
+    - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a geometric
+      constraint.
+    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
+      bodies (default: all of the scene), for the normal force with `height="coordinates"`.
+    - `distance` (m): the gap (default: the point's height above the plane).
+    - `shape`: set by `ball_contact` and similar functions, for pictures; the scene's `visuals` override it.
+    - `friction`, `restitution`: as in `ball_contact`.
+
+    If the coordinates determine the point, no search is needed: `jj.Contact(pose["disc"], p, ground=hill)`.
+    Raises ValueError for an unknown height, or anything of another kind or shape.
+    """
+
+    body: str = eqx.field(static=True)
+    point: Vector3  # m, inertial frame
+    plane: Plane
+    height: str = eqx.field(static=True)  # "coordinates" or "row"
+    carried: Labels | None = eqx.field(static=True)  # supported bodies; None: all of them
+    distance: Scalar | None  # m; None: the point's height above the plane
+    shape: Shape | None  # of the rolling body, for pictures
+    ground: Ground | None  # for pictures; None: the plane
+    friction: Coulomb | None  # None: it rolls, with any friction force
+    restitution: Scalar | None
+    impact: str = eqx.field(static=True)
+
+    def __init__(
+        self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
+    ):
+        """Make a contact of the `body` at its `point` with the tangent `plane` of a ground."""
+        check_kind(body, BodyPose | str, "the body of a contact", 'the pose of a body; write pose["name"]')
+        self.body = body if isinstance(body, str) else body.name
+        if plane is not None and not isinstance(plane, Plane):
+            advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
+            raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a "
+                f"`jj.Plane(...)`, or None for z = 0 at rest{advice}")
+        if ground is not None:
+            _checked_ground(ground, self.body)
+        if shape is not None and not isinstance(shape, get_args(Shape)):
+            advice = "omit it, and state the body's look in `visuals`"
+            raise ValueError(
+                f"`shape` of the contact of `{self.body}` is {described(shape)}, expected a shape set by "
+                f"`ball_contact` or a similar function; {advice}"
+            )
+        self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
+        self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
+        self.height = _checked_height(height)
+        self.carried = _checked_carried(carried, self.body)
+        self.distance = None if distance is None else checked_real(distance, "distance of the contact of "
+            f"`{self.body}`", ())
+        self.shape, self.ground = shape, ground
+        self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
+
+    def gap(self) -> Scalar:
+        """Return the signed distance of the contact point from the ground, m."""
+        return self.plane.height_of(self.point) if self.distance is None else self.distance
+
+    def lean(self) -> Scalar | None:
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for other shapes.
+        """
+        return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
+
+
+class Rolling(Slipping, total=False):
+    """Options of all rolling contacts."""
+
+    centre: Vector | None  # m, body frame, of the rolling shape
+    ground: Ground | None
+    height: str
+    carried: Labels | None
+
+
+def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Contact:
+    """Return the rolling contact of a ball with a ground, without slip; the contact point is `c - a n`.
+
+    - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
+    - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
+    - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a geometric
+      constraint.
+    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
+      bodies (default: all), for the normal force with `height="coordinates"`.
+    - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
+      slips (`motion.phase`), and needs `height="row"`; None (default): it rolls, with any friction force.
+      `restitution` e of impacts, from 0 (default) to 1.
+    - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip afterwards. The others
+      follow the impact along its normal impulse, with friction against the momentary slip: "newton", until
+      w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic",
+      until its work is -e^2 times that of compression. They need a ball, or slip that keeps its direction, as
+      in a plane; a result code reports slip that would turn.
+
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
+    height or a length that is not positive. A ball too large for its cylinder or sphere is refused when the
+    scene is built.
+    """
+    return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
+
+
+def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]) -> Contact:
+    """Return the rolling contact of an ellipsoid with a ground, without slip, at `c - R S n'/sqrt(n'.S n')`,
+    `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
+
+    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in
+      `ball_contact`.
+
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown height.
+    Except on planes, Newton's method finds the point.
+    """
+
+    def ellipsoid(centre) -> Ellipsoid:
+        lengths = checked_positive(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
+        return Ellipsoid(centre, body.orientation, lengths)
+
+    return rolling(body, ellipsoid, **options)
+
+
+def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
+    """Return the rolling contact of the edge of a thin disc with a ground, without slip.
+
+    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's
+    normal n and disc axis k. Undefined for a disc lying flat.
+
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in
+      `ball_contact`.
+
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
+    height. The point is in closed form on a plane and a sphere.
+    """
+    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None), **options)
+
+
+def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
+    """Return the rolling contact of a wheel with a tyre of circular section (a torus) with a ground, without
+    slip.
+
+    The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`,
+    with the ground's normal n and the axle k. R is the wheel's outer radius, R - r the radius of the centre
+    circle of the tyre; r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
+
+    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or
+      "z". `options`: as in `ball_contact`.
+
+    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
+    height. The point is in closed form on a plane and a sphere.
+    """
+    tyre = checked_real(tyre, "tyre of a wheel's contact", ())
+    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre), **options)
+
+
+def _radius(body: BodyPose, radius) -> Scalar:
+    return checked_positive(radius, f"radius of the contact of `{body.name}`")
+
+
+def rolling(
+    body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
+) -> Contact:
+    """Return the contact of a rolling `shape`, a function of its centre (m, inertial frame). Other arguments:
+    as in `ball_contact`.
+    """
+    _checked_height(height)
+    check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
+    if not isinstance(body.body, RigidBody):
+        raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a "
+            "`jj.RigidBody`")
+    ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position
+    if centre is not None:
+        at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
+    rolls = shape(at)
+    found = touch(rolls, ground)
+    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground, **slips)
+
+
+def _checked_ground(given, body: str) -> Ground:
+    if not isinstance(given, get_args(Ground)):
+        known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
+        raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or "
+            "None for z = 0 at rest")
+    return given
+
+
+def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="moreau") -> tuple[Coulomb | None, Scalar | None, str]:
+    if impact not in IMPACTS:
+        raise ValueError(f"`impact` of the contact of `{body}` is {described(impact)}, expected one of "
+            f"{', '.join(IMPACTS)}")
+    if friction is None:
+        return None, None, impact
+    if height != "row":
+        raise ValueError(
+            f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
+            'ground; give the body a coordinate for its height, and write height="row"'
+        )
+    law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, "friction of the "
+        f"contact of `{body}`", ()))
+    return law, checked_real(restitution, f"restitution of the contact of `{body}`", ()), impact
+
+
+def _checked_height(height: str) -> str:
+    if height not in _HEIGHTS:
+        raise ValueError(
+            f"contact height `{height}` is unknown; expected `coordinates` (kept by the coordinates) or "
+            "`row` (a geometric constraint)"
+        )
+    return height
+
+
+def _checked_carried(carried, body: str) -> Labels | None:
+    if carried is None:
+        return None
+    names = () if isinstance(carried, str) or not isinstance(carried, Iterable) else tuple(carried)
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f'`carried` of the contact of `{body}` is {described(carried)}, expected names of '
+            f'bodies; write ("{body}",)')
+    return names

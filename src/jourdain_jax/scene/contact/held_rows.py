@@ -1,0 +1,76 @@
+"""Velocity constraints that hold up to a maximum force: friction in joints, and blades that may slip
+sideways.
+
+    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        L: constraint force, N or N m
+
+Each is treated as a contact with friction whose normal force is one newton and whose coefficients of friction
+are the forces `F`. So it shares the modes, events and derivatives of contacts (`equations/phases.py`).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Scalar, checked_real
+from jourdain_jax.scene.contact.contacts import Coulomb
+from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import check_names
+
+
+class HeldRow(eqx.Module):
+    """A velocity constraint, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m.
+    """
+
+    w: Scalar
+    friction: Coulomb
+
+    def __init__(self, w: Any, friction: Any, what: str):
+        self.w = w
+        known = isinstance(friction, Coulomb)
+        self.friction = friction if known else Coulomb(checked_real(friction, f"friction of {what}", ()))
+
+    @property
+    def slip(self) -> Float[Array, "2"]:
+        """Return the slip along the constraint; the second tangent is unused."""
+        return jnp.stack([self.w, jnp.zeros_like(self.w)])
+
+
+class JointFriction(Load):
+    """Friction on speeds: constraints that hold up to a force, by name of the speed."""
+
+    rows: dict[str, HeldRow]
+
+    def __init__(self, rows: dict[str, HeldRow]):
+        super().__init__()
+        self.rows = rows
+
+
+def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
+    """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`. A speed at rest
+    stays at rest while this needs at most the given force; otherwise the force opposes the speed.
+
+    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
+      static)` with two forces.
+
+    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` returns whether
+    it holds or slips. Raises ValueError for an unknown speed.
+
+    **Examples**
+
+        def loads(self, motion):
+            return jj.gravity(motion, 9.81), jj.joint_friction(motion, angle_rate=self.stiction)
+    """
+    check_names(friction, motion.u.keys(), "friction on unknown speed `{}`")
+    return JointFriction({name: HeldRow(motion.u[name], force, f"`{name}`") for name, force in friction.items()})
+
+
+def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
+    """Return the constraints that hold up to a force, from the results of `velocity_constraints` and `loads`.
+    """
+    found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
+    for load in (loads,) if isinstance(loads, Load) else loads:
+        found |= load.rows if isinstance(load, JointFriction) else {}
+    return found

@@ -1,0 +1,388 @@
+"""Checks of the numbers that a scene gives for its bodies, contacts and gravity.
+
+    m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
+    n.n = 1,   e.e = 1 of gravity,   0 < r of a rolling body and of its ground,   0 <= tyre < r
+    gap = 0 with height="coordinates"
+    d[n.(p - o)]/dt = - n.(v + w x (p - o))    p fixed; a plane's motion, stated by o, n and by v, w
+    dg/dt along the motion of other bodies = 0  or  v, w != 0      g: pose of a contact's ground
+    I_3 <= I_1 + I_2
+
+The table `CHECKS` lists them as functions of numbers at some states. It is evaluated when a scene is probed,
+and a fault raises its text. Checks with a `label` also run in the compiled program of each motion, where a
+fault is a result code. They run at the start, which may hide a fault, and at random states of the domain,
+projected onto the geometric constraints.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from itertools import combinations
+from operator import or_
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Flag, Scalar, all_finite, at_index, eps_of, largest
+from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Wheel
+from jourdain_jax.scene.contact.contacts import Contact
+from jourdain_jax.scene.contact.grounds import Cylinder, Sphere
+from jourdain_jax.scene.loads import Gravity, Load
+from jourdain_jax.scene.motion_state import Motion, Pose
+from jourdain_jax.scene.names import Sentences
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.user_methods import contacts_of, held_rows_of, loads_of
+from jourdain_jax.structure.assembly import random_states
+
+TOLERANCE = 1e-4  # relative: covers rounded constants, while mistakes are larger
+_ROWS_INSTEAD = (
+    "state it in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
+)
+
+# kind -> name of the owner -> values; at one state or, with a leading axis, at many; or nodes
+Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
+
+
+def numbers_of(scene: Scene, motion: Motion) -> Numbers:
+    """Return the numbers that the table checks, from known poses and velocities."""
+    pose = motion.pose()
+    contacts = contacts_of(scene, pose)
+    laws = {f"contact `{name}`": c.friction for name, c in contacts.items() if c.friction is not None}
+    laws |= {f"`{name}`": row.friction for name, row in held_rows_of(scene, motion).items()}
+    return stated_of(scene, pose, loads_of(scene, motion)) | {
+        "position": {f"body `{name}`": body.position for name, body in pose.bodies.items()},
+        "touch": {f"contact `{name}`": contact.point + contact.plane.normal for name, contact in contacts.items()},
+        "friction": {f"the friction of {name}": law.sliding for name, law in laws.items()},
+        "static": {
+            f"the static friction of {name}": jnp.stack([law.static, law.sliding]) for name, law in laws.items()
+        },
+        **_of_grounds(scene, motion),
+    }
+
+
+def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers:
+    """Return the numbers of poses and loads at one state."""
+    bodies = {f"body `{name}`": body.body for name, body in pose.bodies.items()}
+    contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
+    rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
+    closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
+    size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
+    away = _round_off(pose)  # relative round-off, for contacts far from the origin
+    return {
+        "mass": {name: body.mass for name, body in bodies.items()},  # kg
+        # kg m^2; the fourth row is round-off: moments of a body with a radius of gyration of 1e-9 m
+        "inertia": {name: jnp.concatenate([body.inertia, jnp.full((1, 3), 1e-18 * body.mass)]) for name, body in rigid.items()},
+        "orientation": {name: body.orientation for name, body in rigid.items()},
+        "unit": {f"the normal of {name}": c.plane.normal @ c.plane.normal for name, c in contacts.items()}
+        | {f"the axis of {name}": c.ground.axis @ c.ground.axis for name, c in contacts.items() if isinstance(c.ground, Cylinder)},
+        # m; with the distance of the contact from the mass centre
+        "gap": {name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)]) for name, c in closed.items()},
+        "length": {f"{what} of {name}": length for name, c in contacts.items() for what, length in _lengths(c).items()},  # m
+        "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
+        "restitution": {f"the restitution of {name}": c.restitution for name, c in contacts.items() if c.restitution is not None},
+        "gravity": {f"the direction of gravity in load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
+    }
+
+
+def _round_off(pose: Pose):
+    return 1e6 * eps_of(pose.q.array)
+
+
+def _lengths(contact: Contact) -> dict[str, Scalar]:
+    """Return the lengths (m) that must be positive."""
+    found, shape, ground = {}, contact.shape, contact.ground
+    if isinstance(shape, Ball | Wheel):
+        found["the radius"] = shape.radius
+    if isinstance(shape, Wheel) and shape.tyre is not None:
+        found["the radius less the tyre"] = shape.circle
+    if isinstance(shape, Ellipsoid):
+        found["the smallest semi-axis"] = jnp.min(shape.semi_axes)
+    if isinstance(ground, Cylinder | Sphere):
+        found["the radius of the ground"] = ground.radius
+        if ground.side == "inside" and isinstance(shape, Ball):
+            found["ground radius minus ball radius"] = ground.radius - shape.radius
+    return found
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: the kind of numbers, the test (axis of states first), the sentence for one state, and a
+    label if it ends a motion.
+    """
+
+    of: str
+    wrong: Callable
+    says: Callable[[np.ndarray], str]
+    label: str = ""
+    group: str = "faults"  # "grounds" and "moments": computable, but unlikely to be intended; "gravity"
+
+
+def _size(x):
+    return largest(x, (-2, -1))
+
+
+def _lopsided(x):
+    I = x[..., :3, :]
+    return _size(I - I.swapaxes(-1, -2)) > TOLERANCE * _size(x)
+
+
+def _negative(x):
+    """Return whether an inertia matrix has a negative eigenvalue, by its principal minors, relative to its
+    largest entry or to the inertia of a point.
+    """
+    I, size = x[..., :3, :], _size(x)
+    I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
+    at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
+    minor = lambda i, j, k, m: at(i, k) * at(j, m) - at(i, m) * at(j, k)  # noqa: E731
+    whole = sum(at(0, i) * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
+    return reduce(or_, (x < 0 for x in (*(at(i, i) for i in range(3)), *(minor(i, j, i, j) for i, j in combinations(range(3), 2)), whole)))
+
+
+def _from_identity(R):
+    return _size(R.swapaxes(-1, -2) @ R - np.eye(3))
+
+
+def _volume(R):
+    at = lambda i, k: R[..., i, k]  # noqa: E731
+    return sum(at(0, i) * (at(1, (i + 1) % 3) * at(2, (i + 2) % 3) - at(1, (i + 2) % 3) * at(2, (i + 1) % 3)) for i in range(3))
+
+
+def _off(square):
+    return abs(square**0.5 - 1)
+
+
+def _nowhere(x):
+    """Return whether no state has finite numbers, as one flag per state."""
+    bad = ~all_finite(x.reshape(len(x), -1), axis=1)
+    return bad & np.all(bad)
+
+
+def _exceeds_the_others(x):
+    """Return whether the largest moment of a body exceeds the sum of the others; flat bodies are exempt. For
+    thin wheels both are equal, to the digits of published values.
+    """
+    least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
+    return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))
+
+
+def _says_nothing(piece: str) -> Callable:
+    return lambda _: f"has no finite {piece} at any probed state, expected finite numbers; check its computation"
+
+
+def _unit(kind: str, group: str) -> Check:
+    return Check(
+        kind,
+        lambda square: _off(square) > TOLERANCE,
+        lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; "
+            "divide it by its length",
+        "not a unit vector",
+        group,
+    )
+
+
+def _stated_twice(kind: str) -> Check:
+    return Check(
+        kind,
+        lambda x: abs(x[..., 0] - x[..., 1]) > TOLERANCE * x[..., 2],
+        lambda x: (
+            f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by "
+            "`velocity` and `angular_velocity`; state the motion in both: velocity = d origin/dt, "
+            "angular_velocity = (0, d tilt/dt, 0); if coordinates move it, omit the contact and "
+            f"{_ROWS_INSTEAD}"
+        ),
+        "a plane that contradicts its stated motion",
+        "grounds",
+    )
+
+
+CHECKS = (
+    *(Check(piece, _nowhere, _says_nothing(piece)) for piece in ("mass", "inertia", "orientation", "position")),
+    Check(
+        "touch",
+        _nowhere,
+        lambda _: (
+            "finds no point where body and ground touch at any probed state; make a ball smaller than its "
+            "hollow cylinder or sphere, give a surface a nonzero gradient, and state a `domain` near the "
+            "ground"
+        ),
+    ),
+    Check(
+        "mass",
+        lambda m: m < 0,
+        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check its computation",
+        "a negative mass",
+    ),
+    Check(
+        "inertia",
+        _lopsided,
+        lambda x: "has an inertia that is not symmetric; give the same products of inertia above and below "
+            "the diagonal",
+        "an inertia that is not symmetric",
+    ),
+    Check(
+        "inertia",
+        _negative,
+        lambda x: (
+            f"has a principal moment of inertia of {np.linalg.eigvalsh(x[:3])[0]:.4g} kg m^2, expected none "
+            "below zero; check signs and products of inertia"
+        ),
+        "a negative moment of inertia",
+    ),
+    Check(
+        "orientation",
+        lambda R: _from_identity(R) > TOLERANCE,
+        lambda R: (
+            "has an orientation R that is no rotation: R' R differs from the identity by "
+            f"{_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z or jj.quaternion_to_matrix"
+        ),
+        "an orientation that is no rotation",
+    ),
+    Check(
+        "orientation",
+        lambda R: _volume(R) < 0,
+        lambda R: "has an orientation of determinant -1, a reflection; reverse one axis",
+        "a reflected orientation",
+    ),
+    _unit("unit", "grounds"),
+    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check it", "no positive length"),
+    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius >= 0", "a negative tyre"),
+    Check(
+        "gap",
+        lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],
+        lambda x: (
+            f'has height="coordinates", but at a probed state its body is {x[0]:.4g} m off the ground; let '
+            'the coordinates keep it there, or write height="row"'
+        ),
+        "a body off its ground",
+    ),
+    Check("friction", lambda x: x < 0, lambda x: f"is {x:.4g}, expected a coefficient that is not negative", "a negative coefficient of friction"),
+    Check(
+        "static",
+        lambda x: x[..., 0] < x[..., 1],
+        lambda x: f"is {x[0]:.4g}, expected at least the coefficient of sliding, {x[1]:.4g}",
+        "static friction below sliding friction",
+    ),
+    Check("restitution", lambda x: (x < 0) | (x > 1), lambda x: f"is {x:.4g}, expected a number from 0 to 1", "a restitution that is not from 0 to 1"),
+    _unit("gravity", "gravity"),
+    Check(
+        "ground",
+        lambda x: (x[..., 0] > TOLERANCE) & ~(x[..., 1] > 0).any(0),
+        lambda _: (
+            "moves with another body, but its `velocity` and `angular_velocity` are zero; if that is a body "
+            f"of the scene, omit the contact and {_ROWS_INSTEAD}"
+        ),
+        "a ground that another body carries",
+        "grounds",
+    ),
+    *(_stated_twice(kind) for kind in ("plane", "own plane")),
+    Check(
+        "inertia",
+        _exceeds_the_others,
+        lambda x: (
+            "has principal moments of inertia {:.4g}, {:.4g} and {:.4g} kg m^2, the last above the sum of "
+            "the others: no distribution of mass has them; bound the parameters of its inertia, or free "
+            "fewer".format(*np.linalg.eigvalsh(x[:3]))
+        ),
+        group="moments",
+    ),
+)
+
+
+BY_ROWS = "gap", "own plane"  # kinds of numbers that depend on the projection onto geometric constraints
+
+
+def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return random states t, q, u of the scene's domain, not projected onto the geometric constraints."""
+    return random_states(scene, 3, np.random.default_rng(0))
+
+
+def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
+    """Return for each fault whether the scene has it, at this state or at one of the states from `elsewhere`
+    with the coordinates `others`.
+
+    It works under jit and vmap. NaN is no fault.
+    """
+    times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
+    pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
+    states = tuple(jnp.concatenate([x[None], more.astype(x.dtype)]) for x, more in pairs)
+    # not vmapped: loads may be callbacks without batching
+    numbers = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states)
+    seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
+    return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
+
+
+def any_wrong(stacked: dict[str, Array]) -> Flag:
+    """Return whether any number shows a fault, by kind. Axes: states first, then bodies or grounds."""
+    found = [check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked]
+    return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
+
+
+def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
+    """Return velocities (m/s) of the ground of every contact.
+
+    "plane": velocities of the contact's plane along its normal, from origin and tilt and from velocity and
+    angular velocity, with an upper bound. A plane tangent to a ground at rest has none. "own plane": the same
+    for a `Contact` with a user-defined point. "ground": the rates of all numbers that describe the ground,
+    due to the motion of other bodies, and the ground's stated velocity.
+    """
+    found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
+    pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
+    moving = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
+    size = lambda *parts: sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(parts))  # noqa: E731
+
+    def rates(name: str, t_rate, q_rate, of_bodies):
+        def where(t, q, bodies):
+            contact, ground = contacts_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))[name], contacts[name].ground
+            if ground is not None:
+                ground = [getattr(contact.ground, part) for part in ("origin", "normal", "axis", "radius") if hasattr(ground, part)]
+                ground.append(contact.ground.value(contacts[name].point))
+            return contact.plane.normal, contact.plane.origin, ground
+
+        return jax.jvp(where, (motion.t, motion.q.array, pose.bodies), (t_rate, q_rate, of_bodies))[1]
+
+    for name, contact in contacts.items():
+        plane, arm = contact.plane, contact.point - contact.plane.origin
+        normal_rate, origin_rate, _ = rates(name, jnp.ones_like(motion.t), motion.qdot.array, moving)
+        twice = plane.normal @ origin_rate - normal_rate @ arm, plane.normal @ plane.velocity_at(contact.point)
+        could = size(origin_rate, plane.velocity) + size(arm) * size(normal_rate, plane.angular_velocity)
+        could += _round_off(pose)  # of rates of 1 m/s that vanish at this state
+        found["own plane" if contact.shape is None else "plane"]["the plane of contact "
+            f"`{name}`"] = jnp.stack([*twice, could])
+        if contact.ground is not None:
+            others = {body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate) for body, rate in moving.items()}
+            carried = rates(name, jnp.zeros_like(motion.t), jnp.zeros_like(motion.q.array), others)[2]
+            speeds = [(body.velocity, body.angular_velocity) for other, body in motion.bodies.items() if other != contact.body]
+            stated = plane.velocity, plane.angular_velocity
+            found["ground"][f"the ground of contact `{name}`"] = jnp.stack([size(carried) / (size(speeds) + 1e-8 + 0.0 * motion.t), size(stated)])
+    return found
+
+
+def impossible_bodies(scene: Scene, q) -> Sentences:
+    """Return one sentence for each body that no distribution of mass can have. Bodies without thickness whose
+    other moments are zero are omitted.
+
+        m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
+    """
+    stated = {kind: at_index(_weights(scene, q)[kind], None) for kind in ("mass", "inertia")}
+    return sentences(scene, stated, "faults") + sentences(scene, stated, "moments")
+
+
+@eval_numpy
+def _weights(scene: Scene, q) -> Numbers:
+    return {kind: of for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items() if kind in ("mass", "inertia")}
+
+
+def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:
+    """Return one sentence for each fault of a group of the table, about the first of the given states with
+    the fault. Numbers that are not finite are reported as such only.
+    """
+    found = []
+    for check in (check for check in CHECKS if check.group == group):
+        for name, x in numbers.get(check.of, {}).items():
+            wrong = np.flatnonzero(check.wrong(x))
+            found += [f"{name} of `{type(scene).__name__}` {check.says(x[wrong[0]])}"] if wrong.size else []
+    return tuple(found)

@@ -1,0 +1,194 @@
+"""The rank of constraints at probed states, and the redundant ones among them.
+
+A^ = d A c,  M^ = c M c        rows and inertias in scaled speeds (`scaling.py`)
+"""
+
+import itertools
+from collections.abc import Callable, Iterable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.calculus.reals import Indices, at_index, check_kind, eps_of, largest, rank_cutoff, tiny_of
+from jourdain_jax.scene.names import Labels, as_names
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import speed_scales
+from jourdain_jax.structure.probes import Probed
+
+
+class Scaled(eqx.Module):
+    """The quantities from which ranks and pivots are decided, at every probed state."""
+
+    A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
+    lengths: Float[np.ndarray, "states rows"]  # of the rows before scaling
+    M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
+    c: Float[np.ndarray, "states speeds"]  # scales of the speeds
+
+
+def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
+    """Return `d A c` with the scales used for accelerations (`scaling.row_scale`)."""
+    c = speed_scales(found.M)
+    A = found.A * c[:, None]
+    length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
+    return Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
+
+
+def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
+    """Return the ranks of scaled rows. The cut-off is `rank_cutoff` or, if larger, 100 times the error of the
+    configuration.
+    """
+    if not A.size:
+        return [0] * len(A)
+    sigma = np.linalg.svd(A, compute_uv=False)
+    # smaller singular values are errors of the configuration, not of the rows
+    return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1).tolist()
+
+
+def contradictions(
+    who: str, names: Labels, A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
+) -> Labels:
+    """Return a sentence on constraints that no speeds satisfy together at any of the random states.
+
+        A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
+
+    `A`, `at_rest`: scaled rows and their values phi_0 at u = 0, for constraints affine in the speeds.
+    """
+    U = np.linalg.svd(A, full_matrices=False)[0]
+    U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
+    left = at_rest - (U @ (U.transpose(0, 2, 1) @ at_rest[..., None]))[..., 0]
+    # covers rounded constants; mistakes are larger
+    unmet = np.abs(left) > 1e-4 * largest(at_rest, 1, keepdims=True)
+    if not unmet.size or not unmet.any(axis=1).all():
+        return ()
+    wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
+    idle = [name for name, s in wrong if not A[:, s].any()]
+    if idle:
+        return (
+            f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
+            "relations between coordinates in `geometric_constraints`",
+        )
+    several = ", ".join(f"`{name}`" for name, _ in wrong)
+    return (
+        f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of {len(A)} "
+        "random states; omit or correct one",
+    )
+
+
+def redundant_rows(
+    found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: Labels, far: Callable[[], Scaled]
+) -> Labels:
+    """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
+    state and is well conditioned.
+
+    An omitted row is a combination of the others, with bounded coefficients; large ones count as unbounded.
+    For example, the lateral row of one wheel is a combination of its longitudinal row and the other wheel's,
+    with tangents of the heading as coefficients. `generic`: which of the states `found` are random; `far`:
+    rows at angles far from them.
+    """
+    if not ranks:  # no usable state is reported as another fault
+        return ()
+    kept, everywhere = list(range(len(names))), None
+    for s in reversed(range(len(names))):
+        if len(kept) in ranks:
+            break  # the remaining rows are independent somewhere
+        rest = [i for i in kept if i != s]
+        if ranks_of(found.A[:, rest], errors) != ranks:
+            continue
+        if everywhere is None:
+            everywhere = jax.tree.map(lambda *x: np.concatenate(x), at_index(found, generic), far())
+        if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
+            kept = rest
+    return tuple(name for s, name in enumerate(names) if s not in kept)
+
+
+def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
+    """Return the coefficients that express row s by the rows `rest` at states of full rank, with rows in
+    units of their typical lengths. They are infinite where `rest` does not determine row s.
+    """
+    tiny, made = tiny_of(found.A), []
+    lengths = np.maximum(found.lengths, tiny)
+    usual = np.median(lengths, axis=0)
+    for A, length, its_rank in zip(found.A, lengths, ranks_of(found.A, np.zeros(len(found.A))), strict=True):
+        if its_rank == rank:
+            c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
+            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(eps_of(A))
+            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
+    return np.array(made).reshape(len(made), len(rest))
+
+
+def _are_bounded(c: np.ndarray) -> bool:
+    """Return whether coefficients stay bounded over many states. They do not if one is large, or exceeds its
+    usual size with both signs, as a tangent does.
+    """
+    usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(eps_of(c))
+    poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
+    return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (largest(c, 0) > 2)))
+
+
+def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Indices:
+    """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and unless
+    there are `freedoms` of them.
+    """
+    check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
+    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
+    if len(set(chosen)) != len(chosen):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice "
+            f"({', '.join(as_names(names))}); name independent ones")
+    if len(chosen) != freedoms:
+        raise ValueError(
+            f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has "
+            f"{freedoms} degrees of freedom; name {freedoms} independent speeds"
+        )
+    return chosen
+
+
+def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray:
+    """Return the smallest singular value of A_z at every probe."""
+    if rank == 0:
+        return np.ones(len(scaled))
+    return np.linalg.svd(scaled[:, :, dependent], compute_uv=False)[:, rank - 1]
+
+
+def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
+    """Return the smallest pivot over the domain; zero if the determinant of A_z changes sign between probes,
+    since it vanishes in between.
+    """
+    if rank and scaled.shape[1] == rank:
+        signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
+        if signs.min(initial=0.0) < 0 < signs.max(initial=0.0):
+            return 0.0
+    return float(pivots.min(initial=1.0))
+
+
+def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
+    """Return the independent speeds with the largest worst pivot over all probes; the largest typical pivot
+    breaks ties.
+    """
+    if rank == 0:
+        return tuple(range(count))
+    subsets = list(itertools.islice(itertools.combinations(range(count), rank), 3001))
+    if len(subsets) > 3000:
+        subsets = list({_greedy(A, rank) for A in scaled})
+
+    def merit(dependent, probes):
+        pivots = pivots_at(probes, list(dependent), rank)
+        return round(worst_pivot(probes, list(dependent), rank, pivots), 6), round(float(np.median(pivots)), 6)
+
+    some = scaled[:: max(1, len(scaled) // 40)]
+    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:40]
+    dependent = max(best, key=lambda dependent: merit(dependent, scaled))
+    return tuple(i for i in range(count) if i not in dependent)
+
+
+def _greedy(A: np.ndarray, rank: int) -> Indices:
+    """Return columns chosen in turn by largest remaining length (pivoted QR)."""
+    remaining, chosen = A.copy(), []
+    for _ in range(rank):
+        lengths = np.linalg.norm(remaining, axis=0)
+        k = int(np.argmax(lengths))
+        chosen.append(k)
+        e = remaining[:, k] / lengths[k]
+        remaining = remaining - np.outer(e, e @ remaining)
+    return tuple(sorted(chosen))

@@ -1,0 +1,141 @@
+"""Constraints of a class of scenes as a scalar program for projecting and checking starts: residuals, their
+derivatives, the mass matrix.
+
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
+
+Unit norms of quaternions count as geometric constraints.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.calculus.reals import Indices
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+from jourdain_jax.program.subgraph import part_of
+from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
+from jourdain_jax.scene.parameter_fields import parameter_faults
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere
+from jourdain_jax.structure.probes import LookedAt, looked_at
+
+Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
+
+
+@dataclass(frozen=True, eq=False)
+class RowProgram:
+    """Nodes of a graph, compared by identity, so that they can be a static argument of compiled functions.
+    Matrices are dictionaries by (row, column), without zeros.
+    """
+
+    graph: Graph
+    parameters: tuple[Indices, ...]  # of each leaf of the scene, by entry; -1 for unused ones
+    t: int
+    q: Indices
+    u: Indices
+    inputs: Indices
+    g: Indices
+    G: Matrix
+    phi: Indices
+    A: Matrix
+    M: Matrix | None  # lower triangle; None if too large to be written out
+    right: int  # truth value: parameters and bodies are valid
+    # coordinates of other states, projected onto the geometric constraints, on which `right` also depends
+    others: Indices
+
+
+@once_per_class
+def row_program(scene: Scene) -> RowProgram | None:
+    """Return the program of a class of scenes; None if a part of it has no scalar program."""
+    scene = with_reference_parameters(scene)
+    try:
+        nodes = looked_at(scene)
+        right, others = _right(scene, nodes)
+    except Unsupported:
+        return None
+    graph, traced = nodes.graph, nodes.traced
+    q, u = traced.q.tolist(), traced.u.tolist()
+    parts: dict[str, Any] = {
+        "t": traced.t,
+        "q": q,
+        "u": u,
+        "inputs": traced.inputs.tolist(),
+        "g": nodes.closures,
+        "G": _entries(nodes.of_closures, q),
+        "phi": traced.at.phi.tolist(),
+        "A": _entries(nodes.rows, u),
+        "M": _mass_matrix(nodes, u),
+        "right": right,
+        "others": others,
+    }
+    needed = jax.tree.leaves(parts)
+    if graph.calls(needed):
+        return None
+    own, place = part_of(graph, needed)
+    listed: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in jax.tree.map(lambda n: int(place[n]), parts).items()}
+    return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
+
+
+def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
+    """Return the node of a truth value, true for valid parameters, and the coordinates of other states on
+    which it depends.
+
+    Parameters are valid if each is finite, has its required sign, and causes no fault of
+    `plausibility.CHECKS`. Faults independent of parameters are found when the scene is probed. If geometric
+    constraints depend on parameters, so do the coordinates of these states.
+    """
+    g, traced = looked.graph, looked.traced
+    states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0
+    on_rows = [[g.input(f"other_{k}_{i}", True) for i in range(count)] for k in range(len(states))]
+    of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
+    held = traced.q.tolist() if any(depend_on(g, looked.closures, of_parameters)) else []
+    varying = [traced.t, *traced.q.tolist(), *traced.u.tolist()]
+    placed = [[g.const(t), *(own or map(g.const, q)), *map(g.const, u)] for (t, q, u), own in zip(states, on_rows, strict=True)]
+    others = [dict(zip(varying, state, strict=True)) for state in placed]
+
+    def at_states(nodes: np.ndarray) -> np.ndarray:
+        flat = nodes.ravel().tolist()
+        return np.array([flat, *(g.substituted(flat, other) for other in others)]).reshape(-1, *nodes.shape)
+
+    judged = dict.fromkeys(check.of for check in CHECKS if check.label)
+    every = {kind: list(map(np.asarray, traced.particulars.numbers[kind].values())) for kind in judged}
+    deciding = {kind: [*of_parameters, *(held if kind in BY_ROWS else [])] for kind in judged}
+    matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))  # noqa: E731
+    kept = {kind: [x for x in of if matters(kind, x)] for kind, of in every.items()}
+    stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
+    nodes = [*traced.parameters, *stacked.values()]
+    treedef, count = jax.tree.structure(scene), len(traced.parameters)
+
+    def right(*given):
+        faults = parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()
+        return ~jnp.any(jnp.stack([*faults, any_wrong(dict(zip(stacked, given[count:], strict=True)))]))
+
+    closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
+    (found,) = interpret(g, closed, [Nodes(x) for x in nodes])
+    node, given = int(as_nodes(g, found)), [n for state in on_rows for n in state]
+    return node, given if any(depend_on(g, [node], given)) else []
+
+
+def _entries(rows: list[dict[int, int]], variables: list[int]) -> Matrix:
+    place = {n: k for k, n in enumerate(variables)}
+    return {(i, place[n]): node for i, row in enumerate(rows) for n, node in row.items()}
+
+
+def _mass_matrix(nodes: LookedAt, u: list[int]) -> Matrix | None:
+    """Return the lower triangle of `M = d^2 T/du^2`, or None if it is too large."""
+    # more products of entries of velocities than this: too large to be written out
+    if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:
+        return None
+    graph, (kinetic, _) = nodes.graph, nodes.traced.at.energies.tolist()
+    momenta = jacobian(graph, [kinetic], u)[0]
+    slopes = jacobian(graph, list(momenta.values()), u)
+    place = {n: k for k, n in enumerate(u)}
+    found = {(place[n], place[m]): node for n, row in zip(momenta, slopes, strict=True) for m, node in row.items() if place[m] <= place[n]}
+    at_rest = graph.substituted(list(found.values()), dict.fromkeys(u, graph.zero))
+    return {key: int(node) for key, node in zip(found, at_rest, strict=True) if node != graph.zero}

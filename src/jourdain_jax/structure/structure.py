@@ -1,0 +1,397 @@
+"""Facts that hold at every state of a scene, found once by probing: rank, privileged velocities, kinds of
+constraints.
+
+Random states are drawn from the scene's domain. Symmetric configurations (zero and right angles) are added,
+since partitions that are regular at random states may be singular there. All are projected onto the geometric
+constraints. Probing uses concrete numbers even while a scene's parameters are traced (numbers near the
+class's defaults), so that the choice is static.
+"""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, is_traced, largest
+from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
+from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import speed_scales, typical_row_lengths
+from jourdain_jax.structure.plausibility import sentences
+from jourdain_jax.structure.probes import TIMED, Probed, follow_from_others, probed_on_graph
+from jourdain_jax.structure.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
+from jourdain_jax.structure.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
+from jourdain_jax.structure.smoothness import kinks
+
+RANDOM_PROBES = 24
+WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is the default
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Properties of a scene found by probing: rank, privileged speeds, dependence on time, faults."""
+
+    row_names: Labels
+    rank: int  # at generic states
+    ranks: tuple[int, ...]  # at all probed states
+    redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
+    may_set_in: Labels  # those of them that may be independent away from the probes
+    rank_losses: Labels  # probed configurations with fewer independent rows, as text
+    independent: Indices  # privileged speeds, chosen by the user or by conditioning
+    worst_pivot: float  # smallest singular value of the scaled A_z over all probes
+    typical_pivot: float  # its median
+    affine: bool  # constraints are linear or affine in the speeds
+    homogeneous: bool  # phi vanishes at u = 0
+    timed: Labels  # quantities that depend explicitly on time, from `TIMED`
+    driven: bool  # bodies or coordinates move while all speeds are zero
+    massless: bool  # M is singular: some free motion has no inertia
+    varying_inertia: bool  # masses or central inertias change along the motion
+    potentials_of_inputs: Indices  # indices of the loads whose potential depends on inputs
+    rows_of_inputs: bool  # constraints depend on inputs; accelerations then depend on their rates
+    chosen_by_user: bool
+    kinks: Labels  # quantities that are not smooth, as sentences
+    odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
+    odd_grounds: Labels  # grounds of contacts whose motion contradicts the stated one
+    faults: Labels  # impossible bodies and planes, contradictory constraints; as sentences
+    row_lengths: np.ndarray = field(compare=False, repr=False)  # typical, in scaled speeds
+    plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in unscaled speeds
+    times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric constraints
+    coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
+    random: int  # number of random ones
+    closure_slopes: np.ndarray = field(compare=False, repr=False)  # of closures, first states
+    row_slopes: np.ndarray = field(compare=False, repr=False)  # A, same states
+
+    @property
+    def decisions(self) -> tuple:
+        """Return the findings that decide how the scene is integrated; the others describe it."""
+        of_rows = self.row_names, self.rank, self.redundant_rows, self.may_set_in, self.affine, self.homogeneous, self.rows_of_inputs
+        of_speeds = self.independent, self.chosen_by_user, self.well_conditioned, self.typical_pivot >= WELL_CONDITIONED
+        return *of_rows, *of_speeds, self.timed, self.driven, self.massless, self.varying_inertia, self.potentials_of_inputs
+
+    @property
+    def rheonomic(self) -> bool:
+        """Return whether any quantity of `TIMED` depends explicitly on time."""
+        return bool(self.timed)
+
+    @property
+    def timed_kinematics(self) -> bool:
+        """Return whether constraints, poses or coordinate rates depend explicitly on time."""
+        return not {"rows", "poses", "coordinate rates"}.isdisjoint(self.timed)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Return the number of independent speeds at generic states."""
+        return len(self.independent)
+
+    @property
+    def kept_rows(self) -> Indices:
+        """Return indices of the rows that are not redundant."""
+        return tuple(s for s, name in enumerate(self.row_names) if name not in self.redundant_rows)
+
+    @property
+    def dependent_rows(self) -> bool:
+        """Return whether the kept rows still depend on each other, each being needed at some state."""
+        return len(self.kept_rows) > self.rank
+
+    @property
+    def rows_may_contradict(self) -> bool:
+        """Return whether constraints are redundant and prescribe motion at rest. The omitted constraints may
+        then contradict the others.
+        """
+        return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
+
+    @property
+    def has_minimal_state(self) -> bool:
+        """Return whether the integrated state is by default the coordinates and privileged speeds."""
+        return self.affine and self.well_conditioned
+
+    @property
+    def well_conditioned(self) -> bool:
+        """Return whether the privileged velocities are usable everywhere in the domain."""
+        # for a chain of n rows that each couple two neighbours the value falls as 1/n, although no pivot does
+        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
+
+
+def _moves(rates: np.ndarray) -> bool:
+    """Return whether any rate is a number other than zero."""
+    return bool(np.any(np.isfinite(rates) & (rates != 0)))
+
+
+def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
+    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because
+    constraints may have any unit.
+    """
+    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
+    return bool(np.any(np.abs(difference) > tolerance * size))
+
+
+def _sizes(found: Probed) -> np.ndarray:
+    """Return the largest entry of every row, at every state."""
+    return largest(found.A, 2)
+
+
+def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    try:
+        found = probed_on_graph(scene, t, q, u, u_other, generic)
+        if not found.in_calls:
+            return found
+        # the graph does not show how calls behave away from the probes, so a few distant states are probed
+        generator, count = np.random.default_rng(1), 16
+        far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
+        for first, _ in scene.coordinates.quaternions:
+            far[1][:, first : first + 4] = q[:count, first : first + 4]
+        u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
+        beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
+        return replace(found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u)))
+    except Unsupported as reason:
+        raise ValueError(
+            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
+            "that part a rule with `jax.custom_jvp`"
+        ) from None
+
+
+def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
+    """Return the quantities that are nonzero at distant states; for constraints, above round-off."""
+    some = np.sqrt(eps_of(found.A))
+    seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
+    rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
+    rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
+    return frozenset(seen | rows)
+
+
+def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
+    """Return the sizes of the terms of every constraint at the probed speeds."""
+    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
+
+
+def structure_of(scene: Scene) -> Structure:
+    """Return static facts about a scene: rank of its constraints, privileged velocities and their
+    conditioning, kinds of constraints; eqs. (25)-(31).
+
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers
+    replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not move
+    smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For known
+    parameters, raises it also for impossible numbers of bodies or planes, and for contradictory constraints.
+    """
+    structure = structure_whatever_its_faults(scene)
+    # replaced parameters prove nothing about bodies and grounds
+    if wrong := structure.kinks or (is_judged(scene) and (structure.odd_grounds or structure.faults)):
+        raise ValueError(wrong[0])
+    return structure
+
+
+def structure_whatever_its_faults(scene: Scene) -> Structure:
+    """Return static facts about a scene without raising its faults."""
+    return _structure(as_scene(scene))
+
+
+def is_judged(scene: Scene) -> bool:
+    """Return whether the parameters of a scene are known, so that findings at its probed states apply to it.
+    """
+    return not is_traced(scene)
+
+
+def trust(scene: Scene) -> float:
+    """Return the weight of typical lengths: 1, or 0.001 for traced parameters, whose true values may have
+    another magnitude.
+    """
+    return 1.0 if is_judged(scene) else 1e-3
+
+
+def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
+    """Return typical lengths of the rows of `A` in the units of the speeds."""
+    return structure_whatever_its_faults(scene).plain_row_lengths * trust(scene)
+
+
+def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
+    """Return typical lengths of the geometric rows (of their rates) and of quaternion norms in the
+    coordinates, for `project_positions`.
+    """
+    geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
+    return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
+
+
+def usual_rows(scene: Scene) -> UsualRows:
+    """Return typical lengths of the rows in scaled speeds, and their rank at generic states."""
+    known = structure_whatever_its_faults(scene)
+    return UsualRows(known.row_lengths * trust(scene), np.asarray(known.rank, np.int32))
+
+
+@once_per_values
+def _structure(scene: Scene) -> Structure:
+    with np.errstate(all="ignore"):  # probes with NaN are ignored
+        return _probed_structure(scene)
+
+
+def _probed_structure(scene: Scene) -> Structure:
+    names = names_of_rows(scene)
+    count = len(scene.speed_names)
+    for drawn in drawn_states(scene, RANDOM_PROBES, np.random.default_rng(0)):
+        t, u, generic, found = _at_probes(scene, *drawn)
+        if (np.isfinite(found.error) & all_finite(found.A, axis=(1, 2)))[generic].any():
+            break
+    on_rows = usable_states(scene, found, generic)
+    numbers = at_index(found.numbers, on_rows)
+    rough, (grounds, bodies, faults) = kinks(scene, found.q[on_rows & generic], u), (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
+    A = found.A * speed_scales(found.M)[:, None]
+    usable = all_finite(A, axis=(1, 2)) & on_rows
+    if not faults and not usable.any():
+        finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
+        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "(all)"
+        faults = (
+            f"constraints {named} of `{type(scene).__name__}` are not finite at any probed state, expected "
+            "numbers; check their computation",
+        )
+    if usable.any() and not usable[generic].any():
+        raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone do not show the generic rank
+    typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
+    beyond = found.A_beyond[generic]
+    t, u, generic, found = at_index((t, u, generic, found), usable)
+    scaled = scaled_states(found, typical)
+    ranks = ranks_of(scaled.A, found.error)
+    rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
+    if not faults:  # a negative mass is reported as a fault instead
+        _check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
+    # at isolated losses of rank no partition has the generic size
+    candidates = scaled.A[[r == rank for r in ranks]]
+    by_user = scene.privileged
+    independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
+    dependent = [i for i in range(count) if i not in independent]
+    pivots = pivots_at(candidates, dependent, rank)
+    full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
+    acts, at_rest = lambda name: name in unproved or _moves(found.vanishing[name]), found.vanishing["rows at rest"]
+    affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
+    # near round-off: integrating zero work does less harm than omitting work
+    homogeneous = "rows at rest" not in unproved and not _exceeds(at_rest, 32 * eps, _speeds(found, u))
+    rows_of_inputs = acts("rows of inputs")
+    # smaller numbers may be errors of tables and iterations
+    asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))
+    if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
+        asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
+        faults = contradictions(type(scene).__name__, names, scaled.A[generic], asked, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
+    # last, since the replacement of a traced direction must not hide another fault
+    faults = faults or sentences(scene, found.numbers, "gravity")
+    redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
+    return Structure(
+        row_names=names,
+        rank=rank,
+        ranks=tuple(ranks),
+        redundant_rows=redundant,
+        may_set_in=redundant
+        if redundant and "rank" in unproved and not follow_from_others(scene, t, found.q, u, [names.index(name) for name in redundant])
+        else (),
+        rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
+        independent=independent,
+        worst_pivot=worst_pivot(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
+        typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
+        affine=affine,
+        homogeneous=homogeneous,
+        timed=tuple(filter(acts, TIMED)),
+        driven=acts("motion at rest"),
+        massless=_is_singular(scaled.M[generic]),
+        varying_inertia=acts("inertia"),
+        potentials_of_inputs=tuple(sorted(int(name.split()[1]) for name in found.vanishing if name.startswith("potential ") and acts(name))),
+        rows_of_inputs=rows_of_inputs,
+        chosen_by_user=by_user is not None,
+        kinks=rough,
+        odd_bodies=bodies,
+        odd_grounds=grounds,
+        faults=faults,
+        row_lengths=typical,
+        plain_row_lengths=typical_row_lengths(found.A[generic], beyond),
+        times=t,
+        coordinates=found.q,
+        random=int(np.sum(generic)),
+        closure_slopes=found.G[generic][:4],
+        row_slopes=found.A[generic][:4],
+    )
+
+
+def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
+    """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
+    symmetric = symmetric_configurations(scene)
+    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
+    generic = np.arange(len(t)) < RANDOM_PROBES
+    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
+
+
+def _is_singular(M: np.ndarray) -> bool:
+    """Return whether scaled inertias are singular at all states."""
+    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M)))
+
+
+def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
+    """Raise ValueError for speeds along which free motion has no inertia at every generic state."""
+    moved = []
+    for A, M, c in zip(found.A, found.M, found.c, strict=True):
+        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
+        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
+        if not sizes.size or sizes[0] > 16 * len(M) * eps_of(M):
+            return
+        moved.append(np.abs(c * (free @ directions[:, 0])))
+    if not moved:
+        return
+    share = np.median([x / x.max() for x in moved], axis=0)
+    moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
+    names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
+    raise ValueError(
+        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
+        "constraint determines it; give a body that moves with it a mass (or inertia), add a constraint, or "
+        "omit the coordinate"
+    )
+
+
+def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
+    """Return scaled rows at states on the geometric constraints whose coordinates differ from the given ones
+    by up to half a turn.
+    """
+    generator = np.random.default_rng(4)
+    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
+    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
+    for first, _ in scene.coordinates.quaternions:
+        turned[:, first : first + 4] = q[:, first : first + 4]
+    found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
+    good = np.isfinite(found.error) & all_finite(found.A, axis=(1, 2))
+    return at_index(scaled_states(found, typical), good)
+
+
+def _describe(scene: Scene, q: np.ndarray) -> str:
+    values = [f"{name} = {value:.4g}" for name, value in zip(scene.coordinate_names.entries, q, strict=True) if abs(value) > 1e-12]
+    return ", ".join(values) or "all coordinates zero"
+
+
+class Reference:
+    """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
+
+    Two references are equal if their scenes lead to the same decisions (`Structure.decisions`), and then
+    share one program. So the arguments of a call determine its program, not the order of calls. Parameters
+    that are already traced are replaced by the class's defaults.
+
+    `varied`: names of parameters that differ within a batch (None: all). They are replaced by numbers nearby,
+    so that coincidences do not count.
+    """
+
+    def __init__(self, scene: Scene, varied: Iterable[str] | None = None):
+        self.scene = with_reference_parameters(scene)
+        self._varied = None if varied is None else frozenset(varied)
+        decisions = structure_whatever_its_faults(self.scene).decisions
+        self._key = jax.tree.structure(scene), self._varied, decisions, jax.config.jax_enable_x64
+
+    @contextmanager
+    def stands_in(self) -> Iterator[None]:
+        """Return a context in which its numbers replace traced parameters."""
+        with reference_parameters(self.scene, self._varied):
+            yield
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __eq__(self, other):
+        return isinstance(other, Reference) and self._key == other._key

@@ -1,0 +1,238 @@
+"""A study: the variation over many motions of one scene, and how they are run."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Unpack
+
+import numpy as np
+
+from jourdain_jax.calculus.reals import checked_real, checked_whole, described
+from jourdain_jax.motion.model import Model, build
+from jourdain_jax.motion.options import MotionFields, Options, as_options
+from jourdain_jax.motion.simulate import span_and_times
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.studies.cluster import on_cluster
+from jourdain_jax.studies.design import MOST_SAMPLES, Design
+from jourdain_jax.studies.distributions import Distribution, Levels
+from jourdain_jax.studies.mean_gradients import MeanGradients, mean_gradients
+from jourdain_jax.studies.memory import of_each
+from jourdain_jax.studies.outputs import Integral, as_outputs
+from jourdain_jax.studies.result import StudyResult
+from jourdain_jax.studies.run import bounded, in_this_process, run
+from jourdain_jax.studies.task import AT_START, SAVES, Task
+from jourdain_jax.studies.workers import in_processes
+
+_STATED = "times to save at are `ts`, and what is stored is chosen by `outputs` and `save`"
+REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
+REFUSED["every"] = "trajectories of every N-th lane are kept by `keep_every=N`"
+
+
+class TaskFields(MotionFields, total=False):
+    """Arguments of a run of a study, by name."""
+
+    t0: Any
+    t1: Any
+    ts: Any
+    outputs: Mapping | None
+    save: str
+    keep_every: int | None
+    options: Options | None
+
+
+@dataclass(frozen=True, repr=False)
+class Study(Printed):
+    """Many motions of one scene with varying parameters or start values.
+
+    - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
+      number for all samples (the rest is solved for, as by `jj.start`; default: the scene's example). A
+      variation is a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of
+      a grid, or a list with one number per sample; all must be of one kind.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Sample k depends only on the seed and k.
+
+        disc = jj.models.TiltingDisc()
+        study = jj.Study(disc, vary={"radius": jj.Normal(0.5, 0.01)}, start={"lean": jj.Uniform(-0.6, 0.6), "spin_rate": -3.0}, sampler="sobol", samples=1024)
+        result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.End("lean", "rad"), "fallen": jj.Happened("fallen")})
+        print(result)
+
+    Raises ValueError for unknown names and for quantities that cannot vary. Needs the extra `studies`.
+    """
+
+    scene: Any  # a scene, or a model, from which the scene is taken
+    vary: Any = None  # dictionaries by name; `correlation` by pairs of names
+    start: Any = None
+    sampler: str = "random"
+    samples: int | None = None
+    seed: int = 0
+    correlation: Any = None
+    # the samples: parameters by name, start values by name with `_at_start`
+    design: Design = field(init=False, repr=False, compare=False)
+    _given: Any = field(init=False, repr=False, compare=False)  # the scene, or its model
+    _constants: dict = field(init=False, repr=False, compare=False)  # start values that do not vary
+
+    def __post_init__(self):
+        object.__setattr__(self, "_given", self.scene)
+        object.__setattr__(self, "scene", as_scene(self.scene))
+        varying, constants = self._named()
+        object.__setattr__(self, "_constants", constants)
+        column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
+        pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
+        object.__setattr__(self, "design", Design(varying, self.sampler, self.samples, self.seed, pairs or None))
+
+    def _named(self) -> tuple[dict, dict]:
+        """Return the varying quantities by the names of their columns, and the constant start values."""
+        examples = {"vary": '{"mass": jj.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
+        for what, example in examples.items():
+            if (given := getattr(self, what)) is not None and not isinstance(given, Mapping):
+                raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as "
+                    f"{example}")
+        known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
+        varying = {}
+        for name, how in (self.vary or {}).items():
+            check_name(name, known, f"scene `{type(self.scene).__name__}` has no parameter `{name}`")
+            if known[name]:
+                raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a "
+                    "parameter from which the scene makes that array")
+            if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
+                raise ValueError(
+                    f"parameter `{name}` is to vary as {described(how)}; set one value on the scene itself, "
+                    "or give a distribution"
+                )
+            varying[name] = how
+        q, u = self.scene.coordinate_names, self.scene.speed_names
+        groups = {group for names in (q, u) for group, _, _ in names.groups}
+        constants = {}
+        for name, how in (self.scene.example if self.start is None else self.start).items():
+            check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed "
+                f"`{name}` to start with")
+            if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
+                checked_real(how, f"start `{name}`", advice="give its value")
+                constants[name] = how
+            elif name in groups:
+                raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its "
+                    "entries")
+            else:
+                varying[name + AT_START] = how
+        return varying, constants
+
+    def task(
+        self,
+        *,
+        t1=None,
+        ts=None,
+        t0=None,
+        outputs: Mapping | None = None,
+        save: str = "outputs",
+        keep_every: int | None = None,
+        inputs=None,
+        options=None,
+        **by_name,
+    ) -> Task:
+        """Return a description of everything that determines the results of a run. Arguments as in `run`:
+        `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`, `by_name`.
+        """
+        check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
+        if keep_every is not None:
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected=
+                "of at least 1, or None to store no trajectories")
+        options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
+        if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
+            # as for the scene itself: a study may continue with another memory bound
+            options = replace(options, formulation=None)
+        known = as_outputs(self.scene, outputs)
+        first, times, last = span_and_times(self.scene, None, t0, t1, ts)
+        if ts is None and keep_every is None and not any(output.over_times for output in known.values()):
+            times = last[None]
+        if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
+            text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would omit the time between"
+            raise ValueError(f"{text}; begin `ts` at the start of the motion")
+        span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
+        return Task(self.scene, self.design, self._constants, known, span, options, save, keep_every)
+
+    def run(
+        self,
+        path: str | os.PathLike,
+        *,
+        chunk: int | None = None,
+        progress: bool = True,
+        processes: int = 1,
+        client=None,
+        shard: tuple[int, int] = (1, 1),
+        command: str = "",
+        **what: Unpack[TaskFields],
+    ) -> StudyResult:
+        """Compute the missing part of the study in the folder `path`, which is created if necessary, and
+        return its results.
+
+        The same call on the same folder continues an earlier one, however that ended. Results are bit-equal
+        for all `chunk` sizes, orders and interruptions.
+
+        - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
+          are evaluated (default: 201 equidistant ones; only the end if all outputs use only the end).
+        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`,
+          `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a trajectory; default: the end values
+          of all coordinates and speeds. They are NaN for failed motions.
+        - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
+          "statistics" stores only counts, sums and histograms.
+        - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample (with save="statistics"
+          its other results, too); 1: of all samples; None: of none.
+        - `chunk`: number of samples stored together (default: about a thousandth of all); after a crash at
+          most one chunk is computed again.
+        - `processes`: the number of computing processes, each with its share of the cores. More than one need
+          a script whose top level is guarded by `if __name__ == "__main__":`, and outputs that are not
+          defined inside functions.
+        - `client`: a `dask.distributed.Client` whose workers compute, one chunk at a time each; all of them
+          must reach the folder.
+        - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
+          machines; `jj.merge_studies` combines them.
+        - `progress`: show a bar; `command`: text stored with the study.
+        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to
+          `keep_every` above, are the `what` of the signature.
+
+        If the scene is a model, `jj.build(scene, memory="2GB")`, its memory bounds all computing processes of
+        this machine together, including the present one; with `client`, it bounds each worker. Blocks and
+        chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies with
+        other block sizes differ in their last digits.
+
+        Raises ValueError if the folder holds another study or the memory is too small, MemoryError if it was
+        exceeded, `InUseError` if another process runs the study, and OSError if the folder cannot be written.
+        On Ctrl-C the current chunk is finished and all results are stored; then KeyboardInterrupt is raised.
+        """
+        task = self.task(**what)
+        if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:
+            raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
+        checked_whole(processes, "`processes`", 1, expected="of at least 1")
+        if client is not None and processes != 1:
+            raise ValueError("`client` and `processes` are both given; give one of them: the workers of a "
+                "cluster, or processes of this machine")
+        here = client is None and processes == 1
+        memory = self._given.memory if isinstance(self._given, Model) else None
+        task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
+        compute = partial(in_this_process, task) if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
+        store = run(task, path, chunk=chunk, progress=progress, shard=shard, command=command, workers=compute)
+        return StudyResult(store, task)
+
+    def mean_gradients(self, *, parameters: Sequence[str] = (), **what: Unpack[TaskFields]) -> MeanGradients:
+        """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
+        and to shared `parameters`.
+
+        They are pathwise derivatives: the mean over samples of exact derivatives of their motions, in forward
+        mode. If samples end at events, a `SensitivityWarning` (also in `warnings` of the result) names the
+        missing part. This process computes them; nothing is stored.
+
+        - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
+
+            found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.End("lean", "rad")}, parameters=("gravity",))
+            found.of("final lean", "radius.sigma")
+
+        Raises ValueError for unknown names.
+        """
+        return mean_gradients(self.task(**what), tuple(parameters))
+
+    def _text(self) -> str:
+        constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._constants.items())
+        return f"Study of {type(self.scene).__name__}\n{self.design}" + (f"\n  all start with {constants}" if constants else "")

@@ -1,0 +1,174 @@
+"""Several processes that compute the chunks of one study; each is started afresh (never forked from one in
+which JAX runs) and has its share of the cores.
+
+The unfinished chunks of a worker that died are given to a new worker, one at a time. A chunk on which workers
+died three times is omitted, with a warning that names its samples.
+"""
+
+import contextlib
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import connection, get_context, parent_process
+from pathlib import Path
+from typing import Any
+
+from jourdain_jax.scene.arguments import warn
+from jourdain_jax.studies.run import Runner
+from jourdain_jax.studies.store import Store
+from jourdain_jax.studies.task import Task
+
+MOST_DEATHS = 3  # deaths of processes on one chunk before it is omitted
+_NONE_BEGAN = (
+    "no worker of this study could start; see its printed error. Each imports the main program: run studies "
+    "in it under `if __name__ == '__main__':`, and define scenes and outputs in a module; or take processes=1"
+)
+_runners: dict[tuple, Runner] = {}  # of this process: for the latest study and folder
+_one_at_a_time = threading.Lock()
+
+
+def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
+    """Return the workers of `run`. Raises ValueError if the task cannot be sent to another process."""
+    sent = sent_to_others(task)
+
+    def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+        def compute(numbers: list[int], alone: bool):
+            context, most = get_context("spawn"), 1 if alone else count
+            begun, places = context.Event(), context.Queue()
+            for place in range(most):
+                places.put((place, most))
+            with ProcessPoolExecutor(most, mp_context=context, initializer=_begin, initargs=(sent, places, begun)) as pool:
+                died = yield from computed(
+                    lambda number: pool.submit(chunk, number, sent, str(store.path)), BrokenProcessPool, store, numbers, interrupted, most
+                )
+                if died and not begun.is_set():
+                    raise RuntimeError(_NONE_BEGAN)
+                return died
+
+        return whatever_dies(store, numbers, interrupted, compute, MOST_DEATHS - 1)
+
+    return workers
+
+
+def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
+    """Return the counts of a chunk after computing and storing it; one at a time in this process. Chunks that
+    a process stored before it died are not computed again.
+    """
+    with _one_at_a_time:
+        which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
+        if which not in _runners:
+            _runners.clear()
+            _runners[which] = Runner(pickle.loads(sent), Store(path))
+        runner = _runners[which]
+        receipt = runner.store.receipt(number)
+        return receipt.lanes if receipt else runner.run(number)
+
+
+def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
+    """Yield the counts of the chunks `numbers`, computed even if processes die. Chunks on which they die
+    repeatedly are omitted with a warning.
+
+    - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed ones of each
+      chunk, and returns the indices of unfinished ones if a process died.
+    - `attempts`: how often each of these chunks is tried alone, to exclude other chunks as the cause.
+
+    A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
+    RuntimeError if this happens in the first block, which every process computes.
+    """
+    waiting, left_out = list(numbers), []
+    while waiting and not interrupted():
+        for number in (yield from compute(waiting, False)):
+            deaths = 0
+            while deaths < attempts and not interrupted() and (yield from compute([number], True)):
+                deaths += 1
+            if deaths == attempts:
+                left_out.append(number)
+                if store.read_grid() is None:
+                    raise RuntimeError(f"{_died(store, [0])}, with which every process begins. {_ADVICE}")
+        waiting = [number for number in waiting if number not in left_out and store.receipt(number) is None]
+    if left_out:
+        said = (
+            f"{_died(store, sorted(left_out))}, which are omitted; all others are stored, and the same call "
+            f"tries these again. {_ADVICE}"
+        )
+        warn(said)
+
+
+_ADVICE = (
+    "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or "
+    "simulate these lanes one by one, each in its own process, to see why"
+)
+
+
+def _died(store: Store, numbers: list[int]) -> str:
+    return f"processes died {MOST_DEATHS} times on {store.lanes_of(numbers)}"
+
+
+def sent_to_others(task: Task) -> bytes:
+    """Return the task as bytes for another process. Raises ValueError if it cannot be sent."""
+    try:
+        return pickle.dumps(task)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        text = "define scene and outputs at the top level of a module, not as lambdas or inside functions, or take processes=1 and no `client`"
+        raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
+
+
+def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
+    """Yield the numbers of samples and of failed ones of chunks as they finish, at most `most` of them at
+    once. Return the indices of chunks on which a process died.
+
+    `submit(number)`: a future of `concurrent.futures`; `deadly`: the error that reports a dead process.
+    """
+    left = iter(numbers)
+    running: dict[Any, int] = {}
+    died: list[int] = []
+    while True:
+        while not died and len(running) < most and not interrupted() and (number := next(left, None)) is not None:
+            try:
+                running[submit(number)] = number
+            except deadly:  # a pool with a dead process
+                died.append(number)
+        if not running:
+            receipts = {number: store.receipt(number) for number in died}
+            # stored before the process died
+            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)
+            return [number for number, receipt in receipts.items() if receipt is None]
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            number = running.pop(future)
+            try:
+                yield future.result()
+            except deadly:
+                died.append(number)
+
+
+def _begin(sent: bytes, places, begun) -> None:
+    """Start a worker: bind it to its cores, ignore Ctrl-C (which the parent handles), and end it with its
+    parent; `begun`: an event that is set when it can compute.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if parent := parent_process():
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    keep_to_share(*places.get())
+    pickle.loads(sent)
+    begun.set()
+
+
+def keep_to_share(place: int, count: int) -> None:
+    """Bind this thread, and all threads that it starts, to the cores of process `place` of `count`. Call it
+    before JAX starts its threads, one per core.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    own = cores[place::count] or cores
+    os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
+    with contextlib.suppress(AttributeError, OSError):  # not every system supports this
+        os.sched_setaffinity(0, own)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent (a handle of the operating system) has ended, or if it already has."""
+    connection.wait([parent])
+    os._exit(1)

@@ -1,0 +1,140 @@
+"""Pictures of a scene's bodies with matplotlib: animations, stills, and the view of a scene in a notebook."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jourdain_jax.calculus.figures import figure as figure_in_html
+from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.calculus.files import FilePath, check_place
+from jourdain_jax.calculus.reals import checked_whole, described
+from jourdain_jax.motion.start import start
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.arguments import of_known_numbers
+from jourdain_jax.views.looks import Drawn, looks_at, looks_of
+from jourdain_jax.views.space import axes_in_space, box_of, draw, legend, painted
+
+# elevation and azimuth, degrees
+VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}
+
+
+def check_suffix(path: FilePath) -> None:
+    """Raise ValueError if an animation cannot be written to this path."""
+    check_place(path)
+    if not str(path).lower().endswith(".gif"):
+        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+
+
+@of_known_numbers
+def animate(
+    trajectory: Trajectory,
+    path: FilePath,
+    *,
+    frames: int = 60,
+    paths: Sequence[tuple[str, Sequence[float]]] | None = None,
+    follow: bool = False,
+    view: tuple[float, float] = (22.0, -60.0),
+    title: str | None = None,
+) -> None:
+    """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
+
+    - `frames`: maximum number of frames, taken at evenly spaced saved times. The playing time is that of the
+      motion, between 2 and 12 s.
+    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
+    - `follow`: move the view with the bodies instead of showing the whole path. `view`: elevation and azimuth
+      in degrees.
+    - `title`: a line above the drawing (default: none).
+
+    Raises ValueError for a suffix other than .gif or a motion that reached none of its times, and ImportError
+    without matplotlib.
+    """
+    _check_one(trajectory, "`animate`", "jj.animate(rollout.lane(0), 'lane-0.gif')")
+    frames = checked_whole(frames, "`frames`", 1, expected="of at least 1")
+    check_suffix(path)
+    plt = pyplot()
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    drawn = looks_of(trajectory, "animate", frames)
+    traces = _traces(trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths)
+    bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
+    boxes = np.stack([box_of(faces[:1]) for faces in bodies])
+    whole = box_of([*boxes, *traces])
+    half = np.ptp(boxes, axis=1).max() * 0.62  # half the side of the square that follows the bodies
+    figure = plt.figure(figsize=(6.0, 5.0))
+    axes = axes_in_space(figure, view, (0.03, 0.02, 0.9, 0.88))
+    clock = figure.text(0.03, 0.91, "", family="monospace")
+    figure.text(0.25, 0.91, title or "")
+    legend(figure, drawn)
+
+    def draw_frame(k: int):
+        shown = whole.copy()
+        if follow:
+            shown[:, :2] = boxes[k, :, :2].mean(axis=0) + np.array([[-half], [half]])
+        draw(axes, bodies[k], [trace[: k + 1] for trace in traces], shown)
+        clock.set_text(f"t = {drawn.ts[k]:6.2f} s")
+        return [clock]
+
+    count, seconds = len(drawn.ts), float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
+    FuncAnimation(figure, draw_frame, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
+    plt.close(figure)
+
+
+def draw_still(
+    trajectory: Trajectory,
+    path: FilePath,
+    *,
+    at: int | Sequence = 3,
+    paths: Sequence[tuple[str, Sequence]] | None = None,
+    view: str | tuple = "space",
+) -> None:
+    """Draw a motion as one picture: its bodies at a few times, earlier ones paler, and the paths of points.
+
+    - `at`: times in s (the nearest saved ones are drawn), or their number, evenly spaced from the start to
+      the end.
+    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
+    - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
+
+    Raises ValueError for a rollout, an unknown view or body, or a motion that reached none of its times, and
+    ImportError without matplotlib.
+    """
+    _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
+    if isinstance(view, str) and view not in VIEWS:
+        raise ValueError(f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
+            "or elevation and azimuth in degrees")
+    plt, drawn = pyplot(), looks_of(trajectory)
+    wanted = np.asarray(at, float) if not isinstance(at, int) else np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
+    chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
+    traces = _traces(trajectory, drawn, [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths)
+    strengths = np.linspace(1.0, 0.35, len(chosen))[::-1]
+    faces, colours = zip(*map(painted, [drawn] * len(chosen), chosen, strengths), strict=True)
+    figure = plt.figure(figsize=(6.4, 4.2), dpi=100)
+    axes = axes_in_space(figure, VIEWS[view] if isinstance(view, str) else view, (0.05, 0.07, 0.88, 0.83))
+    draw(axes, (np.concatenate(faces), np.concatenate(colours)), traces, box_of([*faces, *traces]))
+    legend(figure, drawn, len(traces))
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def scene_picture(scene) -> str:
+    """Return HTML with a picture of a scene's bodies and their shadows at its `example`; empty if there are
+    none.
+
+    A scene that cannot start has no picture, because notebooks also display unfinished scenes. `jj.start`
+    reports their faults.
+    """
+    try:
+        bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
+    except Exception:  # user methods may raise anything, and the parameters may be traced
+        return ""
+    return figure_in_html(lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200)
+
+
+def _check_one(trajectory, where: str, example: str) -> None:
+    if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
+        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a "
+            f"rollout pass one lane: {example}")
+
+
+def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:
+    """Return the paths (times, 3) of body points, m."""
+    return [np.asarray(trajectory.point(*end))[drawn.reached] for end in ends]
