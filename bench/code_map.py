@@ -35,6 +35,7 @@ PACKAGE = "jourdain_jax"
 SOURCE = ROOT / "src" / PACKAGE
 FOLDERS = ("src", "tests", "bench", "docs", "notebooks")
 PUBLIC = {PACKAGE, *(f"{PACKAGE}.{name}" for name in ("models", "bicycle", "bicycle.parameters", "bicycle.readings", "cli", "dynamics.reduced"))}
+PUBLIC |= {f"{PACKAGE}.{name}" for name in ("analysis", "equations", "identification", "studies")}
 # below public names, tests may speak to the scalar program and its operations, also as machine code, and to one step
 SEAMS = tuple(f"{PACKAGE}.{name}" for name in ("program", "calculus.scalar_operations", "integrate.loop.step"))
 THROUGH = "evaluated_natively"  # the file of `tests` that runs a scalar program as machine code

@@ -23,6 +23,7 @@ from figures import HERE, Figures, figure, main
 import jourdain_jax as jj
 from jourdain_jax.bicycle import eigenvalues, linear_matrices, measured_bicycle, stability_speeds
 from jourdain_jax.bicycle.parameters import PARAMETERS
+from jourdain_jax.studies import Design, EventTime, Happened, Normal, Uniform, sobol_indices
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -42,11 +43,11 @@ def stability(quick: bool, out: Path) -> Figures:
     bicycle = measured_bicycle(BICYCLE)
     fixed = {name: value for name, value in bicycle.values.items() if name not in bicycle.prior}
     began = time.perf_counter()
-    drawn = jj.Design(bicycle.prior, sampler="sobol", samples=samples, seed=7).values()
+    drawn = Design(bicycle.prior, sampler="sobol", samples=samples, seed=7).values()
     group = len(bicycle.prior) + 2
-    design = jj.Design(bicycle.prior, sampler="saltelli", samples=group * max(64, samples // group), seed=7)
+    design = Design(bicycle.prior, sampler="saltelli", samples=group * max(64, samples // group), seed=7)
     weave = in_parts(lambda p: stability_speeds(*linear_matrices(fixed | p)).weave_speed, design.values())
-    indices = jj.sobol_indices(weave, design.names)
+    indices = sobol_indices(weave, design.names)
     speeds = np.nanmean(weave) + np.linspace(-8.0, 8.0, 101) * np.nanstd(weave)  # m/s
     stable = in_parts(lambda p: jnp.all(jnp.real(eigenvalues(*linear_matrices(fixed | p), speeds)) < 0, axis=1), drawn).mean(axis=0)
     yield figure("seconds for eigenvalues at 101 speeds and weave speeds of as many samples", BICYCLE, time.perf_counter() - began)
@@ -79,13 +80,13 @@ def rides(quick: bool, out: Path) -> Figures:
     bicycle = measured_bicycle(BICYCLE)
     radius = bicycle.values["rR"]
     start = {
-        "rear_spin_rate": jj.Uniform(1.0 / radius, 10.0 / radius),
-        "lean": jj.Uniform(-0.6, 0.6),
-        "lean_rate": jj.Normal(0.0, 0.2),
-        "steer_rate": jj.Normal(0.0, 0.2),
+        "rear_spin_rate": Uniform(1.0 / radius, 10.0 / radius),
+        "lean": Uniform(-0.6, 0.6),
+        "lean_rate": Normal(0.0, 0.2),
+        "steer_rate": Normal(0.0, 0.2),
     }
     study = jj.Study(bicycle.scene, start=start, sampler="sobol", samples=samples, seed=7)
-    outputs = {"fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
+    outputs = {"fell": Happened("fallen"), "fall time": EventTime("fallen")}
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         result = study.run(f"{folder}/rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)

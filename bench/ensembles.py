@@ -36,17 +36,18 @@ from distributed import Client, LocalCluster
 from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
+from jourdain_jax.studies import Design, End, EventTime, Happened, Normal, StudyResult, Uniform, sobol_indices
 from jourdain_jax.studies.run import Runner
 from jourdain_jax.studies.store import Store
 
 MODEL, SPAN, TOLERANCE = "tilting-disc", 2.0, 1e-6
 WIDTH = 8  # lanes of a vector
-OUTPUTS = {"final lean": jj.End("lean", "rad"), "final yaw": jj.End("yaw", "rad"), "fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
+OUTPUTS = {"final lean": End("lean", "rad"), "final yaw": End("yaw", "rad"), "fell": Happened("fallen"), "fall time": EventTime("fallen")}
 
 
-def run(lanes: int, path, memory=None, **options) -> jj.StudyResult:
+def run(lanes: int, path, memory=None, **options) -> StudyResult:
     """A study of so many discs with random starts in a folder."""
-    start = {"lean": jj.Uniform(-0.6, 0.6), "yaw_rate": jj.Normal(0.0, 0.5), "lean_rate": jj.Normal(0.0, 0.3), "spin_rate": jj.Uniform(-9.0, 0.0)}
+    start = {"lean": Uniform(-0.6, 0.6), "yaw_rate": Normal(0.0, 0.5), "lean_rate": Normal(0.0, 0.3), "spin_rate": Uniform(-9.0, 0.0)}
     study = jj.Study(jj.build(jj.models.TiltingDisc(), memory=memory), start=start, samples=lanes, seed=1)
     return study.run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
 
@@ -69,7 +70,7 @@ def timed(lanes: int, folder: Path, **options) -> dict:
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
-def logged(lanes: int, folder: Path, log: Path) -> jj.StudyResult:
+def logged(lanes: int, folder: Path, log: Path) -> StudyResult:
     """A study that writes a byte for every block that it begins to compute."""
     before = Runner.run_block
 
@@ -192,9 +193,9 @@ def kills(lanes: int, folder: Path) -> Figures:
 def indices(lanes: int, folder: Path) -> Figures:
     """Ishigami's function; its indices in closed form."""
     a, b = 7.0, 0.1
-    design = jj.Design(dict.fromkeys(("x1", "x2", "x3"), jj.Uniform(-np.pi, np.pi)), sampler="saltelli", samples=5 * 2**14, seed=1)
+    design = Design(dict.fromkeys(("x1", "x2", "x3"), Uniform(-np.pi, np.pi)), sampler="saltelli", samples=5 * 2**14, seed=1)
     x = design.values()
-    found = jj.sobol_indices(np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"]), design.names)
+    found = sobol_indices(np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"]), design.names)
     one, two, three = 0.5 * (1 + b * np.pi**4 / 5) ** 2, a**2 / 8, b**2 * np.pi**8 * (1 / 18 - 1 / 50)
     first, total = np.array([one, two, 0.0]) / (one + two + three), np.array([one + three, two, three]) / (one + two + three)
     errors = [abs(found.first - first) / found.first_half_width, abs(found.total - total) / found.total_half_width]

@@ -28,6 +28,7 @@ from jax.interpreters import mlir
 import jourdain_jax as jj
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.kernels import ffi, host, nvidia
+from jourdain_jax.studies import Uniform
 
 DISC, BICYCLE = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
 NUMBERS = ("mB", "mR", "mF", "mH", "rR", "rF", "w", "c")  # of a bicycle, by which it is differentiated
@@ -131,7 +132,7 @@ def alone(of: str, name: str, x: float, required: float | None, first_within: fl
 
 def study(lanes: int, least: float | None, quick: bool) -> Figures:
     """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is stored."""
-    of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": jj.Uniform(*SPREAD["disc"])}, samples=lanes)
+    of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": Uniform(*SPREAD["disc"])}, samples=lanes)
     with tempfile.TemporaryDirectory() as folder:
         run = partial(of.run, t1=2.0, rtol=1e-6, atol=1e-6, save="statistics", keep_every=1000, progress=False)
         seconds = min(seconds_of(partial(run, f"{folder}/{k}"), time.perf_counter)[1] for k in range(2))

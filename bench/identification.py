@@ -27,6 +27,7 @@ sys.path.insert(0, str(HERE.parent / "tests"))  # small scenes that tests use, t
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Fit, Sensor, filtered_log_likelihood, huber, log_density, planned_information, student_t
 from jourdain_jax.models import ChaplyginSleigh, DoublePendulumAngles, TiltingDisc
 
 START = {"lean": 0.3, "spin_rate": -3.0}
@@ -42,7 +43,7 @@ def share_of_intervals(name: str, model: str, share: float, repeats: int) -> dic
     return figure(name, model, share, high, least=low)
 
 
-def shares(fits: jj.Fit, truth: dict) -> dict[str, float]:
+def shares(fits: Fit, truth: dict) -> dict[str, float]:
     """How often the interval of each quantity holds its true value, %."""
     return {name: 100 * float(np.mean((fits[name].low < truth[name]) & (truth[name] < fits[name].high))) for name in fits.labels}
 
@@ -58,7 +59,7 @@ def disc_data(seed: int, outlier: float = 0.0, repeats: tuple[int, ...] = (), de
     sensors = {}
     if delay:
         exact["lean"] = np.asarray(jj.simulate(TiltingDisc(), START, t0=0.0, ts=ts - delay)["lean"])
-        sensors = {"lean": jj.Sensor(delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)))}
+        sensors = {"lean": Sensor(delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)))}
     values = {name: exact[name] + s * noise.normal(size=(*repeats, len(ts))) for name, s in SIGMA.items()}
     values["lean"][..., 17] += outlier * SIGMA["lean"]
     options = {"start": {"lean": 0.31, "spin_rate": -2.9}, "unknown_start": UNKNOWN, "sensors": sensors, "t0": 0.0, "sigma": SIGMA} | more
@@ -97,7 +98,7 @@ def disc(quick: bool) -> Figures:
 
 def outlier(quick: bool) -> Figures:
     """One of 122 samples is 60 sigmas out."""
-    for name, loss in (("least squares", None), ("Huber", jj.huber()), ("Student-t", jj.student_t())):
+    for name, loss in (("least squares", None), ("Huber", huber()), ("Student-t", student_t())):
         clean, spoilt = (jj.fit(GUESS, disc_data(0, outlier=far), FREE, loss=loss) for far in (0.0, 60.0))
         moved = float(np.max(np.abs(clean.values - spoilt.values) / clean.standard_errors))
         yield figure(f"an outlier of 60 sigmas moves estimates by, standard errors, {name}", DISC, moved, None if loss is None else 0.3)
@@ -202,7 +203,7 @@ def nuts(quick: bool) -> Figures:
 
     data, draws, model = disc_data(0), 500 if quick else 2000, "tilting-disc, 4 unknowns"
     fit = jj.fit(GUESS, data, FREE)
-    density = jj.log_density(GUESS, data, FREE).whitened(fit)
+    density = log_density(GUESS, data, FREE).whitened(fit)
     count = density.initial.size
     # on a normal density of variance one nearly all trees have 3 steps of 1.1: chains side by side hardly wait for each other
     sampler = blackjax.nuts(density, step_size=1.1, inverse_mass_matrix=jnp.ones(count))
@@ -254,7 +255,7 @@ def disturbed(quick: bool) -> Figures:
 
     def along(offset, values):
         run = jj.Experiment(ts, values, sigma, start=start)
-        return jj.filtered_log_likelihood(truth.replace(offset=offset), run, process_noise=noise, rtol=1e-7, atol=1e-7)
+        return filtered_log_likelihood(truth.replace(offset=offset), run, process_noise=noise, rtol=1e-7, atol=1e-7)
 
     logs = np.asarray(jax.jit(lambda v: jax.lax.map(lambda one: jax.vmap(lambda x: along(x, one))(jnp.asarray(grid)), v))(values))
     middle = np.clip(np.argmax(logs, axis=1), 2, len(grid) - 3)  # a quartic through the five points about the largest
@@ -280,7 +281,7 @@ def design(quick: bool) -> Figures:
 
     def planned(z):
         plan = jj.Experiment(ts, dict.fromkeys(SIGMA, ts), SIGMA, start=dict(zip(UNKNOWN, z, strict=True)), unknown_start=UNKNOWN)
-        return jj.planned_information(disc, plan, FREE)
+        return planned_information(disc, plan, FREE)
 
     slope, first = jax.jit(jax.jacfwd(lambda z: planned(z).log_det(FREE))), jnp.array([0.3, -3.0])
     z = first

@@ -7,6 +7,7 @@ import numpy as np
 from figures import Figures, figure, seconds_of
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Fit, MultipleShooting
 from jourdain_jax.models import DoublePendulumAngles, WhippleBicycle
 
 
@@ -37,7 +38,7 @@ def chaotic_run(seed: int, span: float) -> tuple[DoublePendulumAngles, dict, jj.
     return guess, true, jj.Experiment(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
-def fits_of(runs: list, free: tuple[str, ...], **how) -> tuple[list[jj.Fit], float]:
+def fits_of(runs: list, free: tuple[str, ...], **how) -> tuple[list[Fit], float]:
     """Fits with their standard errors, and the median of their processor times without the first, s."""
 
     def fitted(guess, run):
@@ -52,7 +53,7 @@ def fits_of(runs: list, free: tuple[str, ...], **how) -> tuple[list[jj.Fit], flo
 def both(runs: list, free: tuple[str, ...], duration: float, right: Callable) -> tuple[list, list, float]:
     """Fits over growing spans and by multiple shooting, each with whether it is `right`, and the second's time over the first's."""
     whole, seconds = fits_of(runs, free)
-    pieces, by_pieces = fits_of(runs, free, shooting=jj.MultipleShooting(duration=duration))
+    pieces, by_pieces = fits_of(runs, free, shooting=MultipleShooting(duration=duration))
     judge = right([*whole, *pieces])
     return [(x, judge(x)) for x in whole], [(x, judge(x)) for x in pieces], by_pieces / seconds
 

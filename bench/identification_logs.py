@@ -12,6 +12,7 @@ import numpy as np
 from figures import HERE, Figures, figure, fresh, seconds_of
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Fit, unbounded
 from jourdain_jax.models import WhippleBicycle
 
 NOTEBOOKS = HERE.parent / "notebooks"
@@ -54,13 +55,13 @@ def experiments() -> list[jj.Experiment]:
         first = {"lean": "lean_angle", "lean_rate": "lean_rate", "steer": "fork_angle", "steer_rate": "fork_rate"}
         start = {name: column[source][0] for name, source in first.items()} | {"rear_spin_rate": column["speed"].mean() / NOMINAL["rR"]}
         values = {"lean_rate": column["lean_rate"], "steer_rate": column["fork_rate"]}
-        unknown = {name: jj.unbounded(s) for name, s in scale.items()}
+        unknown = {name: unbounded(s) for name, s in scale.items()}
         torque = jj.Sampled(ts, column["command_fork"])
         runs.append(jj.Experiment(ts, values, {"lean_rate": 0.03, "steer_rate": 0.1}, start=start, unknown_start=unknown, inputs={"steer_torque": torque}))
     return runs
 
 
-def fitted(runs: list[jj.Experiment], **options) -> jj.Fit:
+def fitted(runs: list[jj.Experiment], **options) -> Fit:
     """A fit of some runs."""
     return jj.fit(SteerByWire(**NOMINAL), runs, FREE, rtol=1e-6, atol=1e-6, **options)
 

@@ -26,6 +26,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jourdain_jax as jj
+from jourdain_jax.studies import Design, EventTime, Happened, LargestMagnitude, Normal, Uniform, sobol_indices
 
 os.chdir(tempfile.mkdtemp())
 disc = jj.models.TiltingDisc()
@@ -37,7 +38,7 @@ disc = jj.models.TiltingDisc()
 # and k alone: the study may be cut into any pieces, stopped and continued, and every number keeps its bits.
 
 # %%
-start = {"lean": jj.Uniform(-0.6, 0.6), "lean_rate": jj.Normal(0.0, 0.3), "spin_rate": jj.Uniform(-1.5, 0.0)}
+start = {"lean": Uniform(-0.6, 0.6), "lean_rate": Normal(0.0, 0.3), "spin_rate": Uniform(-1.5, 0.0)}
 study = jj.Study(disc, start=start, sampler="sobol", samples=100_000, seed=7)
 study
 
@@ -47,7 +48,7 @@ study
 # Of each motion we keep whether the disc fell within two seconds, when, and its largest lean. A fallen disc ends its lane at once, and another takes its place.
 
 # %%
-outputs = {"fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen"), "largest lean": jj.LargestMagnitude("lean", "rad")}
+outputs = {"fell": Happened("fallen"), "fall time": EventTime("fallen"), "largest lean": LargestMagnitude("lean", "rad")}
 asked = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 41), "rtol": 1e-6, "atol": 1e-6, "outputs": outputs, "progress": False}
 result = study.run("discs.zarr", **asked)
 result
@@ -120,10 +121,10 @@ from jourdain_jax.bicycle import linear_matrices, measured_bicycle, stability_sp
 
 bicycle = measured_bicycle("Browser")
 radius = bicycle.values["rR"]
-start = {"rear_spin_rate": jj.Uniform(1.0 / radius, 10.0 / radius), "lean": jj.Uniform(-0.6, 0.6), "lean_rate": jj.Normal(0.0, 0.2)}
+start = {"rear_spin_rate": Uniform(1.0 / radius, 10.0 / radius), "lean": Uniform(-0.6, 0.6), "lean_rate": Normal(0.0, 0.2)}
 rides = jj.Study(bicycle.scene, start=start, sampler="sobol", samples=2**17, seed=7)
 asked = {"t1": 5.0, "rtol": 1e-6, "atol": 1e-6, "progress": False}
-ridden = rides.run("rides.zarr", outputs={"fell": jj.Happened("fallen")}, **asked)
+ridden = rides.run("rides.zarr", outputs={"fell": Happened("fallen")}, **asked)
 ridden
 
 # %%
@@ -144,13 +145,13 @@ axis.set(xlabel="speed at the start (m/s)", ylabel="lean at the start (rad)")
 # ## Which measurement deserves to be made again?
 #
 # Above its weave speed this bicycle rides by itself. How well do we know that speed, and which of the 25 measured numbers is to blame for what we do not know?
-# No motion is needed: the design alone gives the samples, and `jj.sobol_indices` takes whatever was computed from them.
+# No motion is needed: the design alone gives the samples, and `jj.studies.sobol_indices` takes whatever was computed from them.
 
 # %%
 import jax
 
 fixed = {name: value for name, value in bicycle.values.items() if name not in bicycle.prior}
-design = jj.Design(bicycle.prior, sampler="saltelli", samples=2**10 * (len(bicycle.prior) + 2), seed=7)
+design = Design(bicycle.prior, sampler="saltelli", samples=2**10 * (len(bicycle.prior) + 2), seed=7)
 
 
 def weave_speed(numbers):
@@ -158,7 +159,7 @@ def weave_speed(numbers):
 
 
 weave = np.asarray(jax.lax.map(weave_speed, design.values(), batch_size=1024))  # all at once would take 15 GB
-of_weave = jj.sobol_indices(weave, design.names)
+of_weave = sobol_indices(weave, design.names)
 print(f"weave speed {np.nanmean(weave):.2f} +- {np.nanstd(weave):.2f} m/s")
 order = np.argsort(-of_weave.total)[:8]
 

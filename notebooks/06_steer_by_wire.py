@@ -34,7 +34,9 @@ import scipy.optimize
 import jourdain_jax as jj
 from jourdain_jax.bicycle import linear_matrices
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+from jourdain_jax.identification import Actuator, Sensor, unbounded
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.studies import Normal
 
 with gzip.open(Path("data/steer_by_wire/windows.csv.gz"), "rt") as file:
     rows = list(csv.DictReader(file))
@@ -107,15 +109,15 @@ nominal = SteerByWire(
 )  # fmt: skip
 free = {
     "gain": None, "friction": None, "steer_damping": None, "lean_damping": None, "drift": None,
-    "turned": jj.Estimate(prior=jj.Normal(0.035, 0.018)),
-    "IBxx": jj.Estimate(range=jj.bounds(0.2, 8.0), prior=jj.Normal(1.64, 0.36)),
-    "IBzz": jj.Estimate(range=jj.bounds(0.2, 8.0), prior=jj.Normal(1.94, 0.76)),
-    "IBxz": jj.Estimate(prior=jj.Normal(0.654, 0.2)),
+    "turned": jj.Estimate(prior=Normal(0.035, 0.018)),
+    "IBxx": jj.Estimate(range=jj.bounds(0.2, 8.0), prior=Normal(1.64, 0.36)),
+    "IBzz": jj.Estimate(range=jj.bounds(0.2, 8.0), prior=Normal(1.94, 0.76)),
+    "IBxz": jj.Estimate(prior=Normal(0.654, 0.2)),
 }  # fmt: skip
 SIGMA = {"lean_rate": 0.03, "steer_rate": 0.1}  # rad/s
 late = {
-    "lean_rate": jj.Sensor(delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.05))),
-    "steer_rate": jj.Sensor(gain=jj.Estimate(0.87), delay=0.005),
+    "lean_rate": Sensor(delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.05))),
+    "steer_rate": Sensor(gain=jj.Estimate(0.87), delay=0.005),
 }
 
 
@@ -123,12 +125,12 @@ def run_of(window, sensors):
     """One window; the first 0.05 s wait for the sensors."""
     start = {"lean": window["lean_angle"][0], "lean_rate": window["lean_rate"][0], "steer": window["fork_angle"][0], "steer_rate": window["fork_rate"][0]}
     unknown = {
-        "lean": jj.Estimate(prior=jj.Normal(start["lean"], 0.02)), "steer": jj.Estimate(prior=jj.Normal(start["steer"], 0.03)),
-        "lean_rate": jj.unbounded(0.3), "steer_rate": jj.unbounded(0.5),
+        "lean": jj.Estimate(prior=Normal(start["lean"], 0.02)), "steer": jj.Estimate(prior=Normal(start["steer"], 0.03)),
+        "lean_rate": unbounded(0.3), "steer_rate": unbounded(0.5),
     }  # fmt: skip
     values = {"lean_rate": np.where(ts < 0.0499, np.nan, window["lean_rate"]), "steer_rate": np.where(ts < 0.0499, np.nan, window["fork_rate"])}
     start["rear_spin_rate"] = window["speed"].mean() / 0.3498
-    torque = jj.Actuator(jj.Sampled(ts, window["command_fork"]), hold=True)  # the controller holds a command for 0.01 s
+    torque = Actuator(jj.Sampled(ts, window["command_fork"]), hold=True)  # the controller holds a command for 0.01 s
     return jj.Experiment(ts, values, SIGMA, start=start, unknown_start=unknown, inputs={"steer_torque": torque}, sensors=sensors)
 
 
@@ -174,7 +176,7 @@ def residuals(scene, part, sensors):
 
 def sensors_of(half):
     known = {name: half[name].value for name in ("lean_rate.delay", "steer_rate.gain")}
-    return {"lean_rate": jj.Sensor(delay=known["lean_rate.delay"]), "steer_rate": jj.Sensor(gain=known["steer_rate.gain"], delay=0.005)}
+    return {"lean_rate": Sensor(delay=known["lean_rate.delay"]), "steer_rate": Sensor(gain=known["steer_rate.gain"], delay=0.005)}
 
 
 def rms(values):
@@ -189,7 +191,7 @@ def neighbours(values):
 
 out = {"odd": residuals(odd.scene, parts["even"], sensors_of(odd)), "even": residuals(even.scene, parts["odd"], sensors_of(even))}
 # ideal sensors, to nine digits: the same compiled program serves
-ideal = {"lean_rate": jj.Sensor(delay=1e-9), "steer_rate": jj.Sensor(gain=1.0 + 1e-9, delay=0.005)}
+ideal = {"lean_rate": Sensor(delay=1e-9), "steer_rate": Sensor(gain=1.0 + 1e-9, delay=0.005)}
 plain = residuals(nominal, windows, ideal)
 for what, left in (*((f"fitted to {name} windows, the others", left) for name, left in out.items()), ("the authors' numbers, all windows", plain)):
     told = ", ".join(f"{name} {rms(left[name]):.3f} rad/s (neighbours correlate by {neighbours(left[name]):.2f})" for name in SIGMA)

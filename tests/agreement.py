@@ -4,6 +4,7 @@ import numpy as np
 from solved_states import over_states
 
 import jourdain_jax as jj
+from jourdain_jax.equations import unconstrained_equations
 
 
 def admissible_states(scene: jj.Scene, count, seed=0):
@@ -21,7 +22,7 @@ def disagreement(scene: jj.Scene, count=20, seed=0):
 
     def all_of_them(t, q, u):
         found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
-        equations = jj.unconstrained_equations(scene, t, q, u)
+        equations = unconstrained_equations(scene, t, q, u)
         forces = np.stack([equations.h, equations.Q, found["qr"].constraint_force])
         sizes = np.max(np.abs(found["qr"].udot)), np.max(np.abs(forces))
         return {name: (a.udot, a.constraint_force, a.applicable) for name, a in found.items()}, sizes

@@ -14,11 +14,12 @@ from generated_scenes import LENGTHS, Recipe, body_name, coordinate_list, genera
 from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
-from jourdain_jax import GibbsAppell, structure_of, velocity_residual
+from jourdain_jax import structure_of
 from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
+from jourdain_jax.equations import GibbsAppell, coordinate_rates, gibbs_function, kinetic_energy, partial_velocities, potential_energy, velocity_residual
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
@@ -127,7 +128,7 @@ def _seen(recipe: Recipe, scene, view, t, q, u, rate):
     lengths, paces = dimensions(recipe)
     seen = Seen(scene, view, other_names(body_name(i) for i in range(len(recipe.bodies))), lengths, paces)
     new_q = seen.new_coordinates(q)
-    new_u, expected = jax.jvp(seen.new_speeds, (q, u), (jj.coordinate_rates(scene, t, q, u), rate))
+    new_u, expected = jax.jvp(seen.new_speeds, (q, u), (coordinate_rates(scene, t, q, u), rate))
     ways = {name: way for name, way in jj.reductions(scene).items() if name != "gibbs-appell"}
     by, equations, rows = _accelerations(seen, ways, t / view.time, new_q, new_u, inputs)
     c = scaled(equations, rows).c
@@ -153,19 +154,19 @@ def _plain(scene, t, q, u, sign):
     c = scaled(equations, rows).c
     motion = jj.motion_at(scene, t, q, u, inputs)
     along = jnp.cos(1.0 + jnp.arange(u.shape[0])) / c  # any direction, for Hessians
-    h, M_along = jax.jvp(jax.grad(lambda a: jj.gibbs_function(scene, t, q, u, a)), (jnp.zeros_like(u),), (along,))
+    h, M_along = jax.jvp(jax.grad(lambda a: gibbs_function(scene, t, q, u, a)), (jnp.zeros_like(u),), (along,))
 
     def T(u, t=t, q=q):
-        return jj.kinetic_energy(scene, t, q, u)
+        return kinetic_energy(scene, t, q, u)
 
     def energies(t, q, u):
-        return T(u, t, q), jj.potential_energy(scene, jj.motion_at(scene, t, q, u, inputs)), velocity_residual(scene, t, q, u, inputs)
+        return T(u, t, q), potential_energy(scene, jj.motion_at(scene, t, q, u, inputs)), velocity_residual(scene, t, q, u, inputs)
 
-    rates = (jnp.ones_like(t), jj.coordinate_rates(scene, t, q, u), best.udot)
+    rates = (jnp.ones_like(t), coordinate_rates(scene, t, q, u), best.udot)
     (kinetic, V, _), (T_rate, V_rate, phi_rate) = jax.jvp(energies, (t, q, u), rates)
     (at_rest, slope), (_, T_along) = jax.jvp(jax.value_and_grad(T), (jnp.zeros_like(u),), (along,))
     reactions = row_reactions(scene, t, q, u, best, inputs)
-    partial = jj.partial_velocities(scene, t, q, u)
+    partial = partial_velocities(scene, t, q, u)
     turned = jnp.einsum("bji,sbj->sbi", jnp.stack([body.orientation for body in motion.bodies.values()]), reactions.torque)
     by_row = jnp.einsum("bik,sbi->sk", partial.linear, reactions.force) + jnp.einsum("bik,sbi->sk", partial.angular, turned) + reactions.direct
     return {

@@ -21,10 +21,10 @@ calls = {
     "rollout": lambda **options: jj.rollout(sleigh, {"x_rate": np.array([0.6])}, ts=TS, **options),
     "fit": lambda **options: jj.fit(sleigh, data, ("offset",), **options),
     "fit_batch": lambda **options: jj.fit_batch(sleigh, data, ("offset",), **options),
-    "log_likelihood": lambda **options: jj.log_likelihood(sleigh, data, **options),
-    "log_density": lambda **options: jj.log_density(sleigh, data, ("offset",), **options),
-    "planned_information": lambda **options: jj.planned_information(sleigh, data, ("offset",), **options),
-    "filtered_log_likelihood": lambda **options: jj.filtered_log_likelihood(sleigh, data, process_noise={}, **options),
+    "log_likelihood": lambda **options: jj.identification.log_likelihood(sleigh, data, **options),
+    "log_density": lambda **options: jj.identification.log_density(sleigh, data, ("offset",), **options),
+    "planned_information": lambda **options: jj.identification.planned_information(sleigh, data, ("offset",), **options),
+    "filtered_log_likelihood": lambda **options: jj.identification.filtered_log_likelihood(sleigh, data, process_noise={}, **options),
     "Study.run": lambda **options: study.run("nowhere", **options),
 }
 
@@ -52,22 +52,22 @@ def tied(function):
 
 def pieces(count, **shooting):
     ts = np.linspace(0.0, 0.5, count)
-    return jj.fit(Cart(), jj.Experiment(ts, {"x": ts}, 0.1, start={"x": 0.0}), "mass", shooting=jj.MultipleShooting(**shooting))
+    return jj.fit(Cart(), jj.Experiment(ts, {"x": ts}, 0.1, start={"x": 0.0}), "mass", shooting=jj.identification.MultipleShooting(**shooting))
 
 
 def planned(**changes):
     run = jj.Experiment(TS, {"x": TS}, **({"sigma": 0.01, "start": {"x": 0.3}} | changes))
-    return jj.planned_information(Cart(damping=0.0), run, ("mass",))
+    return jj.identification.planned_information(Cart(damping=0.0), run, ("mass",))
 
 
 def cell(scene, name):
     """What a load cell under this contact tells."""
-    shown = jj.Experiment(TS, {"plate": np.ones((2, 3))}, 1.0, start={}, sensors={"plate": jj.LoadCell(name)})
+    shown = jj.Experiment(TS, {"plate": np.ones((2, 3))}, 1.0, start={}, sensors={"plate": jj.identification.LoadCell(name)})
     return jj.fit(scene, shown, ("mass",))
 
 
 def gradients(parameters, **more):
-    return jj.Study(sleigh, **more).mean_gradients(parameters=parameters, t1=0.1, outputs={"x": jj.End("x")})
+    return jj.Study(sleigh, **more).mean_gradients(parameters=parameters, t1=0.1, outputs={"x": jj.studies.End("x")})
 
 
 def described(**members):
@@ -107,7 +107,7 @@ def inertia(made=lambda s: jnp.diag(s.moments), free={}, moments=(0.5, 0.7, 0.4)
     return jj.fit(scene, jj.Experiment(TS, {"yaw": TS}, 0.1, start={}), {"body": possible} | free)
 
 
-possible = jj.possible_inertia()
+possible = jj.identification.possible_inertia()
 
 
 def described_file(**changes):
@@ -171,17 +171,17 @@ FITS = {
     "event(events={'buffer': (0.9, 0.0)})": "sigma of channel `buffer` must be above zero",
     "event(events={'x': (0.9, 0.003)}, values=np.ones(8))": "`x` is both a channel and an event",
     "event(sensors={'buffer': 'x'})": "`buffer` is an event, whose time has no sensor",
-    "jj.fit(Stopped(), stopped(values=np.ones(8)), ('mass',), shooting=jj.MultipleShooting(pieces=2))": (
+    "jj.fit(Stopped(), stopped(values=np.ones(8)), ('mass',), shooting=jj.identification.MultipleShooting(pieces=2))": (
         "run 0 has a measured time of its event `buffer`, which `shooting` does not use"
     ),
-    "jj.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), process_noise={'x_rate': 0.1})": (
+    "jj.identification.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), process_noise={'x_rate': 0.1})": (
         "run 0 gives the time of its event `buffer`, which the filter does not use"
     ),
-    "jj.MultipleShooting()": "expects either `pieces`",
-    "jj.MultipleShooting(pieces=4, duration=1.0)": "expects either `pieces`",
-    "jj.MultipleShooting(pieces=1)": "two or more",
-    "jj.MultipleShooting(duration=0.0)": "positive finite time",
-    "jj.MultipleShooting(duration=np.nan)": "positive finite time",
+    "jj.identification.MultipleShooting()": "expects either `pieces`",
+    "jj.identification.MultipleShooting(pieces=4, duration=1.0)": "expects either `pieces`",
+    "jj.identification.MultipleShooting(pieces=1)": "two or more",
+    "jj.identification.MultipleShooting(duration=0.0)": "positive finite time",
+    "jj.identification.MultipleShooting(duration=np.nan)": "positive finite time",
     "pieces(11, pieces=20)": "run 0 has 11 samples, too few for 20 pieces",
     "pieces(11, duration=2.0)": "one piece only",
     "planned(sigma=None)": "sigma of channel `x` is None",
@@ -189,11 +189,11 @@ FITS = {
     "planned().log_det('mas')": ("KeyError", "`mas` is not among the unknowns"),
     "cell(disc, 'rin')": "the load cell `plate` of run 0 of `TiltingDisc` is under contact `rin`, which does not exist; did you mean `rim`",
     "cell(jj.models.TwoWheelAxleRedundant(), 'wheel1')": "is under contact `wheel1`, whose force is not determined",
-    "jj.LoadCell(3)": "`contact` of `LoadCell` is an int",
+    "jj.identification.LoadCell(3)": "`contact` of `LoadCell` is an int",
     "jj.steady(disc, {'lean': 0.3}, held=('leen',))": "did you mean `lean`",
     "jj.steady(disc, {'lean': 0.3}, moving=('spinn',))": "did you mean `spin`",
-    "gradients(('ofset',), start={'x_rate': jj.Normal(0.5, 0.1)}, samples=8)": "`ofset` is no parameter of the scene; ... `offset`",
-    "gradients(('offset',), vary={'offset': jj.Normal(0.25, 0.01)}, samples=8)": "`offset` varies over the samples",
+    "gradients(('ofset',), start={'x_rate': jj.studies.Normal(0.5, 0.1)}, samples=8)": "`ofset` is no parameter of the scene; ... `offset`",
+    "gradients(('offset',), vary={'offset': jj.studies.Normal(0.25, 0.01)}, samples=8)": "`offset` varies over the samples",
     "jj.Spline([0.0, 2.0, 1.0], [0.0, 1.0, 2.0])": "`Spline`",
     "jj.Spline([0.0, 1.0], [0.0, np.nan])": "`Spline`",
     "jj.Spline([0.0, 1.0], [0.0, 1.0, 2.0])": "`Spline`",

@@ -18,7 +18,7 @@ def run(**changes):
 def shown(**numbers):
     """Its speed by a sensor with these numbers, the first sample at 0.2 s."""
     values = {"x": SWUNG["x"], "gyro": np.where(TS < 0.2, np.nan, SWUNG["x_rate"])}
-    return run(values=values, sigma=0.01, sensors={"gyro": jj.Sensor("x_rate", **numbers)})
+    return run(values=values, sigma=0.01, sensors={"gyro": jj.identification.Sensor("x_rate", **numbers)})
 
 
 def fitted(**numbers):
@@ -30,8 +30,8 @@ def with_input(push):
 
 
 cart, gain, command = Cart(), jj.Estimate(1.0), jj.Sampled([0.0, 4.0], [1.0, 1.0])
-together = jj.joint_normal({"mass": 2.0, "stiffness": 5.0}, [[0.01, 0.0], [0.0, 0.01]])
-density = jj.log_density(cart, [run(unknown_start=("x",))] * 2, {"damping": jj.bounds(0.0, 2.0), "stiffness": None})
+together = jj.identification.joint_normal({"mass": 2.0, "stiffness": 5.0}, [[0.01, 0.0], [0.0, 0.01]])
+density = jj.identification.log_density(cart, [run(unknown_start=("x",))] * 2, {"damping": jj.bounds(0.0, 2.0), "stiffness": None})
 '''
 
 FITS: dict[str, str] = {
@@ -61,11 +61,11 @@ FITS: dict[str, str] = {
     "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds only NaN",
     "jj.fit(cart, run(), 'mass', errors='hac')": "`errors` is 'hac', expected",
     "jj.fit(cart, run(), 'mass', errors='runs')": "from the differences between runs, but there are 1; give 5 or more",
-    "jj.fit(cart, run(sigma={'x': None, 'x_rate': 1.0}), 'mass', loss=jj.huber())": "sigma of channel `x` is None, but a robust loss",
+    "jj.fit(cart, run(sigma={'x': None, 'x_rate': 1.0}), 'mass', loss=jj.identification.huber())": "sigma of channel `x` is None, but a robust loss",
     "jj.fit(cart, [run(), run(sigma={'x': None, 'x_rate': 1.0})], 'mass')": "sigma of channel `x` is None in one run and given in another",
-    "jj.log_likelihood(cart, run(sigma=None))": "sigma of channel `x` is None, but a likelihood needs",
-    "jj.huber(0.0)": "huber(0.0): expected a positive finite number",
-    "jj.student_t(np.inf)": "student_t(inf): expected a positive finite number",
+    "jj.identification.log_likelihood(cart, run(sigma=None))": "sigma of channel `x` is None, but a likelihood needs",
+    "jj.identification.huber(0.0)": "huber(0.0): expected a positive finite number",
+    "jj.identification.student_t(np.inf)": "student_t(inf): expected a positive finite number",
     "run(values={}, sigma=1.0)": "`values` is empty",
     "run(ts=TS[::-1])": "`ts` must be finite and strictly increasing",
     "run(ts=np.where(TS[4] == TS, TS[3], TS))": "but sample 4 is at 0.6 s after 0.6 s; sort the samples by time and merge repeated",
@@ -82,7 +82,7 @@ FITS: dict[str, str] = {
     "run(sensors={'place': lambda motion: motion.q.x})": "sensor `place` has no measured values",
     "jj.bounds(2.0, 1.0)": "expected finite numbers low < high",
     "jj.bounds(0.0, np.inf)": "for one bound at zero use `positive",
-    "jj.unbounded(0.0)": "expected a positive scale",
+    "jj.identification.unbounded(0.0)": "expected a positive scale",
     "jj.Experiment('ts', {'x': [0.0]}, 0.01, start={})": "`ts` is the text 'ts', expected real numbers; give a vector of times in s",
     "jj.Experiment([0.0, 0.1], [0.0, 0.0], 0.01, start={})": "`values` of `Experiment` is a list, expected a dictionary by name",
     "jj.Experiment([0.0, 0.1], {'x': ['a', 'b']}, 0.01, start={})": "values of channel `x` is a list, expected real numbers",
@@ -90,37 +90,38 @@ FITS: dict[str, str] = {
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": "`start` of `Experiment` is `None`, expected a dictionary by name",
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0='a')": "`t0` is the text 'a', expected real numbers; give one time in s",
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors=3)": "`sensors` of `Experiment` is an int, expected a dictionary",
-    "jj.Actuator('a')": "`command` of `Actuator` is the text 'a', expected `jj.Sampled(ts, values)`",
+    "jj.identification.Actuator('a')": "`command` of `Actuator` is the text 'a', expected `jj.Sampled(ts, values)`",
     "jj.Estimate('a')": "`guess` of `Estimate` is the text 'a', expected real numbers; give a number",
     "jj.bounds('a', 1.0)": "low end of `bounds` is the text 'a', expected real numbers",
-    "jj.unbounded('a')": "`scale` of `unbounded` is the text 'a', expected real numbers",
+    "jj.identification.unbounded('a')": "`scale` of `unbounded` is the text 'a', expected real numbers",
     "jj.fit(Cart, run(), 'mass')": "`scene` is the class `Cart`",
     "jj.fit(cart, 3, 'mass')": "`data` is an int, expected an `Experiment` or a sequence of at least one",
     "jj.fit(cart, [run(), 3], 'mass')": "`data` holds an int, expected an `Experiment` or a sequence of at least one",
     "jj.fit(cart, jj.Experiment([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": "run 0 of `Cart` has unknown channel `z`; Valid names:",
-    "jj.log_likelihood(cart, 3)": "`data` is an int, expected an `Experiment` or a sequence of at least one",
-    "jj.log_likelihood(cart, run(), rtol=-1.0)": "`rtol` is -1, expected a positive finite number",
+    "jj.identification.log_likelihood(cart, 3)": "`data` is an int, expected an `Experiment` or a sequence of at least one",
+    "jj.identification.log_likelihood(cart, run(), rtol=-1.0)": "`rtol` is -1, expected a positive finite number",
 }
 
 SENSORS: dict[str, str] = {
-    "jj.Sensor(3)": "`quantity` of `Sensor` is an int, expected a coordinate, a speed",
-    "jj.Sensor(lag=-0.1)": "`lag` of `Sensor` is -0.1 s, expected zero or more",
-    "jj.Sensor(delay=-0.1)": "`delay` of `Sensor` is -0.1 s, expected zero or more; where the clock of a channel is ahead, shift its times",
-    "jj.Sensor(gain=np.nan)": "`gain` of `Sensor` is nan, expected a finite number",
-    "jj.Sensor(gain='one')": "`gain` of `Sensor` is the text 'one', expected real numbers; give a number, or an `Estimate`",
-    "jj.Sensor(lag=[0.1, 0.2])": "`lag` of `Sensor` has shape (2,), expected one number",
-    "jj.Sensor(gain=jj.Estimate())": "`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate(1.0)`",
-    "jj.Sensor(delay=jj.Estimate(0.1))": "`delay` of `Sensor` is to be estimated, but has no upper limit; give `range=jj.bounds",
-    "jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0)))": "`delay` of `Sensor` may fall to -1 s, expected a range that begins at zero",
-    "jj.Sensor(lag=jj.Estimate((0.1, 0.2)))": "`lag` of `Sensor` has 2 guesses, expected one number",
+    "jj.identification.Sensor(3)": "`quantity` of `Sensor` is an int, expected a coordinate, a speed",
+    "jj.identification.Sensor(lag=-0.1)": "`lag` of `Sensor` is -0.1 s, expected zero or more",
+    "jj.identification.Sensor(delay=-0.1)": "`delay` of `Sensor` is -0.1 s, expected zero or more; where the clock of a channel is ahead, shift its times",
+    "jj.identification.Sensor(gain=np.nan)": "`gain` of `Sensor` is nan, expected a finite number",
+    "jj.identification.Sensor(gain='one')": "`gain` of `Sensor` is the text 'one', expected real numbers; give a number, or an `Estimate`",
+    "jj.identification.Sensor(lag=[0.1, 0.2])": "`lag` of `Sensor` has shape (2,), expected one number",
+    "jj.identification.Sensor(gain=jj.Estimate())": "`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate(1.0)`",
+    "jj.identification.Sensor(delay=jj.Estimate(0.1))": "`delay` of `Sensor` is to be estimated, but has no upper limit; give `range=jj.bounds",
+    "jj.identification.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0)))":
+    "`delay` of `Sensor` may fall to -1 s, expected a range that begins at zero",
+    "jj.identification.Sensor(lag=jj.Estimate((0.1, 0.2)))": "`lag` of `Sensor` has 2 guesses, expected one number",
     "jj.Estimate(np.inf)": "`guess` of `Estimate` is inf, expected a finite number",
     "jj.Estimate(1.0, range=(0.0, 1.0))": "`range` of `Estimate` is a tuple, expected `bounds",
     "jj.Estimate(1.0, per_run=1)": "`per_run` of `Estimate` is an int, expected True or False",
-    "jj.Estimate(1.0, prior=0.1)": "`prior` of `Estimate` is a float, expected `jj.Normal(mean, sigma)`",
-    "jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0))": "expected a standard deviation above zero; give known numbers without `Estimate`",
-    "jj.Actuator(1.0)": "`command` of `Actuator` is a float, expected `jj.Sampled",
-    "jj.Actuator(command, hold=1)": "`hold` of `Actuator` is an int ... expected True",
-    "jj.Actuator(command, gain=[1.0, 2.0])": "`gain` of `Actuator` has shape (2,), expected one number",
+    "jj.Estimate(1.0, prior=0.1)": "`prior` of `Estimate` is a float, expected `jj.studies.Normal(mean, sigma)`",
+    "jj.Estimate(1.0, prior=jj.studies.Normal(1.0, 0.0))": "expected a standard deviation above zero; give known numbers without `Estimate`",
+    "jj.identification.Actuator(1.0)": "`command` of `Actuator` is a float, expected `jj.Sampled",
+    "jj.identification.Actuator(command, hold=1)": "`hold` of `Actuator` is an int ... expected True",
+    "jj.identification.Actuator(command, gain=[1.0, 2.0])": "`gain` of `Actuator` has shape (2,), expected one number",
     "jj.Experiment(TS, {'x': TS}, 1.0, start={}, sensors={'y': 'x'})": "sensor `y` has no measured values; Valid names: `x`",
     "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), 'mass')": (
         "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`"
@@ -133,12 +134,13 @@ SENSORS: dict[str, str] = {
     "jj.fit(cart, [shown(gain=gain), shown(gain=jj.Estimate(2.0))], 'mass')": (
         "run 0 and run 1 share `gyro.gain` but state it differently ... ; give both the same, or `per_run=True`"
     ),
-    "jj.log_likelihood(cart, shown(gain=gain))": "`gyro.gain` is to be estimated, but a likelihood needs its value",
-    "with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1))": "command of input `push` of run 0 of `Cart` ends at 1 s, before",
+    "jj.identification.log_likelihood(cart, shown(gain=gain))": "`gyro.gain` is to be estimated, but a likelihood needs its value",
+    "with_input(jj.identification.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1))": "command of input `push` of run 0 of `Cart` ends at 1 s, before",
     "with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0]))": "is sampled from 1700000000 to 1700000004 s, but the run is from 0 to 4 s, where the input",
     "jj.fit(cart, shown(), {'mass': jj.Estimate(per_run=True)})": "`free` has a `mass` for each run, but all runs share the scene",
     "jj.fit(cart, shown(), {'mass': jj.Estimate((1.0, 2.0))})": "first guess of `mass` has shape (2,), expected ()",
-    "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.Sensor('x', gain=gain)}, inputs={'push': jj.Actuator(command, gain=gain)}))": (
+    "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.identification.Sensor('x', gain=gain)}, "
+    "inputs={'push': jj.identification.Actuator(command, gain=gain)}))": (
         "has a channel and an input `push`, both with an estimated gain; give the channel another name"
     ),
 }
@@ -151,17 +153,17 @@ NOISE: dict[str, str] = {
     "jj.fit(cart, [run(correlation_time=None), run(correlation_time=0.1)], 'mass')": (
         "correlation time of channel `x` is None in one run and given in another"
     ),
-    "jj.fit(cart, run(correlation_time=0.1), 'mass', loss=jj.huber())": "a robust loss assumes independent samples",
-    "jj.log_likelihood(cart, run(correlation_time=None))": "the correlation time of channel `x` is None, but a likelihood needs it",
+    "jj.fit(cart, run(correlation_time=0.1), 'mass', loss=jj.identification.huber())": "a robust loss assumes independent samples",
+    "jj.identification.log_likelihood(cart, run(correlation_time=None))": "the correlation time of channel `x` is None, but a likelihood needs it",
 }
 
 PRIORS: dict[str, str] = {
-    "jj.joint_normal({}, [[1.0]])": "expected a dictionary of name -> mean",
-    "jj.joint_normal({'a': 1.0}, [1.0])": "has shape (1,), expected (1, 1)",
-    "jj.joint_normal({'a': 1.0}, [[np.nan]])": "must be finite",
-    "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.0], [0.0, 0.0]])": "the variance of `b` is 0, expected a number above zero",
-    "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.5], [0.4, 1.0]])": "is not symmetric",
-    "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 2.0], [2.0, 1.0]])": "its correlations have the eigenvalue -1",
+    "jj.identification.joint_normal({}, [[1.0]])": "expected a dictionary of name -> mean",
+    "jj.identification.joint_normal({'a': 1.0}, [1.0])": "has shape (1,), expected (1, 1)",
+    "jj.identification.joint_normal({'a': 1.0}, [[np.nan]])": "must be finite",
+    "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.0], [0.0, 0.0]])": "the variance of `b` is 0, expected a number above zero",
+    "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.5], [0.4, 1.0]])": "is not symmetric",
+    "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 2.0], [2.0, 1.0]])": "its correlations have the eigenvalue -1",
     "jj.fit(cart, jj.Experiment(TS, {'x': TS}, 0.01, start={'x': 0.3}, unknown_start={'x': together['mass']}, t0=0.0))": "belongs to one run",
 }
 
@@ -170,18 +172,18 @@ DENSITIES: dict[str, str] = {
     "density.unconstrain({'damping': 2.0})": "`damping` is 2, which is at or beyond a bound",
     "density(jnp.zeros(3))": "the vector has shape (3,), expected (4,)",
     "density.whitened(jj.fit(cart, run(), 'mass'))": "give the fit of the same unknowns",
-    "jj.log_density(cart, [run(), run(correlation_time=None)], 'mass')": "None in one run and given in another",
-    "jj.log_density(cart, [run(), run(sigma=None)], 'mass')": "None in one run and given in another",
-    "jj.log_density(cart, run(sigma=None), 'damping', max_steps=3)": "the motion fails at the first guess",
+    "jj.identification.log_density(cart, [run(), run(correlation_time=None)], 'mass')": "None in one run and given in another",
+    "jj.identification.log_density(cart, [run(), run(sigma=None)], 'mass')": "None in one run and given in another",
+    "jj.identification.log_density(cart, run(sigma=None), 'damping', max_steps=3)": "the motion fails at the first guess",
 }
 
 INERTIAS: dict[str, str] = {
-    "jj.log_cholesky([0.1, 0.1, 0.3])": "no body of nonzero thickness has the principal moments",
-    "jj.log_cholesky([-0.1, 0.1, 0.1])": "no body of nonzero thickness",
-    "jj.log_cholesky([1.0, 2.0])": "has shape (2,), expected (3, 3) or (3,)",
-    "jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]))": "not symmetric; give Ixy = Iyx",
-    "jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True)": "Ixy = 0.1 and Iyz = 0",
-    "jj.inertia_from_log_cholesky([1.0, 2.0, 3.0])": "has shape (3,), expected (6,), or (4,)",
+    "jj.identification.log_cholesky([0.1, 0.1, 0.3])": "no body of nonzero thickness has the principal moments",
+    "jj.identification.log_cholesky([-0.1, 0.1, 0.1])": "no body of nonzero thickness",
+    "jj.identification.log_cholesky([1.0, 2.0])": "has shape (2,), expected (3, 3) or (3,)",
+    "jj.identification.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]))": "not symmetric; give Ixy = Iyx",
+    "jj.identification.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True)": "Ixy = 0.1 and Iyz = 0",
+    "jj.identification.inertia_from_log_cholesky([1.0, 2.0, 3.0])": "has shape (3,), expected (6,), or (4,)",
 }
 
 TABLE = FITS | SENSORS | NOISE | PRIORS | DENSITIES | INERTIAS

@@ -126,7 +126,7 @@ class Seen(jj.Scene):
 
     def coordinate_rates(self, t, q, u):
         t, old = t * self.view.time, self.old_coordinates(q.array)
-        rates = jj.coordinate_rates(self.scene, t, old, self.old_speeds(old, u.array))
+        rates = jj.equations.coordinate_rates(self.scene, t, old, self.old_speeds(old, u.array))
         return jax.jvp(self.new_coordinates, (old,), (rates,))[1] * self.view.time
 
     def _pose(self, pose) -> Pose:
@@ -150,7 +150,7 @@ class Seen(jj.Scene):
             v = view.rotation.T @ (motion[new].velocity * view.length / view.time - view.velocity)
             omega = view.rotation.T @ motion[new].angular_velocity / view.time
             moving[name] = BodyMotion(name, pose[name].body, v, omega)
-        rates = jj.coordinate_rates(self.scene, t, pose.q.array, u)
+        rates = jj.equations.coordinate_rates(self.scene, t, pose.q.array, u)
         return Motion(t, pose.q, self.scene.speed_names.view(u), self.scene.coordinate_names.view(rates), motion.inputs, moving)
 
     def loads(self, motion):

@@ -29,6 +29,7 @@ from solved_states import over_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import coordinate_rates
 
 # The search for motions that are wrong in silence: its references and its judge, and a short set of its cases.
 
@@ -198,7 +199,7 @@ def _solved(name):
     scene = _with_random_parameters(name)
     t, q, u = jj.sample_states(scene, STATES)
     assert len(t) == STATES
-    return scene, (t, q, u), *map(np.asarray, over_states(lambda *y: (jj.coordinate_rates(scene, *y), jj.accelerations(scene, *y).udot), t, q, u))
+    return scene, (t, q, u), *map(np.asarray, over_states(lambda *y: (coordinate_rates(scene, *y), jj.accelerations(scene, *y).udot), t, q, u))
 
 
 def _assert_equal(found, expected, among=None):

@@ -10,6 +10,7 @@ import pytest
 from test_studies import assert_same
 
 import jourdain_jax as jj
+from jourdain_jax.studies import Uniform
 
 distributed = pytest.importorskip("distributed")
 COUNT = 150  # lanes, in five chunks
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def run(path, outputs=None, **options):
-    start = {"lean": jj.Uniform(-0.5, 0.5), "spin_rate": jj.Uniform(-4.0, 0.0)}
+    start = {"lean": Uniform(-0.5, 0.5), "spin_rate": Uniform(-4.0, 0.0)}
     study = jj.Study(jj.models.TiltingDisc(), start=start, samples=COUNT, seed=3)
     return study.run(path, t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, **options)
 

@@ -9,6 +9,7 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
+from jourdain_jax.equations import coordinate_rates
 from jourdain_jax.program.eager import eval_numpy
 
 # Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move, and what presses them.
@@ -121,7 +122,7 @@ def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shap
         u = jnp.concatenate([-jnp.cross(R @ turning, arm), turning])
         found = jj.accelerations(scene, 0.0, q, u)
         force = contact_forces(scene, 0.0, q, u, found)["touch"]
-        _, slip_rate = jax.jvp(slip, (q, u), (jj.coordinate_rates(scene, 0.0, q, u), found.udot))
+        _, slip_rate = jax.jvp(slip, (q, u), (coordinate_rates(scene, 0.0, q, u), found.udot))
         F = scene.mass * (found.udot[:3] + GRAVITY * UP)
         torque = scene_moments * found.udot[3:] + jnp.cross(turning, scene_moments * turning)
         return jnp.concatenate([slip_rate, R @ torque - jnp.cross(arm, F), slip(q, u)]), F, contact.plane, force

@@ -8,6 +8,7 @@ from oracles import chaplygin_sleigh as sleigh_oracle
 from small_scenes import OnLine
 
 import jourdain_jax as jj
+from jourdain_jax.identification import log_likelihood
 
 SIGMA, TAU = 0.02, 0.4  # m, rad; s: neighbours at 0.1 s correlate at 0.78
 TS = np.linspace(0.0, 8.0, 41)
@@ -45,7 +46,7 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     V = SIGMA**2 * np.exp(-np.abs(ts[:, None] - ts) / tau)
     expected = -0.5 * r @ np.linalg.solve(V, r) - 0.5 * np.linalg.slogdet(2 * np.pi * V)[1]
     # the simulation's error of 1e-8 m is multiplied where neighbours nearly agree
-    found = jax.jit(lambda scene: jj.log_likelihood(scene, data, rtol=1e-10, atol=1e-10))
+    found = jax.jit(lambda scene: log_likelihood(scene, data, rtol=1e-10, atol=1e-10))
     assert found(truth) == pytest.approx(expected, abs=1e-4 * abs(expected))
 
 

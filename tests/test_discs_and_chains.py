@@ -13,6 +13,7 @@ from solved_states import solved_at_random_states, solved_by_every_reduction
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import constraint_rows, unconstrained_equations
 from jourdain_jax.models import (
     BallOnTurntable,
     DoublePendulumAngles,
@@ -294,8 +295,8 @@ def test_a_straight_train_accelerates_as_one_mass():
 @pytest.mark.parametrize("scene", [TrailerChain(trailers=5), PendulumChain(links=6)], ids=lambda s: type(s).__name__)
 def test_rows_far_apart_in_the_chain_do_not_meet(scene):
     ((_, q, u),) = admissible_states(scene, 1)
-    A = np.asarray(jj.constraint_rows(scene, 0.0, q, u).A)
-    M = np.asarray(jj.unconstrained_equations(scene, 0.0, q, u).M)
+    A = np.asarray(constraint_rows(scene, 0.0, q, u).A)
+    M = np.asarray(unconstrained_equations(scene, 0.0, q, u).M)
     names = jj.structure_of(scene).row_names
     place = np.array([int(name.split("[")[0].split()[-1]) for name in names])
     coupling = np.abs(A @ np.linalg.solve(M, A.T))

@@ -16,6 +16,7 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
+from jourdain_jax.equations import coordinate_rates, unconstrained_equations
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integration import integrate
@@ -41,7 +42,7 @@ def other_parameters(name, seed) -> jj.Scene:
 @eqx.filter_vmap(in_axes=(eqx.if_array(0), 0, 0, 0))
 @eqx.filter_vmap(in_axes=(None, 0, 0, 0))
 def _solved(scene, t, q, u):
-    equations = jj.unconstrained_equations(scene, t, q, u)
+    equations = unconstrained_equations(scene, t, q, u)
     found = {name: jj.accelerations(scene, t, q, u, reduction=name) for name in jj.reductions(scene)}
     return equations.Q - equations.h, {name: (x.udot, x.constraint_force, x.applicable) for name, x in found.items()}
 
@@ -79,7 +80,7 @@ def _check_lowered(name, scenes, states, udot, size):
         assert lowered(scene) is program  # parameters are inputs of the program
         probes = Probes(program.graph, named_values(scene, t, q, u, np.zeros((STATES, len(scene.inputs)))))
         ydot, qdot, z = probes(program.ydot).T, probes(program.qdot).T, probes(program.z).T
-        rates = np.asarray(jax.vmap(lambda t, q, u, scene=scene: jj.coordinate_rates(scene, t, q, u))(t, q, u))
+        rates = np.asarray(jax.vmap(lambda t, q, u, scene=scene: coordinate_rates(scene, t, q, u))(t, q, u))
         assert np.max(np.abs(ydot - dense[:, list(program.independent)]) / relative_to, initial=0.0) <= tolerance("round_off"), "accelerations"
         assert np.max(np.abs(z - u[:, list(program.dependent)]), initial=0.0) <= tolerance("round_off") * np.max(np.abs(u)), "dependent speeds"
         assert np.max(np.abs(qdot - rates), initial=0.0) <= tolerance("round_off") * (1 + np.max(np.abs(rates))), "rates of coordinates"

@@ -9,6 +9,7 @@ from small_scenes import Oscillator
 from test_mean_gradients import Thrown
 
 import jourdain_jax as jj
+from jourdain_jax.studies import Integral, Largest, LargestMagnitude, Smallest
 
 TIMES = np.linspace(0.0, 2.0, 41)
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -32,17 +33,17 @@ def test_the_largest_value_is_found_to_the_fifth_order_wherever_it_lies(waves):
     phases, lanes = waves
     inside = (np.pi / 2 - phases) % (2 * np.pi) / 3.0 <= 2.0
     exact = np.where(inside, 1.0, np.maximum(np.sin(phases), np.sin(6.0 + phases)))
-    assert_allclose(jax.jit(jax.vmap(jj.Largest("x").of))(lanes), exact, rtol=0, atol=1e-6)
+    assert_allclose(jax.jit(jax.vmap(Largest("x").of))(lanes), exact, rtol=0, atol=1e-6)
     assert np.max(np.abs(np.max(lanes["x"], axis=1) - exact)) > 2e-3  # what saved values alone give
 
 
 def test_the_integral_is_found_to_the_fourth_order(waves):
     phases, lanes = waves
     exact = (np.cos(phases) - np.cos(6.0 + phases)) / 3.0
-    assert_allclose(jax.jit(jax.vmap(jj.Integral("x").of))(lanes), exact, rtol=0, atol=3e-6)
+    assert_allclose(jax.jit(jax.vmap(Integral("x").of))(lanes), exact, rtol=0, atol=3e-6)
     assert np.max(np.abs(np.trapezoid(lanes["x"], TIMES, axis=1) - exact)) > 1e-4  # of the trapezoidal rule
     uneven = jj.simulate(SWINGING, {}, ts=np.sort(np.concatenate([TIMES, TIMES[1:30] - 0.02])))
-    cubic = jj.Integral(lambda motion: 1.0 + motion.ts - 2.0 * motion.ts**2 + 3.0 * motion.ts**3)
+    cubic = Integral(lambda motion: 1.0 + motion.ts - 2.0 * motion.ts**2 + 3.0 * motion.ts**3)
     assert jax.jit(cubic.of)(uneven) == pytest.approx(2.0 + 2.0 - 16.0 / 3.0 + 12.0, rel=1e-13)
 
 
@@ -52,7 +53,7 @@ def test_values_that_were_not_reached_do_not_count():
 
     def of(height):
         motion = jj.simulate(Thrown(), {"z": height, "z_rate": 0.0}, ts=TIMES, **TIGHT)
-        found = jj.Integral("z").of(motion), jj.Largest("z").of(motion)
+        found = Integral("z").of(motion), Largest("z").of(motion)
         return sum(found), found
 
     heights = 4.5 * landed**2
@@ -66,7 +67,7 @@ def test_the_derivative_is_that_of_the_largest_value():
     """Of a sin(3 t + phase): 1 by the amplitude, 0 by the phase."""
 
     def of(size, phase):
-        return jj.Largest("x").of(jj.simulate(SWINGING, wave(phase, size), ts=TIMES, work=False, **TIGHT))
+        return Largest("x").of(jj.simulate(SWINGING, wave(phase, size), ts=TIMES, work=False, **TIGHT))
 
     assert_allclose(jax.jit(jax.grad(of, argnums=(0, 1)))(1.3, 0.4), [1.0, 0.0], atol=2e-5)
 
@@ -76,15 +77,15 @@ def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
     motion = jj.simulate(Thrown(), {"z": 1.0, "z_rate": 2.0}, t1=0.9, ts=np.linspace(0.0, 0.9, 10), **TIGHT)
     top, landed = 1.0 + 4.0 / 18.0, (2.0 + np.sqrt(22.0)) / 9.0
     assert jnp.nanmax(motion["z"]) < top - 1e-3
-    assert jj.Largest("z").of(motion) == pytest.approx(top, abs=1e-9)
-    assert jj.Smallest("z").of(motion) == pytest.approx(0.0, abs=1e-9)
-    assert jj.LargestMagnitude("z_rate").of(motion) == pytest.approx(np.sqrt(4.0 + 18.0), rel=1e-8)
-    assert jj.Largest(lambda motion: motion["z"] - motion.ts).of(motion) == pytest.approx(1.0 + 1.0 / 18.0, abs=1e-9)
+    assert Largest("z").of(motion) == pytest.approx(top, abs=1e-9)
+    assert Smallest("z").of(motion) == pytest.approx(0.0, abs=1e-9)
+    assert LargestMagnitude("z_rate").of(motion) == pytest.approx(np.sqrt(4.0 + 18.0), rel=1e-8)
+    assert Largest(lambda motion: motion["z"] - motion.ts).of(motion) == pytest.approx(1.0 + 1.0 / 18.0, abs=1e-9)
     height = landed + landed**2 - 1.5 * landed**3
-    assert jj.Integral("z", "m s").of(motion) == pytest.approx(height, rel=1e-9)
-    assert jj.Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion) == pytest.approx(landed, rel=1e-9)
+    assert Integral("z", "m s").of(motion) == pytest.approx(height, rel=1e-9)
+    assert Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion) == pytest.approx(landed, rel=1e-9)
     with pytest.raises(ValueError, match=r"the quantity of an output is .*, expected its real values at all 11 times of the motion"):
-        jj.Integral(lambda motion: motion.t_end).of(motion)
+        Integral(lambda motion: motion.t_end).of(motion)
 
 
 def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
@@ -92,7 +93,7 @@ def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
     after = 1.0 + np.array([1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15, 0.0])
     options = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 21), "rtol": 1e-8, "atol": 1e-8}
     lanes = jj.rollout(Thrown(), {"z": 4.5 * after**2, "z_rate": 0.0}, **options).lanes
-    outputs = jj.Integral("z"), jj.Integral(lambda motion: motion["z_rate"] ** 2), jj.Largest("z")
+    outputs = Integral("z"), Integral(lambda motion: motion["z_rate"] ** 2), Largest("z")
     found = jax.jit(jax.vmap(lambda motion: [output.of(motion) for output in outputs]))(lanes)
     assert_allclose(found, [3.0 * after**3, 27.0 * after**3, 4.5 * after**2], rtol=1e-9)
 
@@ -102,6 +103,6 @@ def test_a_motion_that_runs_back_in_time_has_its_end_too():
     motion = jj.simulate(Thrown(), {"z": 0.5, "z_rate": 0.0}, ts=np.linspace(0.0, -1.0, 10), **TIGHT)
     left = -1.0 / 3.0
     assert motion.t_end == pytest.approx(left, abs=1e-9)
-    outputs = jj.Smallest("z"), jj.LargestMagnitude("z_rate"), jj.Integral("z")
+    outputs = Smallest("z"), LargestMagnitude("z_rate"), Integral("z")
     found = jax.jit(lambda motion: [output.of(motion) for output in outputs])(motion)
     assert_allclose(found, [0.0, 3.0, 0.5 * left - 1.5 * left**3], rtol=1e-9, atol=1e-9)

@@ -9,6 +9,8 @@ from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Accelerometer, Sensor, filtered_log_likelihood, log_likelihood
+from jourdain_jax.studies import Normal
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 TS = np.array([0.0, 0.2, 0.45, 0.5, 0.9, 1.3, 1.7, 2.0])
@@ -45,16 +47,16 @@ def samples():
 
 def measured(unknown=(), values=None):
     values = samples() if values is None else values
-    sensors = {"speedometer": jj.Sensor("x_rate", gain=2.0, bias=0.1)}
+    sensors = {"speedometer": Sensor("x_rate", gain=2.0, bias=0.1)}
     return jj.Experiment(TS, values, {"x": 0.02, "speedometer": 0.05}, start={"x": 0.3, "x_rate": -0.1}, unknown_start=unknown, sensors=sensors)
 
 
 @pytest.mark.parametrize("spread", [(0.0, 0.0), (0.1, 0.3)])
 @pytest.mark.parametrize("noise", [0.0, NOISE])
 def test_linear_scene_has_the_likelihood_of_kalmans_filter(spread, noise):
-    unknown = {n: jj.Estimate(prior=jj.Normal(m, s)) for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True) if s}
+    unknown = {n: jj.Estimate(prior=Normal(m, s)) for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True) if s}
     data = measured(unknown)
-    found = jax.jit(lambda scene: jj.filtered_log_likelihood(scene, data, process_noise={"x_rate": noise}, **TIGHT))
+    found = jax.jit(lambda scene: filtered_log_likelihood(scene, data, process_noise={"x_rate": noise}, **TIGHT))
     assert_allclose(found(Oscillator()), kalman(0.3, 5.0, noise, samples(), spread), rtol=1e-9)
 
 
@@ -62,7 +64,7 @@ def test_derivatives_are_those_of_kalmans_filter():
     run = measured()
 
     def of(theta):
-        return jj.filtered_log_likelihood(Oscillator(damping=theta[0], stiffness=theta[1]), run, process_noise={"x_rate": theta[2]}, **TIGHT)
+        return filtered_log_likelihood(Oscillator(damping=theta[0], stiffness=theta[1]), run, process_noise={"x_rate": theta[2]}, **TIGHT)
 
     theta = jnp.array([0.3, 5.0, NOISE])
     found = jax.jit(jax.jacfwd(of))(theta)
@@ -87,7 +89,7 @@ def undisturbed():
 
 def test_undisturbed_motions_have_the_plain_likelihood():
     for scene, runs in undisturbed():
-        assert_allclose(jj.filtered_log_likelihood(scene, runs, process_noise={}), jj.log_likelihood(scene, runs), rtol=1e-6)
+        assert_allclose(filtered_log_likelihood(scene, runs, process_noise={}), log_likelihood(scene, runs), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -98,19 +100,19 @@ def test_undisturbed_motions_have_the_plain_likelihood():
         ({}, {"sigma": None}, "sigma of channel `x` is None"),
         ({}, {"correlation_time": 0.1}, "has a correlation time"),
         ({}, {"unknown_start": ("x",)}, "start value `x` of run 0 is unknown"),
-        ({}, {"sensors": {"x": jj.Sensor(lag=0.1)}}, "sensor `x` of run 0 has a delay or a lag"),
-        ({}, {"sensors": {"x": jj.Sensor(gain=jj.Estimate(1.0))}}, "`x.gain` is to be estimated"),
+        ({}, {"sensors": {"x": Sensor(lag=0.1)}}, "sensor `x` of run 0 has a delay or a lag"),
+        ({}, {"sensors": {"x": Sensor(gain=jj.Estimate(1.0))}}, "`x.gain` is to be estimated"),
     ],
 )
 def test_what_a_filter_does_not_know_is_said_by_name(noise, change, message):
     run = jj.Experiment(TS, {"x": samples()["x"]}, **({"sigma": 0.02, "start": {"x": 0.3}} | change))
     with pytest.raises(ValueError, match=message):
-        jj.filtered_log_likelihood(Oscillator(), run, process_noise=noise)
+        filtered_log_likelihood(Oscillator(), run, process_noise=noise)
 
 
 def test_quaternions_and_accelerometers_are_refused():
     with pytest.raises(ValueError, match="has quaternions"):
-        jj.filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={})
-    run = jj.Experiment(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": jj.Accelerometer("cart")})
+        filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={})
+    run = jj.Experiment(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": Accelerometer("cart")})
     with pytest.raises(ValueError, match="measures accelerations, which contain the white disturbance itself"):
-        jj.filtered_log_likelihood(Oscillator(), run, process_noise={})
+        filtered_log_likelihood(Oscillator(), run, process_noise={})

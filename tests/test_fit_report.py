@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Sensor, log_likelihood
+from jourdain_jax.studies import Normal
 
 # The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing.
 
@@ -171,7 +173,7 @@ def test_report_tells_the_way_to_the_minimum(tmp_path):
     assert len(costs) == int(fit.steps) + 1
     assert costs[-1] == pytest.approx(0.5 * float(fit.chi_square), rel=1e-9)
     alone = jj.fit(guess, data, free=("offset",))
-    assert alone.trace[0][1][0] == pytest.approx(-float(jj.log_likelihood(guess, data)) - logs, rel=1e-6)
+    assert alone.trace[0][1][0] == pytest.approx(-float(log_likelihood(guess, data)) - logs, rel=1e-6)
     assert np.all(np.diff(alone.trace[0][1]) <= 1e-6)
     fit.report(tmp_path / "fit.html")
     text = (tmp_path / "fit.html").read_text(encoding="utf-8")
@@ -241,7 +243,7 @@ def run(start=START, sigma=0.01, noise: int | None = 0, unknown=("heading_rate",
 
 
 def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error():
-    sensor = jj.Sensor("heading", gain=jj.Estimate(1.1), bias=jj.Estimate(0.1))
+    sensor = Sensor("heading", gain=jj.Estimate(1.1), bias=jj.Estimate(0.1))
     motion, noise = jj.simulate(TRUTH, START, ts=TS), np.random.default_rng(2)
     data = jj.Experiment(TS, {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)}, 0.05, start=START, sensors={"shown": sensor})
     fit = jj.fit(TRUTH, data)
@@ -337,7 +339,7 @@ def test_a_prior_takes_what_the_data_do_not_tell():
     data = run(noise=None)
     alone = jj.fit(TRUTH, data, ("offset",))
     s = 2 * float(alone["offset"].standard_error)
-    fit = jj.fit(TRUTH, data, {"offset": jj.Estimate(prior=jj.Normal(0.25, s))})
+    fit = jj.fit(TRUTH, data, {"offset": jj.Estimate(prior=Normal(0.25, s))})
     found = shares(fit, data)
     assert found.of_priors[0] == pytest.approx(float(fit["offset"].standard_error) ** 2 / s**2, rel=1e-6)
 
@@ -357,7 +359,7 @@ def test_the_span_that_holds_half_of_the_information_is_the_shortest_one():
 
 
 def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
-    gyro = jj.Sensor("heading_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
+    gyro = Sensor("heading_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
 
     def with_gyro(start, bias, seed):
         motion, noise = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(seed)
@@ -370,7 +372,7 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
     other = with_gyro({"x_rate": -0.5, "heading_rate": 0.6}, 0.05, 2)
     (found,) = fit.predict(other)
     # the same by a fit whose shared unknowns are known
-    known = jj.Sensor("heading_rate", gain=float(fit["gyro.gain"].value), bias=jj.Estimate(0.0))
+    known = Sensor("heading_rate", gain=float(fit["gyro.gain"].value), bias=jj.Estimate(0.0))
     by_hand = jj.fit(
         fit.scene, jj.Experiment(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
     )
@@ -384,7 +386,7 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
 
 def test_runs_held_out_that_cannot_be_predicted_are_answered():
     fit = jj.fit(TRUTH, run(unknown=()), ("offset",))
-    scaled = jj.Experiment(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": jj.Sensor("heading_rate", gain=jj.Estimate(1.0))})
+    scaled = jj.Experiment(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": Sensor("heading_rate", gain=jj.Estimate(1.0))})
     with pytest.raises(ValueError, match=r"runs held out share `gyro\.gain`, which was not estimated"):
         fit.predict(scaled)
 

@@ -33,7 +33,7 @@ import gc, json, warnings
 import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.integrate import result_codes
 from jourdain_jax.kernels import host
 
 gc.disable()  # a process of a minute
@@ -65,7 +65,7 @@ for name in names:
     found[name] = {
         "q": [way.q.tolist() for way in (motion, by_xla)],
         "u": [way.u.tolist() for way in (motion, by_xla)],
-        "result": [int(way.result) for way in (motion, by_xla)] == [results.SUCCESS] * 2,
+        "result": [int(way.result) for way in (motion, by_xla)] == [result_codes.SUCCESS] * 2,
         "reduction": motion.reduction,
         "operations": jj.lower(scene).operations,
         "types": types((scene, state, motion, by_xla, motion.energies(), motion.accelerations(), motion.contact_forces(), by_reduction)),

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import generalized_forces, unconstrained_equations
 
 # every body has one geom, or principal moments: MuJoCo diagonalises the inertia of several with an error of 1e-10
 EVERYTHING = """
@@ -75,7 +76,7 @@ def test_the_equations_are_those_of_mujoco(name):
         mujoco.mj_forward(model, data)
         M = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, M, data.qM)
-        own = jj.unconstrained_equations(scene, 0.0, q, u, pushes)
+        own = unconstrained_equations(scene, 0.0, q, u, pushes)
         assert relative_error(own.M, M) < tolerance("closed_form")
         assert relative_error(own.h - own.Q, data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator) < tolerance("closed_form")
         assert relative_error(jj.accelerations(scene, 0.0, q, u, pushes).udot, data.qacc) < tolerance("closed_form")
@@ -94,7 +95,7 @@ def test_the_equations_are_those_of_mujoco(name):
 )
 def test_motors_share_the_defaults_of_all_actuators(defaults, gear):
     text = _body(HINGE, '<actuator><motor name="m" joint="j"/></actuator>', f"<default>{defaults}</default>")
-    assert_allclose(jj.generalized_forces(jj.from_mjcf(text)(), 0.0, np.zeros(1), np.zeros(1), {"m": 2.0}), [2.0 * gear])
+    assert_allclose(generalized_forces(jj.from_mjcf(text)(), 0.0, np.zeros(1), np.zeros(1), {"m": 2.0}), [2.0 * gear])
 
 
 @pytest.mark.parametrize("near", [1e-9, 1e-7, 1e-5, 1e-3])

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import unconstrained_equations
 
 ROBOT = (Path(__file__).parents[1] / "docs" / "howto" / "robot.urdf").read_text(encoding="utf-8")
 LINK = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
@@ -75,7 +76,7 @@ class ByHand(jj.Scene):
 def test_an_arm_moves_as_one_that_is_written_by_hand():
     arm, by_hand = jj.from_urdf(ARM)(), ByHand()
     for t, q, u in zip(*jj.sample_states(by_hand, 3), strict=True):
-        own, expected = (jj.unconstrained_equations(scene, t, q, u) for scene in (arm, by_hand))
+        own, expected = (unconstrained_equations(scene, t, q, u) for scene in (arm, by_hand))
         for what in ("M", "h", "Q"):
             assert relative_error(getattr(own, what), getattr(expected, what)) < tolerance("round_off")
         own, expected = (jj.accelerations(scene, t, q, u).udot for scene in (arm, by_hand))
@@ -96,7 +97,7 @@ def test_numbers_of_the_file_are_parameters():
     q, u = jnp.array([0.3, 0.2, 0.5]), jnp.zeros(3)
 
     def moment(**changes):
-        return jj.unconstrained_equations(arm.replace(**changes), 0.0, q, u).M[0, 0]
+        return unconstrained_equations(arm.replace(**changes), 0.0, q, u).M[0, 0]
 
     # dM/dm of a point mass is the square of its distance from the axis; M is affine in masses and inertias
     slope = jax.grad(lambda m: moment(third_mass=m))(0.5)
@@ -172,7 +173,7 @@ def test_joints_of_several_coordinates_move_as_a_free_body(kind, speeds):
     scene = jj.from_urdf(text)()
     t, q, u = (x[0] for x in jj.sample_states(scene, 1))
     assert len(u) == speeds
-    assert relative_error(jj.unconstrained_equations(scene, t, q, u).M, np.eye(speeds)) < tolerance("round_off")  # 1 kg, 1 kg m^2
+    assert relative_error(unconstrained_equations(scene, t, q, u).M, np.eye(speeds)) < tolerance("round_off")  # 1 kg, 1 kg m^2
     motion = jj.motion_at(scene, t, q, u)["b"]
     if kind == "planar":
         normal = np.array([0.0, 0.6, 0.8])

@@ -18,6 +18,7 @@ from test_modes import NUMBERS, seen
 import jourdain_jax as jj
 from jourdain_jax.kernels import ffi, gpu, nvidia
 from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.studies import Design, LogNormal, LogUniform, Normal, Uniform
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against() or nvidia.reason_against_text()), reason="no machine code is made here")
 ARCHITECTURES = ("sm_75", "sm_80", "sm_90", "sm_100")
@@ -169,16 +170,16 @@ def test_a_model_says_on_which_devices_it_is_integrated():
 @pytest.mark.parametrize("sampler", ["random", "latin-hypercube", "sobol", "saltelli"])
 def test_samples_drawn_on_a_device_have_the_bits_of_the_host(sampler):
     kinds = {
-        "a": jj.Normal(2.0, 0.7),
-        "b": jj.Uniform(-1.0, 3.3),
-        "c": jj.LogNormal(2.0, 0.4),
-        "d": jj.LogUniform(0.01, 30.0),
+        "a": Normal(2.0, 0.7),
+        "b": Uniform(-1.0, 3.3),
+        "c": LogNormal(2.0, 0.4),
+        "d": LogUniform(0.01, 30.0),
     }
     correlation = None if sampler == "saltelli" else {("a", "b"): 0.6, ("b", "c"): -0.3, ("a", "d"): 0.5}
     # XLA for CPUs, as these tests ask for it, refuses loops over many numbers, by which the hypercube is
     # walked
     count = 402 if sampler == "latin-hypercube" else 40_002
-    design = jj.Design(kinds, sampler=sampler, samples=count, seed=2**62 + 11, correlation=correlation)
+    design = Design(kinds, sampler=sampler, samples=count, seed=2**62 + 11, correlation=correlation)
     found = design._at(np.arange(7, count), on_device=True)
     for name, column in design.values(7, count).items():
         assert isinstance(found[name], jax.Array)
@@ -190,7 +191,7 @@ def test_many_lanes_run_at_once_on_a_gpu():
     with gpu_twin.in_place_of_a_gpu() as launched:
         jj.rollout(scene, {"x_rate": np.ones(1000)}, ts=[0.1])
         assert min(launched.values()) == 1
-        assert jj.Study(scene, start={"x_rate": jj.Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15
+        assert jj.Study(scene, start={"x_rate": Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15
 
 
 OF_TWO_DEVICES = """

@@ -17,7 +17,8 @@ from oracles import chaplygin_sleigh as sleigh_oracle
 from small_scenes import Cart
 
 import jourdain_jax as jj
-from jourdain_jax import Experiment, bounds, fit, fit_batch, log_likelihood, unbounded
+from jourdain_jax import Experiment, bounds, fit, fit_batch
+from jourdain_jax.identification import Actuator, Sensor, huber, log_likelihood, student_t, unbounded
 from jourdain_jax.models import ChaplyginSleigh
 
 REPEATS = 200
@@ -252,7 +253,7 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     assert not fit(Cart(mass=1.7), cart_run(values=values, sigma=0.01), ("mass",)).warnings
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
     assert "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are too large" in warning
-    (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=jj.huber()).warnings
+    (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=huber()).warnings
     assert "the residuals are smaller than the sigmas predict" in warning
 
 
@@ -333,7 +334,7 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
         assert [one.filename for one in seen] == [__file__]
         seen.clear()
         ts = np.arange(1, 20) / 5.0  # from an interval after the start until one before the end
-        log_likelihood(CART, cart_run(inputs={"push": jj.Actuator(jj.Sampled(ts, np.sin(ts)), hold=True)}))
+        log_likelihood(CART, cart_run(inputs={"push": Actuator(jj.Sampled(ts, np.sin(ts)), hold=True)}))
         assert not seen
 
 
@@ -400,7 +401,7 @@ def test_many_runs_with_unknown_starts_are_those_of_a_dense_fit():
 
 
 # Huber's loss bounds the influence of a sample, that of Student's t goes to zero
-@pytest.mark.parametrize(("loss", "most"), [(jj.huber(), 0.6), (jj.student_t(4.0), 0.3)])
+@pytest.mark.parametrize(("loss", "most"), [(huber(), 0.6), (student_t(4.0), 0.3)])
 def test_one_sample_far_out_hardly_moves_a_robust_fit(loss, most):
     ts = np.linspace(0.0, 12.0, 61)  # 122 samples
     guess = Cart(mass=1.7, damping=0.8, stiffness=4.0)
@@ -426,7 +427,7 @@ def test_a_sigma_that_is_not_known_is_told_and_ends_at_a_floor_where_a_channel_i
     assert found.reduced_chi_square == pytest.approx(1.0, rel=1e-6)
     x = np.asarray(jj.simulate(CART, cart_run().start, ts=TS)["x"])
     for scale in (1.0, 1e6):  # whatever its unit
-        exact = cart_run(values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": jj.Sensor("x", gain=scale)})
+        exact = cart_run(values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": Sensor("x", gain=scale)})
         met = fit(Cart(mass=1.7), exact, ("mass",))
         assert met.converged
         assert met.sigma["mine"] == pytest.approx(1e-10 * scale * np.max(np.abs(x)), rel=1e-3)
@@ -501,7 +502,7 @@ def test_what_moves_with_an_unknown_of_each_run_has_no_interval_and_all_else_kee
             return (*super().loads(motion), jj.generalized_force(motion, x_rate=self.stiffness * self.rest))
 
     def run(k):  # where the spring rests shows as little as the zero of an encoder and the place of the start
-        sensor = jj.Sensor("x", bias=jj.Estimate(0.0, per_run=True))
+        sensor = Sensor("x", bias=jj.Estimate(0.0, per_run=True))
         values = {"encoder": noisy(k).values["x"]}
         return cart_run(values=values, sigma=0.01, start={"x": 0.3}, unknown_start={"x": unbounded(0.1)}, sensors={"encoder": sensor})
 

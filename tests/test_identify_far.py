@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Sensor
 
 TS, SIGMA = np.linspace(0.0, 40.0, 201), 0.01
 
@@ -93,7 +94,7 @@ class Resting(OnLine):
 def test_a_minimum_that_undamped_steps_overshoot_is_found(curvature, large):
     """F = (x - 0.1)^2 + (R + a x^2 + a x^3 / 3)^2: at the minimum its second derivative is `curvature` times that of the linear problem."""
     a = (curvature - 1) / 2 / large
-    sensors = {"curved": jj.Sensor(lambda motion: large + a * motion.q.x**2 + a * motion.q.x**3 / 3)}
+    sensors = {"curved": Sensor(lambda motion: large + a * motion.q.x**2 + a * motion.q.x**3 / 3)}
     run = jj.Experiment(jnp.ones(1), {"x": [0.1], "curved": [0.0]}, 1.0, start={"x": 0.3}, unknown_start=("x",), sensors=sensors, t0=0.0)
     found = jj.fit(Resting(), run, ())
     slope = np.polynomial.Polynomial([-0.1, 1.0]) + np.polynomial.Polynomial([large, 0.0, a, a / 3]) * np.polynomial.Polynomial([0.0, 2 * a, a])

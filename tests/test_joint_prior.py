@@ -10,13 +10,15 @@ from small_scenes import Cart
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import benchmark_from_measurements, measured_bicycle
+from jourdain_jax.identification import joint_normal, log_density, log_likelihood, planned_information, unbounded
+from jourdain_jax.studies import Normal
 
 TS = np.linspace(0.1, 3.0, 16)
 CART, PUSH = Cart(damping=0.0), {"push": 1.0}
 NAMES, MEAN = ("mass", "stiffness"), {"mass": 2.02, "stiffness": 4.95}
 COVARIANCE = np.array([[0.02**2, 0.9 * 0.02 * 0.05], [0.9 * 0.02 * 0.05, 0.05**2]])
-TOGETHER = jj.joint_normal(MEAN, COVARIANCE)
-APART = {name: jj.Normal(MEAN[name], float(np.sqrt(COVARIANCE[k, k]))) for k, name in enumerate(NAMES)}
+TOGETHER = joint_normal(MEAN, COVARIANCE)
+APART = {name: Normal(MEAN[name], float(np.sqrt(COVARIANCE[k, k]))) for k, name in enumerate(NAMES)}
 
 
 def run():
@@ -26,14 +28,14 @@ def run():
 
 def planned(scene, data):
     """Information of the data about the names, without and with what is known of them before; one program, which compiles in half of the time of its parts."""
-    return jax.jit(lambda: [jj.planned_information(scene, data, free).matrix for free in (NAMES, TOGETHER)])()
+    return jax.jit(lambda: [planned_information(scene, data, free).matrix for free in (NAMES, TOGETHER)])()
 
 
 def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_is_their_sum():
     data, free = run(), dict(reversed(TOGETHER.items()))  # the order of the names does not matter
     found = jj.fit(CART, data, free, tolerance=1e-7)
     at = jnp.array([found[name].value for name in NAMES])
-    slope = jax.jit(jax.grad(lambda x: jj.log_likelihood(CART.replace(mass=x[0], stiffness=x[1]), data)))(at)
+    slope = jax.jit(jax.grad(lambda x: log_likelihood(CART.replace(mass=x[0], stiffness=x[1]), data)))(at)
     pull = np.linalg.solve(COVARIANCE, at - np.array(list(MEAN.values())))
     scale = np.array([found[name].standard_error for name in NAMES])
     assert np.max(np.abs(scale * pull)) > 0.1  # the prior does pull
@@ -46,7 +48,7 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
 
 def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
     one = run()
-    start = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.01))}
+    start = {"x": jj.Estimate(prior=Normal(0.3, 0.01))}
     data = [jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, inputs=PUSH, t0=0.0)] * 2
     for count in (1, 2):
         found = jj.fit(CART, data[:count], TOGETHER)
@@ -56,7 +58,7 @@ def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
 
 
 def test_without_correlation_it_is_a_prior_for_each():
-    data, diagonal = run(), jj.joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
+    data, diagonal = run(), joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
     together, apart = jj.fit(CART, data, diagonal), jj.fit(CART, data, APART)
     assert_allclose(together.values, apart.values, rtol=1e-10)
     assert_allclose(together.standard_errors, apart.standard_errors, rtol=1e-8)
@@ -69,7 +71,7 @@ def test_of_one_of_the_names_the_marginal_counts():
 
 def test_density_has_the_normal_density_of_all_names():
     data = run()
-    flat, density = (jj.log_density(CART, data, free) for free in (dict.fromkeys(NAMES, jj.unbounded()), TOGETHER))
+    flat, density = (log_density(CART, data, free) for free in (dict.fromkeys(NAMES, unbounded()), TOGETHER))
     points = ({"mass": 2.01, "stiffness": 5.02}, {"mass": 1.97, "stiffness": 4.96})
 
     @jax.jit
@@ -86,7 +88,7 @@ def test_density_has_the_normal_density_of_all_names():
 
 def test_a_combination_that_is_known_exactly_stays():
     sigma = np.array([0.02, 0.05])
-    found = jj.fit(CART, run(), jj.joint_normal(MEAN, np.outer(sigma, sigma)))
+    found = jj.fit(CART, run(), joint_normal(MEAN, np.outer(sigma, sigma)))
     moved = (np.array([found[name].value for name in NAMES]) - list(MEAN.values())) / sigma
     assert abs(moved[0]) > 0.1
     assert moved[0] == pytest.approx(moved[1], abs=1e-4)

@@ -14,7 +14,9 @@ import jourdain_jax as jj
 from jourdain_jax import linearize
 from jourdain_jax.bicycle import linear_matrices, measured_bicycle, stability_speeds
 from jourdain_jax.bicycle.parameter_files import PARAMETER_NAMES
+from jourdain_jax.equations import potential_energy, unconstrained_equations
 from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, WhippleBicycle
+from jourdain_jax.studies import Normal
 
 # Linearisation on the constraint manifold, against published bicycles, closed forms, and what a state that is not steady must show.
 
@@ -109,8 +111,8 @@ def test_a_double_pendulum_has_its_normal_frequencies():
     pendulum = DoublePendulumAngles()
     small = linearize(pendulum, {})
     q, u, _ = pendulum.named()
-    M = jj.unconstrained_equations(pendulum, 0.0, q, u).M
-    K = jax.jit(jax.hessian(lambda q: jj.potential_energy(pendulum, jj.motion_at(pendulum, 0.0, q, u))))(q)
+    M = unconstrained_equations(pendulum, 0.0, q, u).M
+    K = jax.jit(jax.hessian(lambda q: potential_energy(pendulum, jj.motion_at(pendulum, 0.0, q, u))))(q)
     squared = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
     found = np.sort(small.eigenvalues().imag ** 2)
     assert relative_error(found, np.repeat(squared, 2)) < tolerance("round_off")
@@ -428,7 +430,7 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         jj.family(bicycle, turns.folds[0])
     with pytest.raises(ValueError, match="expected two axes"):
         jj.stability_chart(bicycle, {"c": (0.02, 0.12)})
-    with pytest.raises(ValueError, match=r"`prior` is .*expected `jj.Normal"):
+    with pytest.raises(ValueError, match=r"`prior` is .*expected `jj.studies.Normal"):
         jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (9.0, 10.0)}, prior={"w": 0.1}, points=3)
     with pytest.raises(ValueError, match="one name with its value"):
         turns.at(lean=0.1, steer=0.1)
@@ -504,7 +506,7 @@ def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
 
 
 def test_a_chart_has_the_speeds_of_stability_as_its_boundaries_and_what_measurements_leave_open(bicycle):
-    prior = {"w": jj.Normal(1.02, 0.01), "lam": jj.Normal(0.314, 0.005), "c": jj.Normal(0.08, 1.0)}
+    prior = {"w": Normal(1.02, 0.01), "lam": Normal(0.314, 0.005), "c": Normal(0.08, 1.0)}
     chart = jj.stability_chart(bicycle, {"c": (0.04, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3, prior=prior)
     linear = linear_speeds(0.12)
     assert_allclose([curve.speed[2] for _, curve in chart.boundaries], [linear.weave_speed, linear.capsize_speed], rtol=1e-12)

@@ -8,9 +8,11 @@ from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
+from jourdain_jax.identification import log_density, unbounded
+from jourdain_jax.studies import Normal
 
 TS = np.linspace(0.0, 4.0, 21)
-FREE = {"damping": jj.bounds(0.0, 2.0), "stiffness": jj.Estimate(prior=jj.Normal(5.2, 0.4))}
+FREE = {"damping": jj.bounds(0.0, 2.0), "stiffness": jj.Estimate(prior=Normal(5.2, 0.4))}
 
 
 def closed(start, damping, stiffness, mass=2.0):
@@ -38,7 +40,7 @@ def by_hand(theta, data, sigma):
 
 def test_density_is_likelihood_times_prior_times_derivative_of_the_transforms():
     data = runs()
-    density = jj.log_density(Oscillator(), data, FREE)
+    density = log_density(Oscillator(), data, FREE)
     assert density.labels == ("damping", "stiffness", "run 0: x", "run 1: x")
 
     def constrain(z):
@@ -63,7 +65,7 @@ def remembering():
 
 def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
     data = remembering()
-    density = jj.log_density(Oscillator(), data, FREE)
+    density = log_density(Oscillator(), data, FREE)
     assert density.labels[-2:] == ("x.sigma", "x.correlation_time")
     assert density.units[-1] == "s"
     h, ends = TS[1] - TS[0], np.arcsin(np.exp(-np.array([10.0, (TS[1] - TS[0]) / (10 * 4.0)])))
@@ -99,10 +101,10 @@ def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
 
 
 def test_unknowns_lead_back_and_stay_finite_far_away():
-    start = {"x": jj.unbounded(1.0), "x_rate": jj.bounds(-1.0, 3.0)}
+    start = {"x": unbounded(1.0), "x_rate": jj.bounds(-1.0, 3.0)}
     free = {"stiffness": jj.positive()}
     data = jj.Experiment(np.linspace(0.0, 1.0, 5), {"x": np.zeros(5)}, 0.1, start={"x": 0.1, "x_rate": 0.5}, unknown_start=start)
-    density = jj.log_density(Oscillator(), data, free)
+    density = log_density(Oscillator(), data, free)
     x = jnp.array([[-2.0, 0.3, 1.5], [3.0, 800.0, -20.0]])
     for point in x:
         assert_allclose(density.unconstrain(density.named(point)), point, rtol=1e-7)
@@ -110,18 +112,18 @@ def test_unknowns_lead_back_and_stay_finite_far_away():
 
 
 def test_failing_motion_has_no_density():
-    density = jj.log_density(Oscillator(), runs(), FREE, max_steps=3)
+    density = log_density(Oscillator(), runs(), FREE, max_steps=3)
     assert density(density.initial) == -jnp.inf
 
 
 def test_unknown_without_a_standard_error_cannot_be_whitened():
     data, free = runs(), ("mass", "damping", "stiffness")
     with pytest.raises(ValueError, match="`mass` has no standard error in the fit"):
-        jj.log_density(Oscillator(), data, free).whitened(jj.fit(Oscillator(), data, free))
+        log_density(Oscillator(), data, free).whitened(jj.fit(Oscillator(), data, free))
 
 
 def test_a_density_is_one_program_which_serves_other_numbers(compilations):
-    densities = [jj.log_density(Oscillator(mass=mass), runs()[0], FREE) for mass in (1.9, 1.8)]
+    densities = [log_density(Oscillator(mass=mass), runs()[0], FREE) for mass in (1.9, 1.8)]
     z = jnp.array([0.3, -0.2, 0.25])
     compilations.clear()
     first = float(densities[0](z))

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.special import ndtri
 
 import jourdain_jax as jj
+from jourdain_jax.studies import End, Happened, LogNormal, LogUniform, Normal, Quantity, Uniform
 
 
 class Thrown(jj.Scene):
@@ -26,11 +27,11 @@ class Thrown(jj.Scene):
 
 
 COUNT, TIME = 64, 0.5
-OUTPUTS = {"height": jj.End("z", "m"), "landed": jj.Happened("ground"), "square": jj.Quantity(lambda motion: motion.q_end[0] ** 2, "m^2")}
+OUTPUTS = {"height": End("z", "m"), "landed": Happened("ground"), "square": Quantity(lambda motion: motion.q_end[0] ** 2, "m^2")}
 HOW = {"t1": TIME, "outputs": OUTPUTS, "rtol": 1e-10, "atol": 1e-10}
 
 
-HEIGHT, SPEED = jj.Normal(20.0, 0.5), jj.Uniform(1.0, 3.0)
+HEIGHT, SPEED = Normal(20.0, 0.5), Uniform(1.0, 3.0)
 
 
 def thrown(z=HEIGHT, v=SPEED, **more):
@@ -62,7 +63,7 @@ def test_gradients_are_those_of_the_closed_form():
     assert "z_at_start.sigma" in str(found)
 
 
-@pytest.mark.parametrize("how", [jj.LogNormal(20.0, 0.1), jj.LogUniform(18.0, 22.0), jj.Normal(20.0, 0.0), jj.Uniform(18.0, 22.0)])
+@pytest.mark.parametrize("how", [LogNormal(20.0, 0.1), LogUniform(18.0, 22.0), Normal(20.0, 0.0), Uniform(18.0, 22.0)])
 def test_values_of_distributions_have_their_derivatives(how):
     u = np.linspace(0.05, 0.95, 7)
     names = list(vars(how))
@@ -84,7 +85,7 @@ def test_columns_of_a_table_are_shifted():
 
 def test_where_lanes_end_in_different_ways_it_is_said_and_what_has_no_derivative_is_nan():
     with pytest.warns(jj.SensitivityWarning) as warned:
-        found = thrown(jj.Uniform(0.05, 3.0)).mean_gradients(**HOW)
+        found = thrown(Uniform(0.05, 3.0)).mean_gradients(**HOW)
     texts = [str(one.message) for one in warned]
     assert texts == list(found.warnings)
     assert any("the means of landed have no pathwise derivative" in text for text in texts)
@@ -100,7 +101,7 @@ def test_lanes_that_fail_are_left_out_and_named():
             return (jj.gravity(motion, jnp.where(motion.q.z > 20.0, jnp.nan, self.gravity)),)
 
     with pytest.warns(jj.SensitivityWarning, match="motions failed and are omitted"):
-        found = jj.Study(Steep(), start={"z": jj.Uniform(15.0, 25.0), "z_rate": 0.0}, samples=COUNT, seed=3).mean_gradients(**HOW)
+        found = jj.Study(Steep(), start={"z": Uniform(15.0, 25.0), "z_rate": 0.0}, samples=COUNT, seed=3).mean_gradients(**HOW)
     assert 0 < found.failed < COUNT
     assert found.lanes[0] == COUNT - found.failed
     assert found.of("height", "z_at_start.low") + found.of("height", "z_at_start.high") == pytest.approx(1.0, rel=1e-9)

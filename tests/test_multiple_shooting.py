@@ -7,6 +7,8 @@ from scipy.signal import lfilter
 from small_scenes import Cart
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Actuator, MultipleShooting, Sensor, huber
+from jourdain_jax.studies import Normal
 
 FREE = ("mass2", "length1", "length2")
 TIGHT = {"rtol": 1e-8, "atol": 1e-8}
@@ -33,7 +35,7 @@ def oscillations(channel="x", sigma=0.01, **options):
     """Three runs of unequal length under one sampled force; the third has a known start."""
     generator, ts = np.random.default_rng(0), np.linspace(0.0, 4.0, 41)
     force = options.pop("force", jj.Sampled(np.linspace(-1.0, 5.0, 61), generator.normal(size=61)))
-    command, found = force.command if isinstance(force, jj.Actuator) else force, []
+    command, found = force.command if isinstance(force, Actuator) else force, []
     for count, x, guess in ((41, 0.5, 0.4), (31, -0.2, -0.3), (23, 0.3, 0.3)):
         motion = jj.simulate(Oscillator(), {"x": x, "x_rate": 0.3}, ts=ts[:count], inputs={"push": command})
         values = {channel: np.asarray(motion["x"]) + 0.01 * generator.normal(size=count)}
@@ -45,7 +47,7 @@ def oscillations(channel="x", sigma=0.01, **options):
 def same(scene, data, free, pieces=4, **options):
     """The fit of the same runs with and without pieces, after a look at whether they agree."""
     whole = jj.fit(scene, data, free, **TIGHT, **options)
-    cut = jj.fit(scene, data, free, shooting=jj.MultipleShooting(pieces=pieces), **TIGHT, **options)
+    cut = jj.fit(scene, data, free, shooting=MultipleShooting(pieces=pieces), **TIGHT, **options)
     assert whole.converged
     assert cut.converged
     assert cut.shooting.continuity <= 1
@@ -60,7 +62,7 @@ def same(scene, data, free, pieces=4, **options):
 
 def test_a_chaotic_motion_is_found_from_afar_with_the_intervals_of_single_shooting():
     guess, truth, run = pendulum(5.0, seed=2)
-    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), **TIGHT)
+    found = jj.fit(guess, run, FREE, shooting=MultipleShooting(duration=0.5), **TIGHT)
     assert found.converged
     assert not found.warnings
     assert found.shooting.pieces == (10,)
@@ -76,7 +78,7 @@ def test_a_chaotic_motion_is_found_from_afar_with_the_intervals_of_single_shooti
 
 def test_pieces_that_cannot_join_in_time_are_no_result():
     guess, _, run = pendulum(5.0, seed=2)
-    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), max_iterations=1, **TIGHT)
+    found = jj.fit(guess, run, FREE, shooting=MultipleShooting(duration=0.5), max_iterations=1, **TIGHT)
     assert not found.converged
     assert found.shooting.continuity > 1
     assert "do not join" in found.warning
@@ -87,7 +89,7 @@ def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
     ts = np.linspace(0.0, 4.0, 41)
     x = 0.5 * np.cos(3.0 * ts) * np.exp(-0.03 / 4 * ts) + 0.002 * np.random.default_rng(1).normal(size=41)  # a damping of 0.03
     run = jj.Experiment(ts, {"x": x}, 0.005, start={"x": 0.5, "x_rate": 0.0}, unknown_start=("x",))
-    found = jj.fit(Oscillator(), run, {"damping": jj.bounds(0.035, 2.0)}, shooting=jj.MultipleShooting(pieces=4), **TIGHT)
+    found = jj.fit(Oscillator(), run, {"damping": jj.bounds(0.035, 2.0)}, shooting=MultipleShooting(pieces=4), **TIGHT)
     assert found.at_bound[0]
     assert found["damping"].high > 0.04
     begins = ts[[10, 20, 30]]
@@ -95,12 +97,12 @@ def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
     assert_allclose(np.sort(found.shooting.nodes[0].ravel()), np.sort(np.stack([motion["x"], motion["x_rate"]]).ravel()), atol=1e-6)
 
 
-SENSOR = {"bias": jj.Estimate(0.0, per_run=True), "gain": jj.Estimate(1.0, prior=jj.Normal(1.0, 0.05))}
+SENSOR = {"bias": jj.Estimate(0.0, per_run=True), "gain": jj.Estimate(1.0, prior=Normal(1.0, 0.05))}
 CASES = {
     "several runs": ({}, ("stiffness", "damping"), {}),
-    "a bound and a prior": ({}, {"stiffness": jj.Normal(16.0, 0.1), "damping": jj.bounds(0.2, 1.0)}, {}),
-    "a robust loss": ({}, ("stiffness", "damping"), {"loss": jj.huber()}),
-    "numbers of sensors": ({"channel": "enc", "sigma": None, "sensors": {"enc": jj.Sensor("x", **SENSOR)}}, ("stiffness", "damping"), {}),
+    "a bound and a prior": ({}, {"stiffness": Normal(16.0, 0.1), "damping": jj.bounds(0.2, 1.0)}, {}),
+    "a robust loss": ({}, ("stiffness", "damping"), {"loss": huber()}),
+    "numbers of sensors": ({"channel": "enc", "sigma": None, "sensors": {"enc": Sensor("x", **SENSOR)}}, ("stiffness", "damping"), {}),
     "noise with a memory": ({"correlation_time": 0.1}, ("stiffness", "damping"), {}),
     "noise with an unknown memory": ({"correlation_time": None}, ("stiffness", "damping"), {}),
 }
@@ -130,14 +132,14 @@ def late_oscillations(true, sensors, counts):
 
 
 DELAY, LONG = jj.Estimate(0.1, range=jj.bounds(0.0, 0.3)), jj.Estimate(0.4, range=jj.bounds(0.0, 0.5), per_run=True)
-GYRO = {"gyro": jj.Sensor("x_rate", delay=DELAY, lag=jj.Estimate(0.15))}
+GYRO = {"gyro": Sensor("x_rate", delay=DELAY, lag=jj.Estimate(0.15))}
 LATE = {  # what channels show and how late, sensors, and numbers of samples
     "a delay and a lag in one run of two": [
         ({"x": ("x", 0.0, None)}, {}, (31,)),
         ({"gyro": ("x_rate", 0.13, 0.2), "x": ("x", 0.0, None)}, GYRO, (61,)),
     ],
-    "delays of each run, longer than a piece": [({"enc": ("x", 0.45, None)}, {"enc": jj.Sensor("x", delay=LONG)}, (41, 31))],
-    "a lag that is hardly one": [({"x": ("x", 0.0, 0.002)}, {"x": jj.Sensor(lag=jj.Estimate(0.01))}, (61,))],
+    "delays of each run, longer than a piece": [({"enc": ("x", 0.45, None)}, {"enc": Sensor("x", delay=LONG)}, (41, 31))],
+    "a lag that is hardly one": [({"x": ("x", 0.0, 0.002)}, {"x": Sensor(lag=jj.Estimate(0.01))}, (61,))],
 }
 
 
@@ -149,7 +151,7 @@ def test_sensors_are_late_in_pieces_as_in_whole_runs(case):
 
 def test_a_fit_in_pieces_is_taken_up_again(tmp_path):
     run, other, _ = oscillations()
-    found = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"), shooting=jj.MultipleShooting(duration=1.0))
+    found = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"), shooting=MultipleShooting(duration=1.0))
     whole = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"))
     for name, profile in found.profiles(run).items():
         assert_allclose([profile.low, profile.high], [whole.profiles(run)[name].low, whole.profiles(run)[name].high], rtol=1e-3)

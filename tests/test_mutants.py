@@ -387,7 +387,15 @@ MUTANTS = [
     Mutant("an earlier window left out", motions, "cotangents", "(x, number, 0, keepdims=False)", "(x, 0 * number, 0, keepdims=False)", TIMES, "derivative"),
     Mutant("tangents of times forgotten", event_search, "put_tangents", "-dc / slope", "0 * dc", ALONG, "forward"),
     Mutant("time of an event forgotten", backwards, "event_back", "total = w.load(g_t)", "total = 0 * w.load(g_t)", EVENT, "derivative"),
-    Mutant("tangents of parameters forgotten", array_functions.Functions, "_parts", "part.get, of[0]", "lambda i: None if k else part[i], of[0]", ALONG, "forward"),
+    Mutant(
+        "tangents of parameters forgotten",
+        array_functions.Functions,
+        "_parts",
+        "part.get, of[0]",
+        "lambda i: None if k else part[i], of[0]",
+        ALONG,
+        "forward",
+    ),
     Mutant("an event by parameters forgotten", backwards, "event_back", "w.where(usable, w.load(added, i), 0.0)", "0.0", EVENT, "by k"),
 ]
 CHECKS = [*dict.fromkeys(mutant.check for mutant in MUTANTS), tangents_through_saved_times]

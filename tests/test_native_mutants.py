@@ -380,7 +380,15 @@ MUTANTS = [
     Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
     Mutant("a bracket with the wrong end", event_search, "_follow", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
-    Mutant("rows by half", projection_kernel, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
+    Mutant(
+        "rows by half",
+        projection_kernel,
+        "_write_moved",
+        "- w.where(moves, change, 0.0)",
+        "- 0.5 * w.where(moves, change, 0.0)",
+        ROWS,
+        "coordinates|speeds",
+    ),
     Mutant(
         "rows that are not scaled",
         projection_kernel,

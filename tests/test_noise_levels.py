@@ -7,6 +7,8 @@ from scipy.special import stdtrit
 from small_scenes import Bead
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Sensor, huber, student_t
+from jourdain_jax.studies import Normal
 
 START = {"x": 1.0, "x_rate": 2.0, "y": 0.0, "y_rate": 0.0}
 BOTH = ("x", "x_rate")
@@ -51,7 +53,7 @@ def test_a_channel_with_a_known_sigma_keeps_its_own_beside_one_that_has_none():
 
 def test_what_priors_tell_is_not_taken_from_the_samples():
     ts, y = lines()
-    prior = {"x": jj.Normal(1.0, 0.03), "x_rate": jj.Normal(2.0, 0.1)}
+    prior = {"x": Normal(1.0, 0.03), "x_rate": Normal(2.0, 0.1)}
     X, P = np.stack([np.ones(6), ts], axis=1), np.diag([0.03**-2, 0.1**-2])
     known = jj.fit(Bead(), run(ts, {"x": y}, 0.1, prior))
     C = np.linalg.inv(X.T @ X / 0.1**2 + P)
@@ -74,7 +76,7 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
     for k, count in enumerate((4, 6, 5)):
         ts = np.linspace(0.1, 1.0 + k, count)
         values = {"far": 1.3 + 2 * ts + 0.1 * noise.normal(size=count), "near": 2.0 + 4 * ts + 0.05 * noise.normal(size=count)}
-        sensors = {"far": jj.Sensor("x", bias=jj.Estimate(0.1)), "near": jj.Sensor("x", gain=2.0)}
+        sensors = {"far": Sensor("x", bias=jj.Estimate(0.1)), "near": Sensor("x", gain=2.0)}
         runs.append(run(ts, values, None, ("x", *own)[k == 0 and not own :] if own else (), sensors=sensors, t0=0.0))
         rows = np.zeros((2, count, 1 + 3 * 2))
         rows[0, :, 0], rows[0, :, 1 + 2 * k], rows[0, :, 2 + 2 * k] = 1.0, 1.0, ts
@@ -112,10 +114,10 @@ def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
     assert float(found["run 0: x"].high - found["run 0: x"].value) == pytest.approx(stdtrit(4, 0.975) * error, rel=1e-5)
 
 
-@pytest.mark.parametrize("loss", [jj.huber(), jj.student_t(4.0)])
+@pytest.mark.parametrize("loss", [huber(), student_t(4.0)])
 def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(loss):
     noise, ts = np.random.default_rng(3), np.linspace(0.1, 1.0, 30)
-    gain = {"x": jj.Sensor("x", gain=jj.Estimate(1.0))}
+    gain = {"x": Sensor("x", gain=jj.Estimate(1.0))}
     ys = [(1 + 2 * ts) * (1 + 0.05 * noise.normal()) + 0.1 * noise.normal(size=30) for _ in range(6)]
     found = jj.fit(Bead(), [run(ts, {"x": y}, 0.02, (), sensors=gain, t0=0.0) for y in ys], errors="runs", loss=loss)
     slope, scores, bend, weights = (1 + 2 * ts) / 0.02, [], [], []
@@ -135,8 +137,8 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
 
 def test_a_robust_loss_does_not_widen_what_a_prior_tells():
     ts, noise = np.linspace(0.0, 1.0, 12), np.random.default_rng(4)
-    y, sure = 1 + 2 * ts + 0.1 * noise.standard_t(4, size=12), jj.Normal(2.0, 1e-3)
-    found = jj.fit(Bead(), run(ts, {"x": y}, 0.05, {"x": None, "x_rate": sure}), loss=jj.student_t())
+    y, sure = 1 + 2 * ts + 0.1 * noise.standard_t(4, size=12), Normal(2.0, 1e-3)
+    found = jj.fit(Bead(), run(ts, {"x": y}, 0.05, {"x": None, "x_rate": sure}), loss=student_t())
     assert found["run 0: x_rate"].standard_error == pytest.approx(1e-3, rel=1e-3)
     r = np.asarray(found.residuals[0]["x"])
     psi, slope = 5 * r / (4 + r**2), 5 * (4 - r**2) / (4 + r**2) ** 2

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Fit, log_density, log_likelihood
 
 
 class Stopped(Oscillator):
@@ -27,7 +28,7 @@ def run(x0=0.3, events=None, values=None, **more) -> jj.Experiment:
     return jj.Experiment(ts, {} if values is None else {"x": values}, 0.005, start={"x": x0, "x_rate": 0.0}, t0=0.0, events=events, **more)
 
 
-def fit(*runs, **options) -> jj.Fit:
+def fit(*runs, **options) -> Fit:
     return jj.fit(SCENE.replace(mass=1.5), runs, ("mass",), rtol=1e-10, atol=1e-10, **options)
 
 
@@ -73,10 +74,10 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
         return -0.5 * ((np.pi / 2 * jnp.sqrt(mass / 5.0) - STOP - 0.002) / SIGMA) ** 2
 
     def told(mass):
-        return jj.log_likelihood(SCENE.replace(mass=mass), run(), rtol=1e-10, atol=1e-10)
+        return log_likelihood(SCENE.replace(mass=mass), run(), rtol=1e-10, atol=1e-10)
 
     assert_allclose(jax.jit(jax.jacfwd(told))(1.99), jax.grad(by_time)(1.99), rtol=1e-6)
-    density = jj.log_density(SCENE, run(), ("mass",), rtol=1e-10, atol=1e-10)
+    density = log_density(SCENE, run(), ("mass",), rtol=1e-10, atol=1e-10)
     z, log = density.unconstrain({"mass": 1.99}), np.log(1.99)  # flat in the mass, whose logarithm z is
     assert_allclose(jax.jit(jax.grad(density))(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6)
 
@@ -85,4 +86,4 @@ def test_a_motion_that_does_not_meet_the_event_is_named():
     other = fit(run(values=np.full(9, 0.3), events={"far": (0.9, SIGMA)}))
     assert not other.converged
     assert "the motion of run 0 does not reach `far` before 4 times the observed time" in "".join(other.warnings)
-    assert jj.log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf
+    assert log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf

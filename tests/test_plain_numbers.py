@@ -11,6 +11,7 @@ from small_scenes import BeadOnTurningWire
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import constraint_rows, gibbs_equations, lagrange_equations, partial_velocities, unconstrained_equations
 
 TWO = {"int": 2, "float": 2.0, "float32": np.float32(2), "float64": np.float64(2), "int64": np.int64(2), "0-d array": np.array(2.0), "jax": jnp.asarray(2.0)}
 THREE = {"list": [1, 0.0, 2], "tuple": (1, 0, 2), "array of integers": np.array([1, 0, 2]), "jax": jnp.array([1.0, 0.0, 2.0])}
@@ -67,7 +68,7 @@ BUILT = [
     'jj.ball_contact(_motion().pose()["block"], n)',
     '_motion()["block"].place(v) + _motion()["block"].velocity_at(v)',
     "[jj.bounds(0, n).low, jj.bounds(0, n).high]",
-    "[jj.unbounded(n).scale]",
+    "[jj.identification.unbounded(n).scale]",
     "jj.Baumgarte(n, n)",
     "jj.Sampled([0, 1, 2], v)(n)",
     'jj.Experiment([1, 2, 3], {"x": v}, n, start={"x": n}, t0=0)',
@@ -86,20 +87,20 @@ def test_every_builder_takes_plain_numbers_and_gives_the_same_floats(number, vec
 
 STATE_FUNCTIONS = [
     "jj.accelerations(s, 0, q, u, [1]).udot",
-    "jj.constraint_rows(s, 0, q, u, [1]).phi",
-    "jj.partial_velocities(s, 0, q, u).linear",
-    "jj.coordinate_rates(s, 0, q, u)",
-    "jj.generalized_forces(s, 0, q, u, [1])",
-    "jj.kinetic_energy(s, 0, q, u)",
-    "jj.unconstrained_equations(s, 0, q, u, [1]).h",
-    "jj.lagrange_equations(s, 0, q, u, [1]).h",
-    "jj.gibbs_equations(s, 0, q, u, [1]).h",
-    "jj.gibbs_function(s, 0, q, u, (1, 1))",
+    "jj.equations.constraint_rows(s, 0, q, u, [1]).phi",
+    "jj.equations.partial_velocities(s, 0, q, u).linear",
+    "jj.equations.coordinate_rates(s, 0, q, u)",
+    "jj.equations.generalized_forces(s, 0, q, u, [1])",
+    "jj.equations.kinetic_energy(s, 0, q, u)",
+    "jj.equations.unconstrained_equations(s, 0, q, u, [1]).h",
+    "jj.equations.lagrange_equations(s, 0, q, u, [1]).h",
+    "jj.equations.gibbs_equations(s, 0, q, u, [1]).h",
+    "jj.equations.gibbs_function(s, 0, q, u, (1, 1))",
     "jj.newton_residual(s, 0, q, u, (1, 1), [1]).linear",
     "jj.virtual_power(s, 0, q, u, (1, 1), [1, 0], [1])",
     'jj.pose_at(s, 0, q)["block"].position',
-    "jj.velocity_residual(s, 0, q, u)",
-    "jj.position_residual(s, 0, q)",
+    "jj.equations.velocity_residual(s, 0, q, u)",
+    "jj.equations.position_residual(s, 0, q)",
     "jj.consistent(s, 0, q, u, [1]).q",
 ]
 
@@ -114,7 +115,7 @@ def test_a_state_may_be_a_list(call):
         assert np.array_equal(f(q, u), expected)
 
 
-EQUATIONS = (jj.accelerations, jj.unconstrained_equations, jj.constraint_rows, jj.partial_velocities, jj.lagrange_equations, jj.gibbs_equations)
+EQUATIONS = (jj.accelerations, unconstrained_equations, constraint_rows, partial_velocities, lagrange_equations, gibbs_equations)
 
 
 def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_compiled(compilations):

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
+from jourdain_jax.identification import inertia_from_log_cholesky, log_cholesky, possible_inertia
 from jourdain_jax.identification.solve.unknowns import unknowns_of
 
 GENERATOR = np.random.default_rng(0)
@@ -14,7 +15,7 @@ GENERATOR = np.random.default_rng(0)
 
 def test_inertia_is_that_of_a_body_whatever_the_numbers_are():
     numbers = jnp.asarray(GENERATOR.normal(size=(2000, 6)) * np.array([2.0, 2.0, 2.0, 3.0, 3.0, 3.0]))
-    moments = np.linalg.eigvalsh(np.asarray(jax.vmap(jj.inertia_from_log_cholesky)(numbers)))
+    moments = np.linalg.eigvalsh(np.asarray(jax.vmap(inertia_from_log_cholesky)(numbers)))
     assert np.all(moments[:, 0] > 0)
     assert np.all(moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-12))
 
@@ -24,21 +25,21 @@ def test_every_cloud_of_points_has_its_numbers():
         points, masses = GENERATOR.normal(size=(7, 3)), GENERATOR.uniform(0.1, 1.0, 7)
         r = points - masses @ points / masses.sum()
         inertia = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, r, strict=True))
-        numbers = jj.log_cholesky(inertia)
+        numbers = log_cholesky(inertia)
         assert numbers.shape == (6,)
-        assert_allclose(jj.inertia_from_log_cholesky(numbers), inertia, rtol=1e-12, atol=1e-12)
+        assert_allclose(inertia_from_log_cholesky(numbers), inertia, rtol=1e-12, atol=1e-12)
     flat = np.array([[0.5, 0.0, 0.1], [0.0, 0.8, 0.0], [0.1, 0.0, 0.4]])
-    four = jj.log_cholesky(flat, symmetric=True)
+    four = log_cholesky(flat, symmetric=True)
     assert four.shape == (4,)
-    assert_allclose(jj.inertia_from_log_cholesky(four), flat, rtol=1e-13, atol=1e-15)
+    assert_allclose(inertia_from_log_cholesky(four), flat, rtol=1e-13, atol=1e-15)
 
 
 def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
-    numbers = jj.log_cholesky([0.5, 0.8, 0.6])
-    six = lambda x: jj.inertia_from_log_cholesky(x)[np.triu_indices(3)]  # noqa: E731
+    numbers = log_cholesky([0.5, 0.8, 0.6])
+    six = lambda x: inertia_from_log_cholesky(x)[np.triu_indices(3)]  # noqa: E731
     J = jax.jacfwd(six)(numbers)
     assert np.linalg.matrix_rank(J) == 6
-    assert_allclose(J @ jax.jacfwd(lambda v: jj.log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
+    assert_allclose(J @ jax.jacfwd(lambda v: log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
 
 
 def of(v):
@@ -66,10 +67,10 @@ class Turning(jj.Scene):
 class TurningBody(Turning):
     """Its motion, with moments that a body can have."""
 
-    moments: float = jj.parameter(jj.log_cholesky([0.5, 0.7, 0.4])[:3])
+    moments: float = jj.parameter(log_cholesky([0.5, 0.7, 0.4])[:3])
 
     def inertia(self):
-        return jj.inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))
+        return inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))
 
 
 def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
@@ -79,7 +80,7 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     values = {name: np.asarray(motion[name]) + 0.1 * noise.normal(size=41) for name in ("yaw", "pitch")}
     data = jj.Experiment(ts, values, 0.1, start=start)
     free, body = (jj.fit(scene, data, ("moments",)) for scene in (Turning(), TurningBody()))
-    by_name = jj.fit(Turning(), data, {"body": jj.possible_inertia()})
+    by_name = jj.fit(Turning(), data, {"body": possible_inertia()})
     assert free.impossible
     assert not by_name.impossible
     assert_allclose(by_name.scene.moments, jnp.diag(body.scene.inertia()), rtol=1e-6)
@@ -106,7 +107,7 @@ NUMBERS_OF = [
 
 @pytest.mark.parametrize(("scene", "body", "names", "count"), NUMBERS_OF, ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else None)
 def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, body, names, count):
-    unknowns = unknowns_of(scene, [], {body: jj.possible_inertia()})
+    unknowns = unknowns_of(scene, [], {body: possible_inertia()})
     layout = unknowns.layout
     assert layout.sizes == (count, 0)
     assert set(layout.following) == names
@@ -125,7 +126,7 @@ def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, b
 
 def test_a_batch_of_numbers_makes_a_batch_of_parameters():
     scene = jj.models.WhippleBicycle()
-    free = {"rear wheel": jj.possible_inertia(), "mB": None, "IFxx": lambda scene: 2.0 * scene.IRxx}
+    free = {"rear wheel": possible_inertia(), "mB": None, "IFxx": lambda scene: 2.0 * scene.IRxx}
     layout = unknowns_of(scene, [], free).layout
     shared = GENERATOR.normal(size=(3, 2, 3))
     many = layout.scene(scene, shared)

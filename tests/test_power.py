@@ -8,8 +8,8 @@ from timed_scenes import TIMED
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax import coordinate_rates
 from jourdain_jax.dynamics.power import power
+from jourdain_jax.equations import coordinate_rates, kinetic_energy, potential_energy, unconstrained_equations
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
 from jourdain_jax.program.eager import eval_numpy
 
@@ -20,10 +20,10 @@ def energy_rate_and_power(scene, t, q, u):
 
     def energy(t, q, u):
         motion = jj.motion_at(scene, t, q, u)
-        return jj.kinetic_energy(scene, t, q, u), jj.potential_energy(scene, motion)
+        return kinetic_energy(scene, t, q, u), potential_energy(scene, motion)
 
     _, (dT, dV) = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), found.udot))
-    equations = jj.unconstrained_equations(scene, t, q, u)
+    equations = unconstrained_equations(scene, t, q, u)
     size = jnp.abs(u) @ (jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)) + jnp.abs(dV)
     return dT + dV, power(scene, jj.motion_at(scene, t, q, u), found).total, size
 

@@ -11,6 +11,7 @@ from oracles import rattleback as oracle
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import coordinate_rates
 from jourdain_jax.models import Rattleback
 
 STONE = Rattleback()
@@ -33,7 +34,7 @@ def motion():
 def test_rates_are_those_of_the_equations_by_hand():
     @eqx.filter_jit
     def rates(q, u):
-        qdot, udot = jj.coordinate_rates(STONE, 0.0, q, u), jj.accelerations(STONE, 0.0, q, u).udot
+        qdot, udot = coordinate_rates(STONE, 0.0, q, u), jj.accelerations(STONE, 0.0, q, u).udot
         return jnp.concatenate([qdot[2:], udot[2:]])
 
     for _, q, u in admissible_states(STONE, 20):

@@ -10,6 +10,7 @@ from tolerances import tolerance
 import jourdain_jax as jj
 from jourdain_jax import diagnose
 from jourdain_jax.dynamics.reactions import contact_forces, row_reactions
+from jourdain_jax.equations import partial_velocities
 from jourdain_jax.models import (
     BallOnTurntable,
     ChaplyginSleigh,
@@ -37,7 +38,7 @@ def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene)
     def compare(t, q, u):
         found = jj.accelerations(scene, t, q, u)
         rows = row_reactions(scene, t, q, u, found)
-        partial, motion = jj.partial_velocities(scene, t, q, u), jj.motion_at(scene, t, q, u)
+        partial, motion = partial_velocities(scene, t, q, u), jj.motion_at(scene, t, q, u)
         turned = jnp.stack([body.orientation for body in motion.bodies.values()])
         gamma = jnp.einsum("bij,bjk->bik", turned, partial.angular)  # space axes
         power = jnp.einsum("sbi,bik->k", rows.force, partial.linear) + jnp.einsum("sbi,bik->k", rows.torque, gamma)

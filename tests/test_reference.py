@@ -4,14 +4,12 @@ import contextlib
 import inspect
 import io
 import re
+from importlib import import_module
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-
-import jourdain_jax as jj
-import jourdain_jax.bicycle
 
 PAGES = sorted(page for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md") if page.stem != "index")
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
@@ -25,8 +23,8 @@ def blocks(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_name_has_an_example(page):
     code, text = "\n".join(code for code, _ in blocks(page)), page.read_text(encoding="utf-8")
-    for module, name in re.findall(r"auto\w+:: (jourdain_jax(?:\.bicycle)?)\.(\w+)$", text, re.MULTILINE):
-        documented = inspect.getdoc(getattr(jj if module == "jourdain_jax" else jourdain_jax.bicycle, name)) or ""
+    for module, name in re.findall(r"auto\w+:: (jourdain_jax(?:\.\w+)?)\.(\w+)$", text, re.MULTILINE):
+        documented = inspect.getdoc(getattr(import_module(module), name)) or ""
         assert re.search(rf"\b{name}\b", code) or re.search(r"^    \S", documented, re.MULTILINE), name
 
 

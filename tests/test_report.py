@@ -13,6 +13,7 @@ from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax import report
+from jourdain_jax.analysis import Verification
 from jourdain_jax.models import ChaplyginSleigh, IsokineticParticle, Skate, Snakeboard, TiltingDisc, TrailerChain, TwoWheelAxleFree
 
 
@@ -186,7 +187,7 @@ def fitted():
 RESULTS = {
     "State": (lambda: jj.start(SLEIGH, heading_rate=0.5), "State at t = 0 s: x = 0"),
     "Report": (lambda: jj.report(SLEIGH), "Report on ChaplyginSleigh"),
-    "Verification": (lambda: jj.Verification("ChaplyginSleigh", (), ()), "Verification of ChaplyginSleigh: passed"),
+    "Verification": (lambda: Verification("ChaplyginSleigh", (), ()), "Verification of ChaplyginSleigh: passed"),
     "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
     "Estimated": (lambda: fitted()["offset"], f"{SLEIGH.offset:.3g} m, standard error"),

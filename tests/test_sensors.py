@@ -13,7 +13,9 @@ from numpy.testing import assert_allclose
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Accelerometer, Actuator, LoadCell, Sensor, log_likelihood
 from jourdain_jax.identification.data.sensors import filtered, read
+from jourdain_jax.studies import Normal
 
 MASS, DAMPING, STIFFNESS = 2.0, 0.6, 5.0
 TS = np.linspace(0.0, 4.0, 81)
@@ -40,7 +42,7 @@ def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_
     values = {"x": shown(since, order=0, x0=x0), "gyro": np.where(since < SEEN, np.nan, shown(since, x0=x0, **truth))}
     if seed is not None:
         values = {name: x + s * noise.normal(size=(*repeats, len(ts))) for (name, x), s in zip(values.items(), (0.002, sigma), strict=True)}
-    sensors = {"gyro": jj.Sensor("x_rate", **(truth | numbers))}
+    sensors = {"gyro": Sensor("x_rate", **(truth | numbers))}
     return jj.Experiment(ts, values, {"x": 0.002, "gyro": sigma}, start={"x": x0, "x_rate": 0.0}, sensors=sensors, unknown_start=unknown_start)
 
 
@@ -142,13 +144,13 @@ def test_a_bias_of_each_run_and_a_delay_that_all_share():
 
 
 def test_a_sensor_shows_functions_and_coordinates_under_other_names():
-    seen = {"place": lambda motion: motion["cart"].position, "encoder": "x", "x_rate": jj.Sensor(gain=jj.Estimate(1.0))}
+    seen = {"place": lambda motion: motion["cart"].position, "encoder": "x", "x_rate": Sensor(gain=jj.Estimate(1.0))}
     x, v = shown(TS, order=0), shown(TS, gain=1.3)
     values = {"place": np.stack([x, 0 * x, 0 * x], axis=1), "encoder": x, "x_rate": v}
     found = jj.fit(Cart(mass=1.8), jj.Experiment(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
     assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
     # a gain and a bias for each component
-    each = jj.Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
+    each = Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
     bent = jj.Experiment(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
     found = jj.fit(Cart(), bent, ())
     assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
@@ -175,12 +177,12 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
     # turn = 0.7 cos(4 t), at 0.2 m: f = (- turn'^2 r, turn'' r, g) in the axes of the arm
     turn, rate = 0.7 * np.cos(4 * TS), -2.8 * np.sin(4 * TS)
     felt = np.stack([-0.2 * rate**2, -16 * 0.2 * turn, 9.81 + 0 * TS], axis=1)
-    seen = jj.Accelerometer("arm", (0.2, 0.0, 0.1))
+    seen = Accelerometer("arm", (0.2, 0.0, 0.1))
     motion = jj.simulate(Swing(), {"turn": 0.7}, ts=TS, rtol=1e-10, atol=1e-10)
     assert_allclose(seen.over_times(motion), felt, atol=1e-7)
     sensor, missing, shown, rough = seen, TS < 0, felt, 0.0
     if late:
-        sensor, missing = jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
+        sensor, missing = Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
         shown = np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
         rough = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
     data = jj.Experiment(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
@@ -188,15 +190,15 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
     assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + rough)
     if late:
         assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
-    bad = jj.Experiment(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
+    bad = jj.Experiment(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": Accelerometer("arn")})
     with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` is on body `arn`, which does not exist; did you mean `arm`"):
         jj.fit(Swing(), bad, ("stiffness",))
 
 
 def test_a_load_cell_shows_what_the_ground_bears():
-    cell, start = jj.LoadCell("rim"), {"heading_rate": 0.5, "roll_rate": 4.0}
+    cell, start = LoadCell("rim"), {"heading_rate": 0.5, "roll_rate": 4.0}
     motion = jj.simulate(jj.models.VerticalDisc(mass=1.3), start, ts=TS, rtol=1e-10, atol=1e-10)
-    force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
+    force, felt = cell.over_times(motion), Accelerometer("disc").over_times(motion)
     assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
 
 
@@ -210,7 +212,7 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
 def late(seed, lag, delay=0.05, tau=0.05) -> jj.Experiment:
     """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau` that is known or not."""
     values = np.where(TS < SEEN, np.nan, shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)))
-    sensor = jj.Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
+    sensor = Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
     return jj.Experiment(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
 
 
@@ -251,20 +253,20 @@ def test_other_numbers_of_a_sensor_compile_nothing(compilations):
 
 def test_a_prior_counts_as_a_measurement():
     data = run(7)
-    free, known = jj.fit(Cart(), data, ("mass",)), jj.fit(Cart(), data, {"mass": jj.Estimate(prior=jj.Normal(2.005, 0.003))})
+    free, known = jj.fit(Cart(), data, ("mass",)), jj.fit(Cart(), data, {"mass": jj.Estimate(prior=Normal(2.005, 0.003))})
     value, error = float(free["mass"].value), float(free["mass"].standard_error)
     weights = np.array([error**-2, 0.003**-2])
     assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
     assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
     assert known.samples == free.samples
     assert not known.warnings
-    assert jj.fit(Cart(), data, {"mass": jj.Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
+    assert jj.fit(Cart(), data, {"mass": Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
 
 
 def test_priors_of_starts_and_of_numbers_of_single_runs():
     def one(k, prior):
-        start = {"x": jj.Estimate(prior=jj.Normal(0.3, prior))}
-        return run(10 + k, sigma=0.01, unknown_start=start, bias=jj.Estimate(0.0, per_run=True, prior=jj.Normal(0.05, prior)))
+        start = {"x": jj.Estimate(prior=Normal(0.3, prior))}
+        return run(10 + k, sigma=0.01, unknown_start=start, bias=jj.Estimate(0.0, per_run=True, prior=Normal(0.05, prior)))
 
     loose, tight = (jj.fit(Cart(mass=1.9), [one(k, prior) for k in range(3)], ("mass",)) for prior in (1e3, 1e-6))
     assert loose.labels == tight.labels
@@ -286,8 +288,8 @@ def pushed(sensor, actuator, ts=TS) -> jj.Experiment:
     knots = np.linspace(0.0, 4.0, 41)
     command = np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0)
     motion = jj.simulate(Cart(), {"x": 0.0, "x_rate": 0.0}, ts=ts, inputs={"push": jj.Sampled(knots, 1.5 * command)}, rtol=1e-10, atol=1e-10)
-    inputs = {"push": jj.Actuator(jj.Sampled(knots, command), **actuator)}
-    return jj.Experiment(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": jj.Sensor(**sensor)})
+    inputs = {"push": Actuator(jj.Sampled(knots, command), **actuator)}
+    return jj.Experiment(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": Sensor(**sensor)})
 
 
 def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_them():
@@ -297,7 +299,7 @@ def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_
     (sentence,) = found.not_identifiable
     assert all(f"`{name}`" in sentence for name in (*names, "x.gain"))
     assert "d mass/mass : d damping/damping : d stiffness/stiffness : d x.gain/x.gain = 1 : 1 : 1 : 1" in sentence
-    known = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1, prior=jj.Normal(1.0, 0.02))}, {"gain": 1.5}), names)
+    known = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1, prior=Normal(1.0, 0.02))}, {"gain": 1.5}), names)
     assert known.not_identifiable == ()
     assert known["x.gain"].standard_error == pytest.approx(0.02, rel=1e-3)
     assert known["mass"].standard_error / known["mass"].value == pytest.approx(0.02, rel=0.05)
@@ -313,7 +315,7 @@ def driven(truth, **asked) -> jj.Experiment:
     late = np.asarray(knots) + truth["delay"]
     signal = jj.Sampled(late, truth["gain"] * filtered(command.ts, command.values, truth["lag"]) + truth["bias"])
     motion = jj.simulate(Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10)
-    inputs = {"push": jj.Actuator(command, **(truth | asked))}
+    inputs = {"push": Actuator(command, **(truth | asked))}
     return jj.Experiment(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
 
 
@@ -352,7 +354,7 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
     # the speed differs from that of a command which is linear in between
     linear = np.array([np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001)) for t in ts])
     assert np.max(np.abs(exact - linear)) > 0.05
-    actuator = jj.Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
+    actuator = Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
     found = fitted(actuator, ts, 1.3 * exact)
     assert found.converged
     assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
@@ -362,7 +364,7 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
 def test_a_lag_after_a_command_that_holds():
     knots, command, ts = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41), np.linspace(0.0, 2.0, 41)
     exact = speeds_of_held(knots, command, ts, lag=0.1)
-    actuator = jj.Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
+    actuator = Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
     found = fitted(actuator, ts, exact)
     assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
@@ -385,7 +387,7 @@ def test_an_actuator_with_known_numbers_is_an_input_like_any_other():
 
 def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
     def value(numbers):
-        return jj.log_likelihood(Cart(), run(8, **numbers))
+        return log_likelihood(Cart(), run(8, **numbers))
 
     numbers = {name: jnp.asarray(x) for name, x in TRUTH.items()}
     slopes = jax.grad(value)(numbers)

@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Upright
 
 import jourdain_jax as jj
+from jourdain_jax.equations import Privileged
+from jourdain_jax.identification import log_likelihood
 from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, Snakeboard, TiltingDisc
 
 
@@ -162,7 +164,7 @@ def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_
     def pulled(inertia, reduction):
         return jj.simulate(Trolley(inertia=inertia), t1=2.0, ts=[0.0, 2.0], formulation=jj.Formulation("full", reduction), max_steps=2000)
 
-    by_wheel = jj.Privileged((2,))
+    by_wheel = Privileged((2,))
     for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-20, "qr")):
         motion = pulled(inertia, reduction)
         assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
@@ -226,7 +228,7 @@ def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fie
         assert motion.accepted == int(by_name.accepted)
     lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
     assert lanes.lane(0).accepted == int(by_name.accepted)
-    assert float(jj.log_likelihood(SLEIGH, DATA, options=coarse)) == float(jj.log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf))
+    assert float(log_likelihood(SLEIGH, DATA, options=coarse)) == float(log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf))
 
 
 def test_options_are_a_tree_whose_numbers_may_be_traced():

@@ -9,14 +9,15 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
+from jourdain_jax.studies import End, EventTime, Happened, LargestMagnitude, Quantity
 
 COUNT, BAD = 150, 37  # lanes; one whose radius is negative
 OUTPUTS = {
-    "final lean": jj.End("lean", "rad"),
-    "largest lean": jj.LargestMagnitude("lean", "rad"),
-    "fell": jj.Happened("fallen"),
-    "fall time": jj.EventTime("fallen"),
-    "distance": jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m"),
+    "final lean": End("lean", "rad"),
+    "largest lean": LargestMagnitude("lean", "rad"),
+    "fell": Happened("fallen"),
+    "fall time": EventTime("fallen"),
+    "distance": Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m"),
 }
 ASKED = {"t1": 1.0, "ts": np.linspace(0.0, 1.0, 11), "rtol": 1e-6, "atol": 1e-6, "progress": False}
 pytestmark = pytest.mark.usefixtures("small_blocks")
@@ -71,7 +72,7 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
 
 
 def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with_and_what_never_has_a_value_has_no_statistics(tmp_path):
-    outputs = {"lean": jj.End("lean"), "never": jj.EventTime("fallen")}
+    outputs = {"lean": End("lean"), "never": EventTime("fallen")}
     found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(tmp_path / "d.zarr", t1=0.1, outputs=outputs, progress=False)
     assert np.isnan([found.mean("never"), *found.quantile("never", 0.5)]).all()
     assert f"  lean = {float(found.to_xarray()['lean'][1]):.6g}" in str(found.lane(1)).splitlines()

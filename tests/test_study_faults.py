@@ -31,7 +31,7 @@ from test_studies import assert_same
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.scene.digests import digest
-from jourdain_jax.studies import folder_lock, store, workers
+from jourdain_jax.studies import End, InUseError, Uniform, folder_lock, merge_studies, store, workers
 from jourdain_jax.studies.run import Runner, opened
 from jourdain_jax.studies.store import Store
 
@@ -41,9 +41,9 @@ pytestmark = pytest.mark.usefixtures("small_blocks")
 
 def study(seed=3, memory=None, **more):
     scene = jj.models.TiltingDisc()
-    lean = jj.Uniform(-0.5, 0.5)
+    lean = Uniform(-0.5, 0.5)
     scene = scene if memory is None else jj.build(scene, memory=memory)
-    return jj.Study(scene, start={"lean": lean, "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more)
+    return jj.Study(scene, start={"lean": lean, "spin_rate": Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more)
 
 
 def run(path, seed=3, memory=None, **options):
@@ -159,8 +159,8 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
     assert "run it again" in str(shares[0])
     assert shares[3].counts == {}
     with pytest.raises(ValueError, match="no share"):
-        jj.merge_studies(paths[0], [run(tmp_path / "other.zarr", seed=4).store.path])
-    assert_same(jj.merge_studies(paths[3], paths[:3]), whole)
+        merge_studies(paths[0], [run(tmp_path / "other.zarr", seed=4).store.path])
+    assert_same(merge_studies(paths[3], paths[:3]), whole)
 
 
 def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tmp_path, monkeypatch):
@@ -254,7 +254,7 @@ def test_other_chunks_than_the_study_began_with_are_refused(whole):
 
 @pytest.mark.skipif(folder_lock.fcntl is None, reason="no locks on this system")
 def test_a_second_run_into_one_folder_is_refused_while_the_first_lives(whole):
-    with whole.store.lock(), pytest.raises(jj.InUseError, match=f"in use by process {os.getpid()} on "):
+    with whole.store.lock(), pytest.raises(InUseError, match=f"in use by process {os.getpid()} on "):
         run(whole.store.path)
     (whole.store.path / "run" / "lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))  # what a dead run leaves
     assert run(whole.store.path).complete
@@ -393,7 +393,7 @@ def _is_right_or_said(path, right):
 def test_whatever_happens_to_a_file_of_a_study_no_other_number_comes_out(tmp_path, options, count):
     generator = np.random.default_rng(1)
     path = tmp_path / "discs.zarr"
-    run(path, outputs={"last lean": jj.End("lean")}, **options)
+    run(path, outputs={"last lean": End("lean")}, **options)
     right = _answers(path)
     seen = []
     for file in sorted(file for file in path.rglob("*") if file.is_file()):
@@ -420,7 +420,7 @@ def test_whatever_happens_to_a_file_of_a_study_no_other_number_comes_out(tmp_pat
 def test_whatever_files_of_a_study_are_exchanged_no_other_number_comes_out(tmp_path):
     path, other = tmp_path / "discs.zarr", tmp_path / "other.zarr"
     for folder, seed in ((path, 3), (other, 4)):
-        run(folder, seed=seed, outputs={"lean": jj.End("lean")})
+        run(folder, seed=seed, outputs={"lean": End("lean")})
     right = _answers(path)
     names = [file.relative_to(path) for file in sorted(path.rglob("*")) if file.is_file() and file.name != "lock"]
     contents = {name: (path / name).read_bytes() for name in names}
@@ -597,8 +597,13 @@ def spread(motion, allowed=frozenset({"lean", "yaw", "spin", "x"})):
     return motion.q_end[3] - motion.q_end[2] if "lean" in allowed and "q" not in {"a", "b", "c"} else 0.0
 
 if __name__ == "__main__":
-    study = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=400_000, seed=3)
-    outputs = {"lean": jj.End("lean"), "spread": spread}
+    study = jj.Study(
+        jj.models.TiltingDisc(),
+        start={"lean": jj.studies.Uniform(-0.5, 0.5), "spin_rate": jj.studies.Uniform(-4.0, 0.0)},
+        samples=400_000,
+        seed=3,
+    )
+    outputs = {"lean": jj.studies.End("lean"), "spread": spread}
     study.run(sys.argv[1], t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, processes=int(sys.argv[2]))
 """
 

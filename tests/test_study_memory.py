@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_study_faults import run, study
 
 import jourdain_jax as jj
-from jourdain_jax.studies import memory, task
+from jourdain_jax.studies import End, memory, task
 from jourdain_jax.studies.statistics import Tally
 
 TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
@@ -97,7 +97,7 @@ def test_systems_that_do_not_say_refuse(tmp_path, monkeypatch):
 def test_lanes_are_counted_on_the_device_where_they_lie(tmp_path, monkeypatch):
     counted, seen = Tally.of_block, []
     monkeypatch.setattr(Tally, "of_block", lambda *given: seen.append(given) or counted(*given))
-    found = run(tmp_path / "discs.zarr", outputs={"last lean": jj.End("lean")})
+    found = run(tmp_path / "discs.zarr", outputs={"last lean": End("lean")})
     for *_, ends, values in seen:  # the last block is filled up by copies, which do not count
         assert all(isinstance(x, jax.Array) and len(x) == 32 for x in (*ends.values(), values))
     edges, (low, *within, high) = seen[0][0].edges()[0], found.statistics.counts[0]

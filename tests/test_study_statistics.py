@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import special
 
 import jourdain_jax as jj
+from jourdain_jax.studies import Design, End, EventTime, Uniform, sobol_indices
 
 # Sobol' indices. -------------------------------------------------------------------------------------------------
 
@@ -14,7 +15,7 @@ import jourdain_jax as jj
 def _ishigami(samples):
     """f = sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 on (-pi, pi)^3 (Ishigami and Homma 1990), its indices in closed form."""
     a, b, pi = 7.0, 0.1, np.pi
-    design = jj.Design(dict.fromkeys(("x1", "x2", "x3"), jj.Uniform(-pi, pi)), sampler="saltelli", samples=samples, seed=1)
+    design = Design(dict.fromkeys(("x1", "x2", "x3"), Uniform(-pi, pi)), sampler="saltelli", samples=samples, seed=1)
     x = design.values()
     values = np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"])
     one, two, three = 0.5 * (1 + b * pi**4 / 5) ** 2, a**2 / 8, b**2 * pi**8 * (1 / 18 - 1 / 50)
@@ -24,7 +25,7 @@ def _ishigami(samples):
 
 def test_the_indices_of_ishigamis_function_lie_within_their_limits():
     design, values, first, total = _ishigami(5 * 2**13)
-    found = jj.sobol_indices(values, design.names)
+    found = sobol_indices(values, design.names)
     assert np.all(np.abs(found.first - first) <= found.first_half_width)
     assert np.all(np.abs(found.total - total) <= found.total_half_width)
     assert np.all(found.first_half_width < 0.04)
@@ -34,15 +35,15 @@ def test_the_indices_of_ishigamis_function_lie_within_their_limits():
 def test_groups_without_a_value_are_left_out_and_counted():
     design, values, _, _ = _ishigami(5 * 2**10)
     values[12] = np.nan
-    found = jj.sobol_indices(values, design.names)
+    found = sobol_indices(values, design.names)
     assert (found.groups, found.left_out) == (2**10 - 1, 1)
     assert "1 groups" in str(found)
     with pytest.raises(ValueError, match="a multiple of 5"):
-        jj.sobol_indices(values[:-1], design.names)
+        sobol_indices(values[:-1], design.names)
     with pytest.raises(ValueError, match="that varies"):
-        jj.sobol_indices(np.ones(20), design.names)
+        sobol_indices(np.ones(20), design.names)
     with pytest.raises(ValueError, match="that varies"):
-        jj.sobol_indices(np.tile([1.0, 2.0, 3.0, 4.0, 1.0], 4), design.names)
+        sobol_indices(np.tile([1.0, 2.0, 3.0, 4.0, 1.0], 4), design.names)
 
 
 class Pendulum(jj.Scene):
@@ -66,9 +67,9 @@ class Pendulum(jj.Scene):
 def test_a_study_has_the_indices_of_its_outputs(tmp_path):
     """T / 4 = sqrt(L / g) K(sin(angle / 2)), with the complete elliptic integral K."""
     ranges = {"length": (0.5, 1.5), "gravity": (9.0, 10.5), "angle_at_start": (0.2, 2.8)}
-    length, gravity, angle = (jj.Uniform(*limits) for limits in ranges.values())
+    length, gravity, angle = (Uniform(*limits) for limits in ranges.values())
     study = jj.Study(Pendulum(), vary={"length": length, "gravity": gravity}, start={"angle": angle}, sampler="saltelli", samples=5 * 2**6, seed=4)
-    result = study.run(tmp_path / "pendulum.zarr", t1=3.0, rtol=1e-8, outputs={"quarter": jj.EventTime("down")}, progress=False)
+    result = study.run(tmp_path / "pendulum.zarr", t1=3.0, rtol=1e-8, outputs={"quarter": EventTime("down")}, progress=False)
     assert result.counts == {"event": len(result)}
 
     def quarter(length, gravity, angle):
@@ -77,7 +78,7 @@ def test_a_study_has_the_indices_of_its_outputs(tmp_path):
     at = study.design.values()
     found = result.to_xarray()["quarter"].values
     assert_allclose(found, quarter(*at.values()), rtol=1e-7)
-    indices, expected = result.sensitivity("quarter"), jj.sobol_indices(found, study.design.names)
+    indices, expected = result.sensitivity("quarter"), sobol_indices(found, study.design.names)
     assert_array_equal(np.stack([indices.first, indices.total]), np.stack([expected.first, expected.total]))
     assert "length" in str(indices)
     with pytest.raises(ValueError, match="no output `period`"):
@@ -88,7 +89,7 @@ def test_what_lies_beyond_the_grid_is_printed_and_drawn_as_that(tmp_path):
     """The grid spans twice the range of the first block; the middle between its edge and the extreme says nothing."""
     angles = np.r_[np.linspace(0.0, 1.0, 2048), np.linspace(2.0, 12.0, 2000)]
     study = jj.Study(jj.models.TiltingDisc(), start={"yaw": angles, "lean": 0.1})
-    found = study.run(tmp_path / "discs.zarr", t1=1e-6, outputs={"yaw": jj.End("yaw", "rad")}, progress=False)
+    found = study.run(tmp_path / "discs.zarr", t1=1e-6, outputs={"yaw": End("yaw", "rad")}, progress=False)
     assert found.quantile("yaw", 0.975) == (pytest.approx(1.5), pytest.approx(12.0))
     median, *beyond = str(found).split()[-3:]
     assert float(median) == pytest.approx(0.9884, abs=1e-3)

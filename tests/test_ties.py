@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
+from jourdain_jax.identification import MultipleShooting, log_density, log_likelihood, unbounded
 
 Sleigh = jj.models.ChaplyginSleigh
 START, TIMES = {"x_rate": 0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 21)
@@ -50,7 +51,7 @@ def test_the_page_of_a_fit_tells_tied_parameters(found, tmp_path):
 
 def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
     def along(offset):
-        return float(jj.log_likelihood(Sleigh(mass=2.0, offset=offset, inertia=offset), data))
+        return float(log_likelihood(Sleigh(mass=2.0, offset=offset, inertia=offset), data))
 
     best, step = float(found.scene.offset), float(found["offset"].standard_error)
     below, at, above = (along(best + k * step) for k in (-1, 0, 1))
@@ -59,7 +60,7 @@ def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
 
 
 def test_a_density_has_the_slope_along_the_tie(data):
-    density = jj.log_density(Sleigh(mass=2.0), data, free={"offset": jj.unbounded(0.1), "inertia": TIED["inertia"]})
+    density = log_density(Sleigh(mass=2.0), data, free={"offset": unbounded(0.1), "inertia": TIED["inertia"]})
     step = 1e-5
     slope = [float(density(density.unconstrain({"offset": 0.3 + k * step}))) for k in (-1, 1)]
     found = jax.grad(density)(density.unconstrain({"offset": 0.3}))
@@ -72,13 +73,13 @@ def test_ties_of_a_batch_and_in_pieces_are_those_of_one_fit(found, data):
     assert_allclose(batch.scene.inertia, batch.scene.offset, rtol=1e-15)
     assert_allclose(batch.tied["inertia"].standard_error, batch["offset"].standard_error, rtol=1e-12)
     assert_allclose(batch.derived(lambda scene: scene.inertia).standard_error, batch["offset"].standard_error, rtol=1e-9)
-    pieces = jj.fit(Sleigh(mass=2.0), data, free=TIED, shooting=jj.MultipleShooting(pieces=2))
+    pieces = jj.fit(Sleigh(mass=2.0), data, free=TIED, shooting=MultipleShooting(pieces=2))
     assert_allclose(pieces.scene.inertia, found.scene.inertia, rtol=1e-4)
 
 
 def test_ties_follow_from_ties_before_them(data):
     free = {"offset": None, "inertia": lambda scene: scene.offset * 1.0, "mass": lambda scene: 8.0 * scene.inertia}
-    density = jj.log_density(Sleigh(), data, free=free)
+    density = log_density(Sleigh(), data, free=free)
     scene = density.scene_at(density.unconstrain({"offset": 0.3}))
     assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
 

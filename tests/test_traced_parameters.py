@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose
 from small_scenes import OnPlane, Upright
 
 import jourdain_jax as jj
+from jourdain_jax.identification import log_density, planned_information
 from jourdain_jax.models import ChaplyginSleigh
 
 
@@ -195,6 +196,6 @@ def test_parameters_that_no_lane_varies_and_no_fit_frees_keep_their_numbers():
     assert_allclose(lanes.q, [alone.q, alone.q], atol=1e-8)
     assert jj.diagnose(alone).energy_drift < 1e-8
     data = [jj.Experiment(OPTIONS["ts"], {"x": alone["x"] + off}, 0.01, start=start) for off in (0.0, 0.02)]
-    right, off = (jj.log_density(scene, x, free=("mass",)) for x in data)
+    right, off = (log_density(scene, x, free=("mass",)) for x in data)
     assert_allclose(right(right.initial) - off(off.initial), 3 * 0.5 * 2.0**2, rtol=1e-3)
-    assert jj.planned_information(scene, data[0], free=("mass",)).labels == ("mass",)
+    assert planned_information(scene, data[0], free=("mass",)).labels == ("mass",)

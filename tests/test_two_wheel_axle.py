@@ -12,6 +12,7 @@ from solved_states import solved_at_random_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations import constraint_rows
 from jourdain_jax.models import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
 
 ROUND_OFF = tolerance("round_off")
@@ -60,7 +61,7 @@ def _rank_of_eleven_rows(heading, without=None):
     return np.linalg.matrix_rank(np.asarray(rows.A)[kept])
 
 
-_rows = eqx.filter_jit(lambda scene, q, u: jj.constraint_rows(scene, 0.0, q, u))
+_rows = eqx.filter_jit(lambda scene, q, u: constraint_rows(scene, 0.0, q, u))
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, np.pi / 2])

@@ -113,7 +113,7 @@ WAYS = [
     'jj.steady(CART, {"x": 0.0}, t0=q(0.0))',
     'jj.periodic(CART, {"x": 0.0}, q(1.0))',
     'jj.periodic(CART, {"x": 0.0}, 1.0, shift={"x": q(1.0)})',
-    "jj.generalized_forces(CART, 0.0, np.zeros(1), np.zeros(1), q(np.ones(1)))",
+    "jj.equations.generalized_forces(CART, 0.0, np.zeros(1), np.zeros(1), q(np.ones(1)))",
     "jj.newton_residual(CART, 0.0, np.zeros(1), np.zeros(1), q(np.ones(1)))",
     "jj.Particle(q(1.0), jnp.zeros(3))",
     "jj.Particle(1.0, [q(0.0), 0.0, 0.0])",
@@ -123,10 +123,10 @@ WAYS = [
     'jj.Experiment(q(TS), {"x": TS}, 0.1, start={"x": 0.0})',
     'jj.Experiment(TS, {"x": TS}, q(0.1), start={"x": 0.0})',
     'jj.Experiment(TS, {"x": TS}, 0.1, start={"x": q(0.0)})',
-    'jj.Sensor("x", delay=q(1.0))',
+    'jj.identification.Sensor("x", delay=q(1.0))',
     "jj.bounds(q(0.0), q(1.0))",
-    "jj.Uniform(q(0.0), q(1.0))",
-    'jj.Study(CART, start={"x": q(1.0), "x_rate": jj.Uniform(0.0, 1.0)}, samples=2)',
+    "jj.studies.Uniform(q(0.0), q(1.0))",
+    'jj.Study(CART, start={"x": q(1.0), "x_rate": jj.studies.Uniform(0.0, 1.0)}, samples=2)',
     'jj.Study(CART, start={"x": q(TS), "x_rate": 0.0})',
 ]
 

@@ -6,7 +6,7 @@ import pytest
 from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine, OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax import Verification
+from jourdain_jax.analysis import Verification, derivative_exists
 from jourdain_jax.analysis.statements import statement_checks
 
 
@@ -53,20 +53,20 @@ def wrong(**methods) -> tuple[jj.Scene, jj.State]:
     return scene, jj.consistent(scene, 0.0, *scene.named(**scene.example)[:2], held=("bead_x",))
 
 
-def statements(scene: jj.Scene, state: jj.State) -> jj.Verification:
+def statements(scene: jj.Scene, state: jj.State) -> Verification:
     """Of the verification, the part that looks at what the scene states, piece by piece: the rest takes a quarter of a minute to compile."""
     Z = jnp.eye(len(state.u))
     return Verification("Wrong", tuple(statement_checks(scene, state.t, state.q, state.u, jnp.zeros(0), Z, 0)), ())
 
 
-def refused(found: jj.Verification, check, culprit):
+def refused(found: Verification, check, culprit):
     """The verification failed in the named check, on the named culprit, and its text says so."""
     assert not found.passed
     lines = [line for line in str(found).splitlines() if line.startswith(f"  {check} ") and "FAILED" in line]
     assert culprit in "\n".join(lines), str(found)
 
 
-def failed(found: jj.Verification):
+def failed(found: Verification):
     """Names of the checks that did not pass."""
     return {check.name for check in found.checks if not check.passed}
 
@@ -187,7 +187,7 @@ class TwoBlades(OnPlane):
 )
 def test_a_derivative_that_splits_dependent_rows_does_not_exist(change, exists):
     scene = TwoBlades()
-    assert jj.derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
+    assert derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
 
 
 def test_verification_leaves_out_a_derivative_that_does_not_exist_and_says_so():

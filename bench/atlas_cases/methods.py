@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 import jourdain_jax as jj
+from jourdain_jax.equations import GibbsAppell
 from jourdain_jax.equations.reductions import Reduced, reduce
 
 REDUCTIONS = ("privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell")
@@ -25,7 +26,7 @@ EVEN_STEPS = {"implicit midpoint": jj.ImplicitMidpoint, "DLA": jj.DiscreteLagran
 STABILISED = {"no projection": 0.0, "Baumgarte 5/s": 5.0, "Baumgarte 1e4/s": 1e4}  # rates; one program serves all
 
 
-class OneOf(jj.GibbsAppell):
+class OneOf(GibbsAppell):
     """The reduction with number `index` out of several: they share one compiled program.
 
     A kind of `GibbsAppell` because that reduction alone is handed everything: the scene, and equations and rows in raw units.
@@ -38,7 +39,7 @@ class OneOf(jj.GibbsAppell):
         """By the chosen member."""
 
         def by(member):
-            if isinstance(member, jj.GibbsAppell):
+            if isinstance(member, GibbsAppell):
                 return lambda e, r: _uniform(member.accelerations(scene, t, q, u, e, r))
             return lambda e, r: _uniform(reduce(member, e, r))
 

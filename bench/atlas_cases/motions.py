@@ -14,6 +14,7 @@ from atlas_cases.case import by_type, single
 from atlas_cases.elsewhere import Elsewhere
 from atlas_cases.methods import EVEN_STEPS, Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
+from jourdain_jax.equations import constraint_rows
 from jourdain_jax.integrate import result_codes
 
 # Methods that take long and show something in some cases only.
@@ -115,7 +116,7 @@ class Motion:
     def _by_naive(self, method: Method, tolerance: float) -> Outcome:
         state = self.state
         q, u = (state.q, state.u) if self.naive_start is None else map(jnp.asarray, self.naive_start)
-        rows = jj.constraint_rows(self.scene, 0.0, q, u)
+        rows = constraint_rows(self.scene, 0.0, q, u)
         if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
             return not_applicable("no rows that are linear in the speeds")
         static = naive.fixed_point(self.scene, q, u, independent=self.independent)

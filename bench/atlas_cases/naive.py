@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jourdain_jax as jj
+from jourdain_jax.equations import constraint_rows, coordinate_rates
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.program.eager import eager_if_concrete
 
@@ -28,7 +28,7 @@ class Static:
 
 def fixed_point(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) -> Static:
     """Rank at the start, and the partition that is best there (or the one asked for)."""
-    A = np.asarray(jj.constraint_rows(scene, t, q, u).A, float)
+    A = np.asarray(constraint_rows(scene, t, q, u).A, float)
     cut = 4096 * float(jnp.finfo(q.dtype).eps) * np.linalg.norm(A) if A.size else 0.0
     rank = int(np.linalg.matrix_rank(A, tol=cut)) if A.size else 0
     rows = _pivots(A.T, rank)
@@ -175,9 +175,9 @@ def _all_in_one(scene, index, q, u, ts, static: Static, steps: int, names: tuple
         equations, rows = equations_and_rows(scene, t, q, u)
         problem = (equations.M, equations.Q - equations.h, rows.A, -rows.drift)
         if rows.A.shape[0] == 0:
-            return jj.coordinate_rates(scene, t, q, u), jnp.linalg.solve(problem[0], problem[1])
+            return coordinate_rates(scene, t, q, u), jnp.linalg.solve(problem[0], problem[1])
         branches = [lambda p, name=name: ACCELERATIONS[name](*p, static) for name in names]
-        return jj.coordinate_rates(scene, t, q, u), jax.lax.switch(index, branches, problem)
+        return coordinate_rates(scene, t, q, u), jax.lax.switch(index, branches, problem)
 
     return _runge_kutta(rates, (q, u), ts, steps)
 
@@ -192,7 +192,7 @@ def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[s
     independent = np.array([i for i in range(u.shape[0]) if i not in static.dependent], int)
 
     def rows_at(t, q):
-        rows = jj.constraint_rows(scene, t, q, none)
+        rows = constraint_rows(scene, t, q, none)
         # beyond that LAPACK's singular values of float32 may never converge: a motion that far off is lost
         A = jnp.where(jnp.max(jnp.abs(rows.A), initial=0.0) < 1e-3 * float(np.sqrt(jnp.finfo(q.dtype).max)), rows.A, jnp.nan)
         return A, rows.phi - A @ none
@@ -206,7 +206,7 @@ def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[s
         q, s = y
         Z, c = basis(t, q)
         u = Z @ s + c
-        qdot = jj.coordinate_rates(scene, t, q, u)
+        qdot = coordinate_rates(scene, t, q, u)
         udot = accelerations("pinv, 1e-10", scene, static, t, q, u)
         Z1, c1 = basis(t + small, q + small * qdot)
         by_basis = Z.T @ (udot - ((Z1 - Z) @ s + c1 - c) / small)  # Z'Z = 1 for orthonormal bases

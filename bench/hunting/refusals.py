@@ -19,6 +19,7 @@ import jourdain_jax as jj
 from hunting.family import G
 from hunting.pendulums import SphericalPendulum
 from hunting.uses import Single, in_way, warnings_of
+from jourdain_jax.studies import End, Uniform
 
 WAYS = ("simulate", "jit", "rollout", "jit rollout")
 
@@ -242,8 +243,8 @@ def _robot(seed: int):
 @cache
 def _study() -> tuple[Path, dict]:
     path = Path(tempfile.mkdtemp()) / "discs.zarr"
-    study = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3)
-    result = study.run(path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": jj.End("lean", "rad")}, progress=False)
+    study = jj.Study(jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3)
+    result = study.run(path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": End("lean", "rad")}, progress=False)
     return path, _facts(result)
 
 

@@ -6,6 +6,8 @@ from typing import Any, assert_type
 import jax.numpy as jnp
 
 import jourdain_jax as jj
+from jourdain_jax.identification import Fit
+from jourdain_jax.studies import Normal, StudyResult
 
 
 class Sleigh(jj.Scene):
@@ -21,5 +23,5 @@ assert_type(scene, Sleigh)
 start = jj.start(scene, x_rate=1.0, heading_rate=0.5)
 assert_type(jj.simulate(scene, start, t1=1.0), jj.Trajectory)
 assert_type(jj.rollout(jj.models.TiltingDisc(mass=2.0), {"lean": 0.3}, t1=1.0, rtol=1e-6), jj.Rollout)
-assert_type(jj.fit(scene, jj.Experiment([0.0, 1.0], {"x": [0.0, 1.0]}, 0.01, start={"x_rate": 1.0}), free=["mass"]), jj.Fit)
-assert_type(jj.Study(scene, vary={"mass": jj.Normal(1.0, 0.1)}, samples=8).run("study.zarr", t1=1.0), jj.StudyResult)
+assert_type(jj.fit(scene, jj.Experiment([0.0, 1.0], {"x": [0.0, 1.0]}, 0.01, start={"x_rate": 1.0}), free=["mass"]), Fit)
+assert_type(jj.Study(scene, vary={"mass": Normal(1.0, 0.1)}, samples=8).run("study.zarr", t1=1.0), StudyResult)

@@ -3,3 +3,19 @@
 `motion_derivatives.py` has the derivatives at one instant that linearisation, steady motions and families
 share. Open `report.py` or `linearize.py` first.
 """
+
+from jourdain_jax.analysis.energy import Energy, EnergyBalance
+from jourdain_jax.analysis.linearize import Linearization
+from jourdain_jax.analysis.report import Report
+from jourdain_jax.analysis.statements import Verification, derivative_exists
+from jourdain_jax.analysis.steady import SteadyMotion
+
+__all__ = [
+    "Energy",
+    "EnergyBalance",
+    "Linearization",
+    "Report",
+    "SteadyMotion",
+    "Verification",
+    "derivative_exists",
+]

@@ -90,7 +90,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         return known[reduction]
     check_kind(
         reduction, Reduction | GibbsAppell, "`reduction`",
-        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`"
+        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.equations.NullSpaceQR()`"
     )
     chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
     if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):

@@ -7,3 +7,37 @@
 
 A motion enters only through `solve/runs.py`. Open `fit.py` first.
 """
+
+from jourdain_jax.identification.data.channels import Accelerometer, LoadCell
+from jourdain_jax.identification.data.estimate import joint_normal, unbounded
+from jourdain_jax.identification.data.sensors import Actuator, Sensor
+from jourdain_jax.identification.inference.filtering import filtered_log_likelihood
+from jourdain_jax.identification.inference.likelihood import PlannedInformation, log_likelihood, planned_information
+from jourdain_jax.identification.inference.log_density import LogDensity, log_density
+from jourdain_jax.identification.report.fit_result import Fit
+from jourdain_jax.identification.solve.layout import possible_inertia
+from jourdain_jax.identification.solve.problem import huber, student_t
+from jourdain_jax.identification.solve.shooting import MultipleShooting
+from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
+
+__all__ = [
+    "Accelerometer",
+    "Actuator",
+    "Fit",
+    "LoadCell",
+    "LogDensity",
+    "MultipleShooting",
+    "PlannedInformation",
+    "Sensor",
+    "filtered_log_likelihood",
+    "huber",
+    "inertia_from_log_cholesky",
+    "joint_normal",
+    "log_cholesky",
+    "log_density",
+    "log_likelihood",
+    "planned_information",
+    "possible_inertia",
+    "student_t",
+    "unbounded",
+]

@@ -25,9 +25,9 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
     where Ixy = Iyz = 0: (d1, d2, d3, s13).
 
         class Frame(jj.Scene):
-            inertia: jax.Array = jj.parameter(jj.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit
+            inertia: jax.Array = jj.parameter(jj.identification.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit
             ...
-                jj.RigidBody(self.mass, jj.inertia_from_log_cholesky(self.inertia), position, orientation)
+                jj.RigidBody(self.mass, jj.identification.inertia_from_log_cholesky(self.inertia), position, orientation)
 
     **Raises** ValueError for another shape. Differentiable at all numbers.
     """

@@ -3,3 +3,34 @@
 `study.py` -> `design.py` -> `task.py` (one block of samples) -> `run.py` -> `store.py`. Files on disk keep
 their format between versions. Open `study.py` first.
 """
+
+from jourdain_jax.studies.design import Design
+from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+from jourdain_jax.studies.folder_lock import InUseError
+from jourdain_jax.studies.mean_gradients import MeanGradients
+from jourdain_jax.studies.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
+from jourdain_jax.studies.result import StudyResult, merge_studies
+from jourdain_jax.studies.sobol import SobolIndices, sobol_indices
+
+__all__ = [
+    "Design",
+    "End",
+    "EventTime",
+    "Happened",
+    "InUseError",
+    "Integral",
+    "Largest",
+    "LargestMagnitude",
+    "Levels",
+    "LogNormal",
+    "LogUniform",
+    "MeanGradients",
+    "Normal",
+    "Quantity",
+    "Smallest",
+    "SobolIndices",
+    "StudyResult",
+    "Uniform",
+    "merge_studies",
+    "sobol_indices",
+]

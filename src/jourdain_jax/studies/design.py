@@ -39,7 +39,7 @@ class Design(Printed):
     - `correlation`: pair of names -> correlation coefficient, for normal distributions; for others, of the
       normal scores of their ranks.
 
-        design = jj.Design({"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
+        design = jj.studies.Design({"mass": jj.studies.Normal(12.0, 0.3), "radius": jj.studies.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
         design.values(0, 8)["mass"]                               # of samples 0 to 7, in kg
     """
 
@@ -77,7 +77,7 @@ class Design(Printed):
             column = np.empty(0)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
             raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as "
-                "jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
+                "jj.studies.Normal(0, 1), jj.studies.Levels([...]) or a list of numbers")
         if not all_finite(column):
             raise ValueError(
                 f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; "
@@ -89,11 +89,11 @@ class Design(Printed):
         if self.sampler in (GRID, TABLE):
             name, what = next(iter(self.variables.items()))
             raise ValueError(f"a {self.sampler} takes "
-                f"{'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as "
+                f"{'`jj.studies.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as "
                 f"{what!r}")
         if not isinstance(self.sampler, str) or self.sampler not in SAMPLERS:
             raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} "
-                "Grids take `jj.Levels`, tables columns.")
+                "Grids take `jj.studies.Levels`, tables columns.")
         samples = checked_whole(self.samples, "`samples`", 1, MOST_SAMPLES, expected="of at least 1 and at "
             f"most {MOST_SAMPLES}")
         if self.sampler in ("sobol", "saltelli") and samples > MOST_SOBOL:

@@ -176,7 +176,7 @@ class Happened(OfEvent):
 class Quantity(Output):
     """A number computed by `function` from a `Trajectory` with operations of JAX, and its `unit` as a text.
 
-        jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
+        jj.studies.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """
 
     function: Callable
@@ -199,7 +199,7 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
         outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names, *scene.speed_names)}
     if not isinstance(outputs, Mapping) or not outputs:
         raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as '
-            '{"final lean": jj.End("lean", "rad")}')
+            '{"final lean": jj.studies.End("lean", "rad")}')
     found = {}
     for name, output in outputs.items():
         # it becomes the name of a folder
@@ -209,7 +209,7 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
                 "200 bytes without `/` and `\\` that begins with neither `_` nor `.`")
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
             raise ValueError(f"output `{name}` is {described(output)}, expected an output such as "
-                "jj.End('lean'), or a function of a trajectory")
+                "jj.studies.End('lean'), or a function of a trajectory")
         found[name] = output if isinstance(output, Output) else Quantity(output)
         found[name].check(scene)
     return found

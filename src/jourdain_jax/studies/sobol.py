@@ -53,9 +53,9 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     """Return Sobol' indices of a quantity from its `values` on a design with sampler "saltelli", whose
     variables are called `names`.
 
-        design = jj.Design({"a": jj.Uniform(-1.0, 1.0), "b": jj.Uniform(0.0, 1.0)}, sampler="saltelli", samples=4 * 1024)
+        design = jj.studies.Design({"a": jj.studies.Uniform(-1.0, 1.0), "b": jj.studies.Uniform(0.0, 1.0)}, sampler="saltelli", samples=4 * 1024)
         at = design.values()
-        print(jj.sobol_indices(at["a"] + at["b"] ** 2, design.names))
+        print(jj.studies.sobol_indices(at["a"] + at["b"] ** 2, design.names))
 
     `confidence`: of each interval. Groups with a value that is not finite are omitted and counted; if they
     are many or not random, the indices describe only the rest. Raises ValueError if the number of values is

@@ -50,13 +50,14 @@ class Study(Printed):
 
     - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
       number for all samples (the rest is solved for, as by `jj.start`; default: the scene's example). A
-      variation is a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of
+      variation is a distribution (`jj.studies.Normal`, `jj.studies.Uniform`, `jj.studies.LogNormal`, `jj.studies.LogUniform`), `jj.studies.Levels` of
       a grid, or a list with one number per sample; all must be of one kind.
-    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Sample k depends only on the seed and k.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.studies.Design`. Sample k depends only on the seed and k.
 
         disc = jj.models.TiltingDisc()
-        study = jj.Study(disc, vary={"radius": jj.Normal(0.5, 0.01)}, start={"lean": jj.Uniform(-0.6, 0.6), "spin_rate": -3.0}, sampler="sobol", samples=1024)
-        result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.End("lean", "rad"), "fallen": jj.Happened("fallen")})
+        start = {"lean": jj.studies.Uniform(-0.6, 0.6), "spin_rate": -3.0}
+        study = jj.Study(disc, vary={"radius": jj.studies.Normal(0.5, 0.01)}, start=start, sampler="sobol", samples=1024)
+        result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.studies.End("lean", "rad"), "fallen": jj.studies.Happened("fallen")})
         print(result)
 
     Raises ValueError for unknown names and for quantities that cannot vary. Needs the extra `studies`.
@@ -85,7 +86,7 @@ class Study(Printed):
 
     def _named(self) -> tuple[dict, dict]:
         """Return the varying quantities by the names of their columns, and the constant start values."""
-        examples = {"vary": '{"mass": jj.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
+        examples = {"vary": '{"mass": jj.studies.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
         for what, example in examples.items():
             if (given := getattr(self, what)) is not None and not isinstance(given, Mapping):
                 raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as "
@@ -173,8 +174,8 @@ class Study(Printed):
 
         - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
           are evaluated (default: 201 equidistant ones; only the end if all outputs use only the end).
-        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`,
-          `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a trajectory; default: the end values
+        - `outputs`: name -> `jj.studies.End`, `jj.studies.Largest`, `jj.studies.Smallest`, `jj.studies.LargestMagnitude`, `jj.studies.Integral`,
+          `jj.studies.EventTime`, `jj.studies.Happened`, `jj.studies.Quantity`, or a function of a trajectory; default: the end values
           of all coordinates and speeds. They are NaN for failed motions.
         - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
           "statistics" stores only counts, sums and histograms.
@@ -188,7 +189,7 @@ class Study(Printed):
         - `client`: a `dask.distributed.Client` whose workers compute, one chunk at a time each; all of them
           must reach the folder.
         - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
-          machines; `jj.merge_studies` combines them.
+          machines; `jj.studies.merge_studies` combines them.
         - `progress`: show a bar; `command`: text stored with the study.
         - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to
           `keep_every` above, are the `what` of the signature.
@@ -226,7 +227,7 @@ class Study(Printed):
 
         - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 
-            found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.End("lean", "rad")}, parameters=("gravity",))
+            found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.studies.End("lean", "rad")}, parameters=("gravity",))
             found.of("final lean", "radius.sigma")
 
         Raises ValueError for unknown names.

@@ -55,7 +55,7 @@ def stability_chart(
     - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
     - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
       parameter, at least 3.
-    - `prior`: parameter (one number) -> `jj.Normal`, such as `measured_bicycle(...).prior`. `chart.bands`
+    - `prior`: parameter (one number) -> `jj.studies.Normal`, such as `measured_bicycle(...).prior`. `chart.bands`
       then has the standard deviations of the second number on each boundary, to first order, for independent
       parameters.
     - `asked`: arguments of `family`: `held`, `inputs`, `names`.
@@ -65,7 +65,7 @@ def stability_chart(
     the middle value is missed, and one that turns back along the first number has gaps.
 
     **Returns** a `StabilityChart`. **Raises** errors as in `family`, and ValueError unless there are two
-    axes, or for a prior that is no `jj.Normal`.
+    axes, or for a prior that is no `jj.studies.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
         raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, "
@@ -83,7 +83,7 @@ def stability_chart(
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
         raise ValueError(
-            f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter that is one "
+            f"`prior` is {given}, expected `jj.studies.Normal(mean, sigma)` for each name, a parameter that is one "
             "number"
         ) from None
     sigma[getattr(place, first)] = 0.0

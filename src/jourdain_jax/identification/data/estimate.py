@@ -151,7 +151,7 @@ class Correlated:
 
 
 def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
-    """Return priors of several parameters with correlated errors: `free=jj.joint_normal({"mass": 20.9,
+    """Return priors of several parameters with correlated errors: `free=jj.identification.joint_normal({"mass": 20.9,
     "inertia": 1.64}, covariance)`.
 
     **Arguments**
@@ -159,7 +159,7 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     - `covariance`: (n, n), in the order of the names. It may be singular: a combination without variance gets
       a standard deviation of a ten thousandth of the others.
 
-    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.joint_normal(...)
+    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.identification.joint_normal(...)
     | {"gain": None}`. If only some of the names are free, their block of the covariance counts.
     `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
@@ -213,8 +213,8 @@ def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
 class Estimate:
     """An unknown number, estimated by a fit.
 
-        jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
-        jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg
+        jj.identification.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
+        jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.studies.Normal(20.9, 0.5))})        # kg
 
     - `guess`: the initial value of the fit, in the unit of the number. Parameters and start values have one
       already.
@@ -251,7 +251,7 @@ def _check_prior(prior) -> None:
     try:
         mean, sigma = float(prior.mean), float(prior.sigma)
     except (AttributeError, TypeError):
-        raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, "
+        raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.studies.Normal(mean, "
             "sigma)`") from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
         raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give "

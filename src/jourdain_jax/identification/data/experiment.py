@@ -25,7 +25,8 @@ _NO_INPUTS = Inputs(())
 class Experiment(eqx.Module):
     """Measurements of one run of a scene; several runs are a list of these.
 
-        Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
+        gyro = jj.identification.Sensor("heading_rate", lag=0.01)
+        Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": gyro})
 
     **Arguments**
 

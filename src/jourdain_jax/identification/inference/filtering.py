@@ -74,7 +74,7 @@ def filtered_log_likelihood(
 
     **Example**
 
-        jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
+        jj.identification.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
     settled = replace(as_fit_options(scene, options, by_name, "filtered_log_likelihood"), events=False)
     scene = as_scene(scene)
@@ -221,7 +221,7 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
             if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):
                 raise ValueError(
                     f"start value `{name}` of run {index} is unknown, but has no prior; give "
-                    "`jj.Estimate(prior=jj.Normal(mean, sigma))`"
+                    "`jj.Estimate(prior=jj.studies.Normal(mean, sigma))`"
                 )
 
 

@@ -166,7 +166,7 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
     motion fails. `options`, `by_name`: as in `simulate`. Missing samples (NaN, or an infinite sigma) do not
     count.
 
-        jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
+        jax.grad(lambda a: jj.identification.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
@@ -305,7 +305,7 @@ def planned_information(
 
         def told(spin):
             plan = jj.Experiment(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
-            return jj.planned_information(disc, plan, free=("radius", "gravity")).log_det()
+            return jj.identification.planned_information(disc, plan, free=("radius", "gravity")).log_det()
 
         slope = jax.jacfwd(told)(-3.0)
     """

@@ -210,7 +210,7 @@ def log_density(
 
     **Example**
 
-        density = jj.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
+        density = jj.identification.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
         sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
         draws = density.named(positions)["radius"]                               # m, at the sampled positions (draws, unknowns)
     """

@@ -42,7 +42,7 @@ from jourdain_jax.scene.scene import Scene
 
 _DIAGONAL, _PRODUCTS = ((0, 0), (1, 1), (2, 2)), ((0, 1), (1, 2), (0, 2))
 _OTHERWISE = (
-    "give each parameter its own range or tie, or make its inertia of `jj.log_cholesky` numbers in the scene"
+    "give each parameter its own range or tie, or make its inertia of `jj.identification.log_cholesky` numbers in the scene"
 )
 
 
@@ -53,7 +53,7 @@ class PossibleInertia:
 
 def possible_inertia() -> PossibleInertia:
     """Return a marker that frees the inertia of a body, restricted to possible values: `free={"rear frame":
-    jj.possible_inertia()}`, with the name of the body.
+    jj.identification.possible_inertia()}`, with the name of the body.
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 

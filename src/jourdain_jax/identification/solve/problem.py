@@ -91,7 +91,7 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 def huber(k: Number = 1.345) -> Loss:
     """Return a loss that counts residuals beyond `k` sigmas by magnitude instead of by square: `jj.fit(...,
-    loss=jj.huber())`. The default has 95 % of the efficiency of least squares for normal noise.
+    loss=jj.identification.huber())`. The default has 95 % of the efficiency of least squares for normal noise.
 
     Raises ValueError unless k is positive and finite.
     """

@@ -60,7 +60,7 @@ def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], 
 class MultipleShooting:
     """Fit each run in pieces with their own starts, each ending where the next one begins.
 
-        jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
+        jj.fit(guess, run, free=("mass", "length"), shooting=jj.identification.MultipleShooting(duration=0.5))
 
     - `duration`: approximate length of a piece, s. Choose the time over which neighbouring motions diverge by
       a factor of two to five.
@@ -189,5 +189,5 @@ def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
 def check_shooting(shooting) -> None:
     """Raise ValueError unless `shooting` is a `MultipleShooting` or None."""
     if shooting is not None and not isinstance(shooting, MultipleShooting):
-        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, "
-            "`jj.MultipleShooting(pieces=...)`, or None")
+        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.identification.MultipleShooting(duration=...)`, "
+            "`jj.identification.MultipleShooting(pieces=...)`, or None")
