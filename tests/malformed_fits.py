@@ -97,7 +97,7 @@ FITS: dict[str, str] = {
     "jj.fit(Cart, run(), 'mass')": "`scene` is the class `Cart`",
     "jj.fit(cart, 3, 'mass')": "`data` is an int, expected an `Experiment` or a sequence of at least one",
     "jj.fit(cart, [run(), 3], 'mass')": "`data` holds an int, expected an `Experiment` or a sequence of at least one",
-    "jj.fit(cart, jj.Experiment([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": "run 0 of `Cart` has unknown channel `z`; Valid names:",
+    "jj.fit(cart, jj.Experiment([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": "run 0 of `Cart` has unknown channel `z`; valid names:",
     "jj.identification.log_likelihood(cart, 3)": "`data` is an int, expected an `Experiment` or a sequence of at least one",
     "jj.identification.log_likelihood(cart, run(), rtol=-1.0)": "`rtol` is -1, expected a positive finite number",
 }
@@ -122,7 +122,7 @@ SENSORS: dict[str, str] = {
     "jj.identification.Actuator(1.0)": "`command` of `Actuator` is a float, expected `jj.Sampled",
     "jj.identification.Actuator(command, hold=1)": "`hold` of `Actuator` is an int ... expected True",
     "jj.identification.Actuator(command, gain=[1.0, 2.0])": "`gain` of `Actuator` has shape (2,), expected one number",
-    "jj.Experiment(TS, {'x': TS}, 1.0, start={}, sensors={'y': 'x'})": "sensor `y` has no measured values; Valid names: `x`",
+    "jj.Experiment(TS, {'x': TS}, 1.0, start={}, sensors={'y': 'x'})": "sensor `y` has no measured values; valid names: `x`",
     "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), 'mass')": (
         "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`"
     ),

@@ -101,7 +101,7 @@ def test_comments_blank_lines_spaces_and_plus_minus_signs_are_read(tmp_path):
     [
         ("lam = 0.39", "Lam = 0.39", ["line 15", "`Lam`", "`lam`"]),
         ("IBxx = ", "IBxxx = ", ["line 1", "`IBxxx`", "`IBxx`"]),
-        ("w = 1.121", "wheelbase = 1.121", ["line 22", "unknown", "Valid names"]),
+        ("w = 1.121", "wheelbase = 1.121", ["line 22", "unknown", "valid names"]),
         ("w = 1.121+/-0.002\n", "", ["missing `w`", "Add a line"]),
         ("w = 1.121", "w = 1,121", ["line 22", "`w`", "decimal point"]),
         ("w = 1.121", "w = long", ["line 22", "`w`", "`long`", "expected a number"]),

@@ -13,7 +13,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 465_238,
+    "code tokens of src": 465_252,
     "code tokens of docs": 11_424,
     "code tokens of notebooks": 7424,
     "caches": 49,
@@ -25,7 +25,7 @@ CEILINGS = {
     "ways: constraints and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, its event search and its adjoint": 1,
-    "code tokens of tests": 329_196,
+    "code tokens of tests": 329_294,
     "code tokens of bench": 107_027,
     "test files that reach private names": 35,
 }

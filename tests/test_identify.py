@@ -153,6 +153,12 @@ def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
     assert all(found.values < found.high)
 
 
+def test_a_fit_by_dense_matrices_is_that_by_machine_code():
+    by_code, dense = (fit(jj.build(Cart(mass=1.7), backend=backend), cart_run(), ("mass",)) for backend in ("auto", "dense"))
+    assert dense["mass"].value == pytest.approx(float(by_code["mass"].value), rel=1e-9)
+    assert dense["mass"].standard_error == pytest.approx(float(by_code["mass"].standard_error), rel=1e-6)
+
+
 @pytest.mark.parametrize("missing", ["masked", "no number", "of no weight"])
 def test_samples_that_are_missing_do_not_count(missing):
     some, x = np.arange(21) % 2 == 0, cart_run().values["x"]

@@ -155,7 +155,7 @@ def _output(name: str, how):
     unit = stated.pop("unit", "")
     if len(stated) != 1 or (kind := OUTPUTS.get(*stated)) is None:
         raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = "
-            f"'rad' }}. {nearest(str([*stated][:1]), OUTPUTS)}")
+            f"'rad' }}; {nearest(str([*stated][:1]), OUTPUTS)}")
     return kind(*stated.values(), *(() if kind in (EventTime, Happened) else (unit,)))
 
 

@@ -21,8 +21,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Return the end of an error message: the nearest valid name, if any is near, and all valid names."""
     valid = list(valid)
     match = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
-    hint = f"did you mean `{match[0]}`? " if match else ""
-    return f"{hint}Valid names: {', '.join(f'`{v}`' for v in valid) or 'none'}."
+    names = ", ".join(f"`{v}`" for v in valid) or "none"
+    return f"did you mean `{match[0]}`? Valid names: {names}." if match else f"valid names: {names}."
 
 
 def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:

@@ -337,8 +337,10 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
-            r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
-        return jnp.concatenate([J, r[:, None]], axis=1)
+            # dense matrices give the residuals once for each direction
+            directions = np.eye(max(unknowns, 1), unknowns, dtype=x.dtype)  # one of no length where nothing is free
+            r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)))(directions)
+        return jnp.concatenate([J[:unknowns], r[:1]]).T
 
     # XLA's newer emitters take twice the time to compile, for a program that is no faster; jaxlib 0.11.1 and
     # later have no others
