@@ -178,8 +178,8 @@ def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":
-    """Return the program that evaluates a scene at single instants, with these speeds constant or
-    independent. `masses`: whether the mass matrix of these speeds is needed.
+    """Return the program that evaluates a scene at single instants. `constant`: indices of its constant or
+    independent speeds. `masses`: whether their mass matrix is needed.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)

@@ -111,9 +111,9 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time with its captured values (None unless its value is a number), and its shape.
+    """Return a function of time with its captured values, or None unless its value is a number; and its shape.
 
-    A new function, or one that reads (`scene/identity.py`) other values than before, is traced again.
+    A function is traced again if it is new, or if a value that it reads has changed (`scene/identity.py`).
     """
     try:
         kept = _trace(function)

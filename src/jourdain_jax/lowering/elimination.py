@@ -46,7 +46,7 @@ def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[
     """Solve a system. `right[row]` holds the right-hand sides of that row. With more rows than unknowns,
     the rows must be consistent.
 
-    `far`: makes probes with angles over full turns, only when a pivot must be judged there.
+    `far`: function that makes probes with angles of up to a full turn, called only if a pivot needs them.
     """
     system = Pivots(graph, A, right, probes, far)
     count = len(system.columns)

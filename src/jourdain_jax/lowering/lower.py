@@ -124,8 +124,8 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Return random and symmetric configurations that satisfy the geometric constraints, with random speeds.
 
-    Parameters are up to a tenth larger than given, to exclude coincidences. If the scene would then be
-    undefined or its moments of inertia impossible, they are smaller or closer to the given values.
+    Parameters are up to a tenth larger than given, to exclude coincidences. If the scene were
+    undefined for them, or its moments of inertia impossible, parameters nearer to the given ones are used.
     """
     generator = np.random.default_rng(1)
     # at most 56 probes

@@ -111,8 +111,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return the replacements of one node by another that leave all `nodes` unchanged, each tested alone.
-    `probes`: generic ones.
+    """Return those entries of `replacement` (node -> its substitute) that change no value of `nodes`; each
+    is tested alone. `probes`: generic ones.
     """
     graph, here = probes.graph, probes(nodes)
 

@@ -21,8 +21,8 @@ class Projected(NamedTuple):
 
 
 def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
-    """Return the probes with `inputs` (names -> nodes) moved to the nearest point with rows = 0; `limits` of
-    steps as in `nearest_root`.
+    """Return the probes with `inputs` (names -> nodes) moved to the nearest point where all rows are 0.
+    `limits`: of the steps, as in `nearest_root`.
     """
     graph = probes.graph
     needed = set(graph.reachable(rows))

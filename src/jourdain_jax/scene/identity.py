@@ -171,8 +171,8 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return the given numbers changed by the fractions `change`, which have the same shape after any leading
-    axes. Each zero is replaced by `zero`.
+    """Return the given numbers changed by the fractions `change`: the shape of `given`, after any leading
+    axes. A number that is 0 becomes the argument `zero`.
 
     An inertia tensor becomes the tensor of the body stretched, sheared and rotated, since separately changed
     entries may belong to no body:

@@ -138,8 +138,8 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return the rooms to which the body stores, and the shapes of its results. The
-        trace leaves the rooms unchanged.
+        """Return the rooms (arrays in memory) that the function `body` writes, and the shapes of its results.
+        The trace leaves the rooms unchanged.
         """
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)

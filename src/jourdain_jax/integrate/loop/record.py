@@ -127,8 +127,8 @@ def _write_more_room(w: MachineWriter) -> None:
 
 
 def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
-    """Return slots that fit into a third of each thread's memory. While the record
-    doubles, the old one still exists.
+    """Return slots that fit into a third of each thread's memory: while a record is replaced by one of twice
+    its size, both exist.
     """
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)

@@ -209,8 +209,8 @@ class Trajectory(Record, Printed):
         return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items() if bool(wrong))
 
     def nan_if_failed(self) -> "Trajectory":
-        """Return the trajectory with NaN states if it reached neither its end nor an event: under `jit`,
-        `vmap` and `grad`, for each sample.
+        """Return the trajectory, with NaN states if it reached neither its end nor an event. Works under
+        `jit`, `vmap` and `grad`, and for each sample of a batch.
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
