@@ -83,7 +83,7 @@ def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
 
         def call(*values):
             found = jax.ffi.ffi_call(handler(lanes, threads), results)(*operands.side_by_side(*values))
-            jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), value_kernels, found)
+            jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), values, found)
             return found
 
         return mlir.lower_fun(call)(ctx, *values)

@@ -229,7 +229,7 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
             L, _ = forces(z[:2], z[2:], modes)
             return np.where(modes == 0, F - np.abs(L), modes * z[2:])
 
-        times = np.linspace(t, end, 301)[1:]
+        times = np.linspace(t, end, 3001)[1:]
         low = np.array([values(s) for s in times]) < 0
         if not low.any():
             y, t = found.y[:, -1], end
@@ -252,15 +252,12 @@ def test_a_contact_may_have_the_name_of_a_coordinate():
     """Modes and coordinates are named apart: of one name, the coordinate became the number of the mode."""
 
     class Named(Braked):
-        def loads(self, motion):
-            return (jj.gravity(motion, 9.81),)
-
         def contacts(self, pose):
             return {"x": super().contacts(pose)["tread"]}
 
-    motion = jj.simulate(Named(), {"z": 0.3, "x_rate": 3.0, "spin_rate": 0.0}, ts=[1.0], **TIGHT)
-    rolls = 1.0 / (0.5 * 9.81)  # s, until the speed has fallen to two thirds
-    np.testing.assert_allclose(motion["x"], 2.5 * rolls + 2.0 * (1.0 - rolls), rtol=1e-9)
+    start = {"z": 0.3, "x_rate": 3.0, "spin_rate": 0.0}
+    places = [jj.simulate(kind(brake=0.0), start, ts=[1.0])["x"][0] for kind in (Braked, Named)]
+    assert places[0] == places[1]
 
 
 def test_what_cannot_hold_is_refused():

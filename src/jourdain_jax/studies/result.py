@@ -121,8 +121,8 @@ class StudyResult(Printed):
         grid = self.store.read_grid()
         if grid is None or not self._done:
             raise ValueError(
-                f"no chunk of `{self.store.path}` is finished, or `run/grid.json` is damaged; run the study, "
-                "which computes it"
+                f"no chunk of `{self.store.path}` is finished, or `run/grid.json` is damaged; run the study "
+                "again"
             )
         return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 

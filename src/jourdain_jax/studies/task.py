@@ -123,8 +123,8 @@ class Task:
         names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(
-                f"`{twice[0]}` would name two arrays of the study; its names are "
-                f"{', '.join(map(repr, names))}: give the output another name"
+                f"`{twice[0]}` would name two arrays of the study, which has {', '.join(map(repr, names))}; "
+                "give the output another name"
             )
         return dict(found)
 

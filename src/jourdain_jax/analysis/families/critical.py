@@ -365,8 +365,8 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
             raise ValueError(
-                f"steady motions continue in {freedoms.shape[1]} directions at equal parameters, so a zero "
-                "eigenvalue is not a special point; hold more, by `held`"
+                f"the steady motions of these parameters form a set of {freedoms.shape[1]} dimensions, where "
+                "a zero eigenvalue is no special point; name further values in `held`"
             )
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
