@@ -3,8 +3,9 @@
     python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...]
     python bench/atlas.py --redraw FILE --out DIR
 
-Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, tables and a picture (PNG and SVG).
-The engine as it comes is the method `default`. Each floating-point type runs in a process of its own: JAX chooses it once.
+Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, tables and a
+picture (PNG and SVG). The engine as it comes is the method `default`. Each floating-point type runs in a
+process of its own: JAX chooses it once.
 """
 
 import argparse
@@ -25,8 +26,14 @@ def chosen(arguments):
     from atlas_cases.cases import CASES
     from atlas_cases.methods import METHODS
 
-    cases = tuple(case for case in CASES if (not arguments.quick or case.quick) and (not arguments.case or case.name in arguments.case))
-    return cases, tuple(method for method in METHODS if not arguments.method or method.name in arguments.method)
+    cases = tuple(
+        case
+        for case in CASES
+        if (not arguments.quick or case.quick) and (not arguments.case or case.name in arguments.case)
+    )
+    return cases, tuple(
+        method for method in METHODS if not arguments.method or method.name in arguments.method
+    )
 
 
 def measure(arguments) -> list[dict]:
@@ -49,7 +56,15 @@ def in_process(dtype: str, arguments) -> list[dict]:
     """The cells of one floating-point type, by a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cells.json"
-        command = [sys.executable, __file__, "--only-dtype", dtype, "--json", str(path), *(["--quick"] if arguments.quick else [])]
+        command = [
+            sys.executable,
+            __file__,
+            "--only-dtype",
+            dtype,
+            "--json",
+            str(path),
+            *(["--quick"] if arguments.quick else []),
+        ]
         for option in ("case", "method"):
             command += [f"--{option}", *getattr(arguments, option)] if getattr(arguments, option) else []
         subprocess.run(command, env=os.environ | environment(dtype), check=True)
@@ -63,7 +78,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for the picture and the tables")
     parser.add_argument("--case", nargs="*", help="only these cases")
     parser.add_argument("--method", nargs="*", help="only these methods")
-    parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: picture and tables of what is in this file")
+    parser.add_argument(
+        "--redraw",
+        type=Path,
+        metavar="FILE",
+        help="measure nothing: picture and tables of what is in this file",
+    )
     parser.add_argument("--only-dtype", choices=TYPES, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.redraw:

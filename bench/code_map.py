@@ -2,19 +2,22 @@
 
     python bench/code_map.py [--quick] [--json FILE] [--private]
 
-Read from the source: code tokens of every folder (docstrings, comments and layout are free, a string counts one per 40 characters begun, as Python 3.11
-splits text); test files that reach names below the top level of the package, through other files of `tests` too; caches (decorators, containers at module
-level that are filled later); numbers at module level and as defaults of classes; tests for tracers; functions with more than 8 parameters.
+Read from the source: code tokens of every folder (docstrings, comments and layout are free, a string counts
+one per 40 characters begun, as Python 3.11 splits text); test files that reach names below the top level of
+the package, through other files of `tests` too; caches (decorators, containers at module level that are
+filled later); numbers at module level and as defaults of classes; tests for tracers; functions with more than
+8 parameters.
 
-Measured, in a fresh process for each model, with every call of a Python function observed: files of the package of which some function runs
+Measured, in a fresh process for each model, with every call of a Python function observed: files of the
+package of which some function runs
 
     build       in the first `jj.build` of the model
     first       in the first `jj.simulate(scene, start, t1=...)` after it
     gradient    in the first gradient of its end with respect to the start
     warm        in one more `jj.simulate`
 
-`tests/test_code_map.py` holds what is read as ceilings. The JSON is a list of {"figure", "model", "value", "required", "met"}; `--quick`: one model;
-`--private`: which private modules every test file reaches.
+`tests/test_code_map.py` holds what is read as ceilings. The JSON is a list of {"figure", "model", "value",
+"required", "met"}; `--quick`: one model; `--private`: which private modules every test file reaches.
 """
 
 import ast
@@ -34,18 +37,54 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "jourdain_jax"
 SOURCE = ROOT / "src" / PACKAGE
 FOLDERS = ("src", "tests", "bench", "docs", "notebooks")
-PUBLIC = {PACKAGE, *(f"{PACKAGE}.{name}" for name in ("models", "bicycle", "bicycle.parameters", "bicycle.readings", "cli", "dynamics.reduced"))}
+PUBLIC = {
+    PACKAGE,
+    *(
+        f"{PACKAGE}.{name}"
+        for name in ("models", "bicycle", "bicycle.parameters", "bicycle.readings", "cli", "dynamics.reduced")
+    ),
+}
 PUBLIC |= {f"{PACKAGE}.{name}" for name in ("analysis", "equations", "identification", "studies")}
-# below public names, tests may speak to the scalar program and its operations, also as machine code, and to one step
-SEAMS = tuple(f"{PACKAGE}.{name}" for name in ("program", "calculus.scalar_operations", "integrate.loop.step"))
+# below public names, tests may speak to the scalar program and its operations, also as machine code, and to
+# one step
+SEAMS = tuple(
+    f"{PACKAGE}.{name}" for name in ("program", "calculus.scalar_operations", "integrate.loop.step")
+)
 THROUGH = "evaluated_natively"  # the file of `tests` that runs a scalar program as machine code
 CACHES = {"cache", "lru_cache", "cached_property"}
-CONTAINERS = {"dict", "list", "set", "defaultdict", "OrderedDict", "Counter", "WeakKeyDictionary", "WeakValueDictionary", "WeakSet", "deque"}
-TRACERS = {"is_traced", "is_traced_type", "nothing_is_traced", "checked_unless_traced", "Tracer", "ConcretizationTypeError", "TracerBoolConversionError"}
+CONTAINERS = {
+    "dict",
+    "list",
+    "set",
+    "defaultdict",
+    "OrderedDict",
+    "Counter",
+    "WeakKeyDictionary",
+    "WeakValueDictionary",
+    "WeakSet",
+    "deque",
+}
+TRACERS = {
+    "is_traced",
+    "is_traced_type",
+    "nothing_is_traced",
+    "checked_unless_traced",
+    "Tracer",
+    "ConcretizationTypeError",
+    "TracerBoolConversionError",
+}
 MOST_PARAMETERS = 8
 MOST_FILES = 20  # that a warm call runs
 MODELS = ("tilting-disc", "skate", "whipple-bicycle")
-LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER, tokenize.ENCODING}
+LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+    tokenize.ENCODING,
+}
 OPENS, CLOSES = (getattr(tokenize, f"FSTRING_{end}", -1) for end in ("START", "END"))  # from Python 3.12 on
 
 
@@ -67,7 +106,8 @@ def code_tokens(text: str) -> int:
     documented = {
         node.body[0].lineno
         for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node) is not None
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and ast.get_docstring(node) is not None
     }
     lines, total, opened = text.splitlines(keepends=True), 0, []
     starts = [sum(map(len, lines[:k])) for k in range(len(lines) + 1)]
@@ -85,7 +125,9 @@ def code_tokens(text: str) -> int:
 
 
 def modules_imported(path: Path) -> set[str]:
-    """Return the names of the modules that a file imports, those of the package and of `tests` as far down as a file goes."""
+    """Return the names of the modules that a file imports, those of the package and of `tests` as far down as
+    a file goes.
+    """
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -99,14 +141,19 @@ def modules_imported(path: Path) -> set[str]:
 def _file(module: str) -> Path | None:
     """Return the file of a module of the package or of `tests`."""
     for root in (ROOT / "src", ROOT / "tests"):
-        for path in (root.joinpath(*module.split(".")).with_suffix(".py"), root.joinpath(*module.split("."), "__init__.py")):
+        for path in (
+            root.joinpath(*module.split(".")).with_suffix(".py"),
+            root.joinpath(*module.split("."), "__init__.py"),
+        ):
             if path.is_file():
                 return path
     return None
 
 
 def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
-    """Return the modules of the package that a file of `tests` reaches, itself or through others there, beyond public ones and the seams."""
+    """Return the modules of the package that a file of `tests` reaches, itself or through others there,
+    beyond public ones and the seams.
+    """
     if path not in known:
         known[path] = set()
         for module in modules_imported(path):
@@ -121,7 +168,9 @@ def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
 def reaching() -> dict[str, list[str]]:
     """Return the private modules that every test file reaches, by the name of the file, where there are any."""
     known: dict[Path, set[str]] = {}
-    found = {path.name: sorted(private_modules(path, known)) for path in sorted((ROOT / "tests").glob("test_*.py"))}
+    found = {
+        path.name: sorted(private_modules(path, known)) for path in sorted((ROOT / "tests").glob("test_*.py"))
+    }
     return {name: modules for name, modules in found.items() if modules}
 
 
@@ -133,12 +182,18 @@ def counted(tree: ast.Module) -> Counter:
         found["caches"] += name in CACHES
         found["tests for a tracer"] += name in TRACERS
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            named = [x for x in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs) if x.arg not in ("self", "cls")]
+            named = [
+                x
+                for x in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+                if x.arg not in ("self", "cls")
+            ]
             found[f"functions with more than {MOST_PARAMETERS} parameters"] += len(named) > MOST_PARAMETERS
     for body in (tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))):
         for value in (node.value for node in body if isinstance(node, ast.Assign | ast.AnnAssign)):
             found["caches"] += body is tree.body and _is_empty(value)
-            found["named numbers"] += sum(map(_is_number, value.elts if isinstance(value, ast.Tuple) else [value]))
+            found["named numbers"] += sum(
+                map(_is_number, value.elts if isinstance(value, ast.Tuple) else [value])
+            )
     return found
 
 
@@ -147,7 +202,9 @@ def _is_empty(value: ast.expr | None) -> bool:
     if isinstance(value, ast.Call):
         name = getattr(value.func, "id", None) or getattr(value.func, "attr", None)
         return name in CONTAINERS and all(isinstance(argument, ast.Name) for argument in value.args)
-    return (isinstance(value, ast.Dict) and not value.keys) or (isinstance(value, ast.List) and not value.elts)
+    return (isinstance(value, ast.Dict) and not value.keys) or (
+        isinstance(value, ast.List) and not value.elts
+    )
 
 
 def _is_number(value: ast.expr | None) -> bool:
@@ -164,7 +221,9 @@ def figures_of_source() -> dict[str, int]:
     found: Counter = Counter()
     for folder in FOLDERS:
         files = [path for path in sorted((ROOT / folder).rglob("*.py*")) if path.suffix in (".py", ".pyi")]
-        found[f"code tokens of {folder}"] = sum(code_tokens(path.read_text(encoding="utf-8")) for path in files)
+        found[f"code tokens of {folder}"] = sum(
+            code_tokens(path.read_text(encoding="utf-8")) for path in files
+        )
     for path in sorted(SOURCE.rglob("*.py")):
         found += counted(ast.parse(path.read_text(encoding="utf-8")))
     found["test files that reach private names"] = len(reaching())
@@ -185,7 +244,12 @@ def observed(call: Callable[[], object]) -> tuple[object, dict[str, int]]:
 
     def look(frame, event, argument):
         path = frame.f_code.co_filename
-        if event == "call" and path.startswith(root) and frame.f_code.co_name != "<module>" and not frame.f_code.co_flags & inspect.CO_GENERATOR:
+        if (
+            event == "call"
+            and path.startswith(root)
+            and frame.f_code.co_name != "<module>"
+            and not frame.f_code.co_flags & inspect.CO_GENERATOR
+        ):
             files[path[len(root) :]] += 1
 
     threading.setprofile(look)
@@ -213,7 +277,9 @@ def observed_calls(model: str) -> dict[str, dict[str, int]]:
         return jax.block_until_ready(jj.simulate(scene, start, t1=span))
 
     def slope():
-        return jax.block_until_ready(jax.grad(lambda start: jj.simulate(scene, start, t1=span).q_end.sum())(start))
+        return jax.block_until_ready(
+            jax.grad(lambda start: jj.simulate(scene, start, t1=span).q_end.sum())(start)
+        )
 
     motion, first = observed(moved)
     motion.raise_if_failed()
@@ -228,7 +294,9 @@ def source(quick: bool) -> Figures:
 def calls(quick: bool) -> Figures:
     """Yield how much of the package runs, for every model."""
     for model in MODELS[: 1 if quick else None]:
-        found = fresh("import code_map, json, sys; print(json.dumps(code_map.observed_calls(sys.argv[1])))", model)
+        found = fresh(
+            "import code_map, json, sys; print(json.dumps(code_map.observed_calls(sys.argv[1])))", model
+        )
         for name, files in found.items():
             yield figure(f"files run, {name}", model, len(files), MOST_FILES if name == "warm" else None)
             yield figure(f"calls of own functions, {name}", model, sum(files.values()))

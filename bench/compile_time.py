@@ -2,9 +2,11 @@
 
     taskset -c 0 python bench/compile_time.py [--quick] [--json FILE] [--only MODEL ...]
 
-Every model is measured in two fresh processes that share one cache, empty at first: of JAX's programs, and of our machine code, structures and scalar
-programs. The first process fills it ("cold", writing included), the second reads it ("warm cache"). Both find the package as bytecode, as it lies on a
-user's machine: a process before them writes it, where PYTHONDONTWRITEBYTECODE is set here too. In seconds of processor time, one after another in each process:
+Every model is measured in two fresh processes that share one cache, empty at first: of JAX's programs, and of
+our machine code, structures and scalar programs. The first process fills it ("cold", writing included), the
+second reads it ("warm cache"). Both find the package as bytecode, as it lies on a user's machine: a process
+before them writes it, where PYTHONDONTWRITEBYTECODE is set here too. In seconds of processor time, one after
+another in each process:
 
     import      jax, the package and the model, which is made
     structure   probing of rank, privileged velocities and kinds of rows
@@ -62,8 +64,14 @@ print(json.dumps(laps | {"total": sum(laps.values()) - laps["second"]}))
 def times(name: str, quick: bool) -> Figures:
     """Those of a model, cold and with a warm cache."""
     with tempfile.TemporaryDirectory() as cache:
-        caching = {"COMPILATION_CACHE_DIR": cache, "PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
-        environment = {f"JAX_{key}": value for key, value in caching.items()} | {"PYTHONDONTWRITEBYTECODE": ""}
+        caching = {
+            "COMPILATION_CACHE_DIR": cache,
+            "PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+        environment = {f"JAX_{key}": value for key, value in caching.items()} | {
+            "PYTHONDONTWRITEBYTECODE": ""
+        }
         for what in ("cold", "with a warm compile cache"):
             for lap, seconds in fresh(PROBE, name, **environment).items():
                 yield figure(f"{lap}, {what}, s", name, seconds)

@@ -1,10 +1,12 @@
-"""Events after which a motion goes on: how exact motions and derivatives through them are, and how long they take.
+"""Events after which a motion goes on: how exact motions and derivatives through them are, and how long they
+take.
 
     python bench/contacts.py [--quick] [--json FILE]
 
-Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e = 0.7, and its
-derivatives; processor time; fits of 500 noisy throws; ends of slip of 1,000 bowling balls. A `solve` is one motion without
-derivatives. `--quick`: fewer lanes. The JSON is a list of {"figure", "model", "value", "required", "met"}.
+Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e =
+0.7, and its derivatives; processor time; fits of 500 noisy throws; ends of slip of 1,000 bowling balls. A
+`solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of {"figure", "model",
+"value", "required", "met"}.
 """
 
 import jax
@@ -35,22 +37,36 @@ class Ball(jj.Scene):
 
     def loads(self, motion):
         along = self.drag * (self.draught - motion.u.x_rate)
-        return jj.gravity(motion, self.gravity), jj.Load(forces={"ball": jnp.stack([along, 0.0 * along, 0.0 * along])})
+        return jj.gravity(motion, self.gravity), jj.Load(
+            forces={"ball": jnp.stack([along, 0.0 * along, 0.0 * along])}
+        )
 
     def events(self, motion):
-        return {"floor": jj.Event(motion.q.z - self.slope * motion.q.x, jump={"z_rate": -self.bounce * motion.u.z_rate})}
+        return {
+            "floor": jj.Event(
+                motion.q.z - self.slope * motion.q.x, jump={"z_rate": -self.bounce * motion.u.z_rate}
+            )
+        }
 
 
 def bounces(e, most=60, tolerance=1e-12):
     """Return the times of the bounces, as many as there may be."""
-    return jj.simulate(Ball(e), {"z": 1.0}, ts=[2.52], rtol=tolerance, atol=tolerance, max_transitions=most).phases.ts
+    return jj.simulate(
+        Ball(e), {"z": 1.0}, ts=[2.52], rtol=tolerance, atol=tolerance, max_transitions=most
+    ).phases.ts
 
 
 def digits(quick: bool) -> Figures:
     """Errors of the time of the tenth bounce and of its derivatives by e, and of the energy."""
-    tenth = lambda e: bounces(e)[9]  # noqa: E731
-    found = tenth(0.7), max(abs(f(tenth)(0.7) - RIGHT[1]) for f in (jax.grad, jax.jacfwd)) + RIGHT[1], jax.hessian(tenth)(0.7)
-    for name, value, right, required in zip(("time", "d/de", "d2/de2"), found, RIGHT, (1e-12, 1e-10, 1e-8), strict=True):
+    tenth = lambda e: bounces(e)[9]
+    found = (
+        tenth(0.7),
+        max(abs(f(tenth)(0.7) - RIGHT[1]) for f in (jax.grad, jax.jacfwd)) + RIGHT[1],
+        jax.hessian(tenth)(0.7),
+    )
+    for name, value, right, required in zip(
+        ("time", "d/de", "d2/de2"), found, RIGHT, (1e-12, 1e-10, 1e-8), strict=True
+    ):
         yield figure(f"ten bounces, {name}: error", NAME, abs(value - right), required)
     motion = jj.simulate(Ball(), {"z": 1.0}, t1=2.5, rtol=1e-12, atol=1e-12)
     balance = motion.energies().balance
@@ -63,13 +79,17 @@ def seconds(call, *arguments) -> float:
 
 
 def times(quick: bool) -> Figures:
-    """Time of a lane with ten bounces and more, and of derivatives by eight numbers through twelve, in solves."""
+    """Time of a lane with ten bounces and more, and of derivatives by eight numbers through twelve, in
+    solves.
+    """
     e = jnp.linspace(0.5, 0.7, 200 if quick else 1000)
     lanes = seconds(jax.jit(jax.vmap(lambda e: bounces(e, 10, 1e-6)[9])), e)
     yield figure("a lane with ten bounces, us", NAME, 1e6 * lanes / len(e), 5.0)
 
     def last(x):
-        motion = jj.simulate(Ball(*x[:6]), {"z": x[6], "x_rate": x[7]}, ts=[2.52], rtol=1e-8, atol=1e-8, max_transitions=60)
+        motion = jj.simulate(
+            Ball(*x[:6]), {"z": x[6], "x_rate": x[7]}, ts=[2.52], rtol=1e-8, atol=1e-8, max_transitions=60
+        )
         return motion.phases.ts[11] + motion.q[-1, 0]
 
     at = jnp.array([0.7, 9.81, 0.1, 0.3, 0.02, 1.0, 1.0, 0.5])
@@ -77,7 +97,9 @@ def times(quick: bool) -> Figures:
     solve = seconds(jax.jit(jax.vmap(last)), lanes)
     for name, derivative, required in (("forward", jax.jacfwd, 6.0), ("reverse", jax.grad, 8.0)):
         taken = seconds(jax.jit(jax.vmap(derivative(last))), lanes)
-        yield figure(f"gradient by 8 numbers through 12 events, {name}, solves", NAME, taken / solve, required)
+        yield figure(
+            f"gradient by 8 numbers through 12 events, {name}, solves", NAME, taken / solve, required
+        )
 
 
 def fits(quick: bool) -> Figures:
@@ -90,7 +112,12 @@ def fits(quick: bool) -> Figures:
     for name, right in (("bounce", 0.72), ("gravity", 9.81)):
         held = (found[name].low <= right) & (right <= found[name].high)
         off = abs(np.mean(held) - 0.95)
-        yield figure(f"share of intervals that hold `{name}`, off 0.95", NAME, off, 0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5)
+        yield figure(
+            f"share of intervals that hold `{name}`, off 0.95",
+            NAME,
+            off,
+            0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5,
+        )
 
 
 class Bowling(jj.Scene):
@@ -100,7 +127,14 @@ class Bowling(jj.Scene):
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(6.8, 0.108, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                6.8,
+                0.108,
+                position=jnp.stack([q.x, q.y, q.z]),
+                orientation=jj.quaternion_to_matrix(q.attitude),
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -110,7 +144,9 @@ class Bowling(jj.Scene):
 
 
 def slips(quick: bool) -> Figures:
-    """Balls that slide in two directions: how many come to roll, and when slip w0 ends against 2 |w0|/(7 mu g)."""
+    """Balls that slide in two directions: how many come to roll, and when slip w0 ends against 2 |w0|/(7 mu
+    g).
+    """
 
     def slip(along, aside, spin):
         start = {"z": 0.108, "x_rate": along, "y_rate": aside, "attitude_omega_x": spin}
@@ -131,10 +167,14 @@ def slips(quick: bool) -> Figures:
     def right(numbers):
         slip = jnp.stack([numbers[1], 0.7])
         duration = 2 / (7 * numbers[0] * 9.81)  # in |w0|
-        return slip * (jnp.hypot(*slip) * duration * (1 - 0.5 * 2 / 7) + 5 / 7 * (6.0 - jnp.hypot(*slip) * duration))
+        return slip * (
+            jnp.hypot(*slip) * duration * (1 - 0.5 * 2 / 7) + 5 / 7 * (6.0 - jnp.hypot(*slip) * duration)
+        )
 
     numbers = jnp.array([0.12, 8.0])
-    yield figure("x(6 s), y(6 s): error, m", "bowling ball", jnp.max(jnp.abs(end(numbers) - right(numbers))), 1e-10)
+    yield figure(
+        "x(6 s), y(6 s): error, m", "bowling ball", jnp.max(jnp.abs(end(numbers) - right(numbers))), 1e-10
+    )
     for name, derivative in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
         off = jnp.max(jnp.abs(derivative(end)(numbers) - jax.jacfwd(right)(numbers)))
         yield figure(f"d/dmu, d/dv0 of x, y: error, {name}", "bowling ball", off, 1e-8)

@@ -1,4 +1,6 @@
-"""The disc as a free rigid body in space, as engines with contacts or joints hold it, and the way back to yaw, lean, spin and the contact point."""
+"""The disc as a free rigid body in space, as engines with contacts or joints hold it, and the way back to
+yaw, lean, spin and the contact point.
+"""
 
 from dataclasses import dataclass
 
@@ -21,7 +23,9 @@ def rot_z(angle: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Body:
-    """Centre (m), body-to-space rotation, velocity of the centre (m/s) and angular velocity (rad/s), both in space axes; body y is the axle."""
+    """Centre (m), body-to-space rotation, velocity of the centre (m/s) and angular velocity (rad/s), both in
+    space axes; body y is the axle.
+    """
 
     centre: np.ndarray
     rotation: np.ndarray
@@ -30,7 +34,9 @@ class Body:
 
 
 def start(radius: float, minimal) -> Body:
-    """A disc that rolls without slip, the lowest point of the rim at height zero; `minimal`: contact point, yaw, lean, spin, and the rates of these three."""
+    """A disc that rolls without slip, the lowest point of the rim at height zero; `minimal`: contact point,
+    yaw, lean, spin, and the rates of these three.
+    """
     x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate = minimal
     frame = rot_z(yaw) @ rot_x(lean)
     up = radius * frame[:, 2]
@@ -40,7 +46,9 @@ def start(radius: float, minimal) -> Body:
 
 
 def state(radius: float, body: Body, near: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates and speeds of the tilting disc; yaw and spin are known up to whole turns, and taken next to those in `near`."""
+    """Coordinates and speeds of the tilting disc; yaw and spin are known up to whole turns, and taken next to
+    those in `near`.
+    """
     axle = body.rotation[:, 1]
     lean, yaw = np.arcsin(np.clip(axle[2], -1.0, 1.0)), np.arctan2(-axle[0], axle[1])
     frame = rot_z(yaw) @ rot_x(lean)
@@ -51,5 +59,9 @@ def state(radius: float, body: Body, near: dict) -> tuple[np.ndarray, np.ndarray
     lean_rate, spin_rate = along[0], along[1] - yaw_rate * np.sin(lean)
     up_rate = np.cross(np.array([0.0, 0.0, yaw_rate]) + lean_rate * frame[:, 0], radius * frame[:, 2])
     contact, contact_rate = body.centre - radius * frame[:, 2], body.velocity - up_rate
-    yaw, spin = (angle + TURN * np.round((near[name] - angle) / TURN) for name, angle in (("yaw", yaw), ("spin", spin)))
-    return np.array([*contact[:2], yaw, lean, spin]), np.array([*contact_rate[:2], yaw_rate, lean_rate, spin_rate])
+    yaw, spin = (
+        angle + TURN * np.round((near[name] - angle) / TURN) for name, angle in (("yaw", yaw), ("spin", spin))
+    )
+    return np.array([*contact[:2], yaw, lean, spin]), np.array(
+        [*contact_rate[:2], yaw_rate, lean_rate, spin_rate]
+    )

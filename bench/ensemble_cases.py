@@ -1,4 +1,5 @@
-"""Two studies of bicycles at full size, drawn: which measured quantity deserves a better measurement, and from which starts a bicycle falls.
+"""Two studies of bicycles at full size, drawn: which measured quantity deserves a better measurement, and
+from which starts a bicycle falls.
 
     python bench/ensemble_cases.py [--quick] [--only NAME ...] [--json FILE] [--out DIR]
 
@@ -6,8 +7,9 @@
                 weave speed
     rides       1,000,000 rides of 5 s from random leans and speeds: where the bicycle falls
 
-Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures `docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where
-that is given). `--quick`: a hundredth of the samples. Needs the extras `studies` and `plot`.
+Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures
+`docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where that is given). `--quick`: a
+hundredth of the samples. Needs the extras `studies` and `plot`.
 """
 
 import tempfile
@@ -49,23 +51,44 @@ def stability(quick: bool, out: Path) -> Figures:
     weave = in_parts(lambda p: stability_speeds(*linear_matrices(fixed | p)).weave_speed, design.values())
     indices = sobol_indices(weave, design.names)
     speeds = np.nanmean(weave) + np.linspace(-8.0, 8.0, 101) * np.nanstd(weave)  # m/s
-    stable = in_parts(lambda p: jnp.all(jnp.real(eigenvalues(*linear_matrices(fixed | p), speeds)) < 0, axis=1), drawn).mean(axis=0)
-    yield figure("seconds for eigenvalues at 101 speeds and weave speeds of as many samples", BICYCLE, time.perf_counter() - began)
+    stable = in_parts(
+        lambda p: jnp.all(jnp.real(eigenvalues(*linear_matrices(fixed | p), speeds)) < 0, axis=1), drawn
+    ).mean(axis=0)
+    yield figure(
+        "seconds for eigenvalues at 101 speeds and weave speeds of as many samples",
+        BICYCLE,
+        time.perf_counter() - began,
+    )
     yield figure("largest share of samples that is stable at one speed", BICYCLE, float(stable.max()))
     yield figure("deviation of the weave speed, m/s", BICYCLE, float(np.nanstd(weave)))
     order = np.argsort(-indices.total)[:10]
     for k in order[:3]:
-        yield figure(f"total Sobol' index of the weave speed, {indices.names[k]}", BICYCLE, float(indices.total[k]))
-    yield figure("largest half-width of these indices, at 95 %", BICYCLE, float(indices.total_half_width[order[:3]].max()))
+        yield figure(
+            f"total Sobol' index of the weave speed, {indices.names[k]}", BICYCLE, float(indices.total[k])
+        )
+    yield figure(
+        "largest half-width of these indices, at 95 %",
+        BICYCLE,
+        float(indices.total_half_width[order[:3]].max()),
+    )
 
     shape, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(1, 1.25))
     axes[0].fill_between(speeds, stable, color=BLUE, alpha=0.25)
     axes[0].plot(speeds, stable, color=BLUE)
-    axes[0].set(xlabel="speed (m/s)", ylabel="share of samples that is self-stable", ylim=(0, 1.02), xlim=(speeds[0], speeds[-1]))
+    axes[0].set(
+        xlabel="speed (m/s)",
+        ylabel="share of samples that is self-stable",
+        ylim=(0, 1.02),
+        xlim=(speeds[0], speeds[-1]),
+    )
     axes[0].set_title(f"{BICYCLE} bicycle, {samples:,} samples", fontsize=10)
     place = np.arange(len(order))[::-1]
-    axes[1].barh(place, indices.total[order], xerr=indices.total_half_width[order], color=ORANGE, capsize=2, height=0.7)
-    axes[1].set_yticks(place, [f"{PARAMETERS[indices.names[k]]['about']} ({indices.names[k]})" for k in order], fontsize=8)
+    axes[1].barh(
+        place, indices.total[order], xerr=indices.total_half_width[order], color=ORANGE, capsize=2, height=0.7
+    )
+    axes[1].set_yticks(
+        place, [f"{PARAMETERS[indices.names[k]]['about']} ({indices.names[k]})" for k in order], fontsize=8
+    )
     axes[1].set(xlabel="total Sobol' index of the weave speed")
     axes[1].set_title("what deserves a better measurement", fontsize=10)
     for axis in axes:
@@ -92,11 +115,17 @@ def rides(quick: bool, out: Path) -> Figures:
         result = study.run(f"{folder}/rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)
         seconds = time.perf_counter() - began
         arrays = result.to_xarray().load()
-        yield figure("rides per second of wall time, storage and compilation included", BICYCLE, samples / seconds)
+        yield figure(
+            "rides per second of wall time, storage and compilation included", BICYCLE, samples / seconds
+        )
         yield figure("rides that failed, of all", BICYCLE, result.failed.size / samples)
         yield figure("rides that ended in a fall, of all", BICYCLE, float(result.mean("fell")))
 
-    speed, lean, fell = arrays["rear_spin_rate_at_start"].values * radius, arrays["lean_at_start"].values, arrays["fell"].values
+    speed, lean, fell = (
+        arrays["rear_spin_rate_at_start"].values * radius,
+        arrays["lean_at_start"].values,
+        arrays["fell"].values,
+    )
     edges, known = (np.linspace(1.0, 10.0, 181), np.linspace(-0.6, 0.6, 121)), np.isfinite(fell)
     counts, *_ = np.histogram2d(speed[known], lean[known], edges)
     with np.errstate(invalid="ignore"):

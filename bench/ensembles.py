@@ -1,9 +1,11 @@
-"""Studies of many motions: how many per second, what storage and interruption cost, memory, and whether bits depend on how a study is run.
+"""Studies of many motions: how many per second, what storage and interruption cost, memory, and whether bits
+depend on how a study is run.
 
     python bench/ensembles.py [--quick] [--json FILE] [--only NAME ...]
 
-The motions: two seconds of a rolling disc with random lean, yaw, lean and spin rates, some of which fall, at a tolerance of 1e-6; end values, result codes and
-steps are stored. Every measurement runs in a fresh process, and a program is compiled before the clock starts.
+The motions: two seconds of a rolling disc with random lean, yaw, lean and spin rates, some of which fall, at
+a tolerance of 1e-6; end values, result codes and steps are stored. Every measurement runs in a fresh process,
+and a program is compiled before the clock starts.
 
     rate        discs per second, storage included (wall time; and per second of processor time, where other programs share the machine)
     storage     processor time within the writing of chunks, of that of the whole run
@@ -42,19 +44,35 @@ from jourdain_jax.studies.store import Store
 
 MODEL, SPAN, TOLERANCE = "tilting-disc", 2.0, 1e-6
 WIDTH = 8  # lanes of a vector
-OUTPUTS = {"final lean": End("lean", "rad"), "final yaw": End("yaw", "rad"), "fell": Happened("fallen"), "fall time": EventTime("fallen")}
+OUTPUTS = {
+    "final lean": End("lean", "rad"),
+    "final yaw": End("yaw", "rad"),
+    "fell": Happened("fallen"),
+    "fall time": EventTime("fallen"),
+}
 
 
 def run(lanes: int, path, memory=None, **options) -> StudyResult:
     """A study of so many discs with random starts in a folder."""
-    start = {"lean": Uniform(-0.6, 0.6), "yaw_rate": Normal(0.0, 0.5), "lean_rate": Normal(0.0, 0.3), "spin_rate": Uniform(-9.0, 0.0)}
+    start = {
+        "lean": Uniform(-0.6, 0.6),
+        "yaw_rate": Normal(0.0, 0.5),
+        "lean_rate": Normal(0.0, 0.3),
+        "spin_rate": Uniform(-9.0, 0.0),
+    }
     study = jj.Study(jj.build(jj.models.TiltingDisc(), memory=memory), start=start, samples=lanes, seed=1)
-    return study.run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
+    return study.run(
+        path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options
+    )
 
 
 def timed(lanes: int, folder: Path, **options) -> dict:
-    """Seconds of a run after one that compiled its program: by the clock, of the processor, of the processor within writing."""
-    if options.get("processes", 1) == 1 and "memory" not in options:  # a bound counts compilers once more in a process that has compiled
+    """Seconds of a run after one that compiled its program: by the clock, of the processor, of the processor
+    within writing.
+    """
+    if (
+        options.get("processes", 1) == 1 and "memory" not in options
+    ):  # a bound counts compilers once more in a process that has compiled
         run(4096, folder / "warm", **options)
     within, write = [0.0], Store.write
 
@@ -66,7 +84,11 @@ def timed(lanes: int, folder: Path, **options) -> dict:
     Store.write = watched
     clock, processor = time.perf_counter(), time.process_time()
     run(lanes, folder / "timed", **options)
-    found = {"wall": time.perf_counter() - clock, "processor": time.process_time() - processor, "writing": within[0]}
+    found = {
+        "wall": time.perf_counter() - clock,
+        "processor": time.process_time() - processor,
+        "writing": within[0],
+    }
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
@@ -100,9 +122,17 @@ def in_fresh_process(lanes: int, folder: Path, on_one_core: bool = False, **opti
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     cores = os.sched_getaffinity(0)
-    begin = lambda: os.sched_setaffinity(0, {min(cores)} if on_one_core else cores)  # noqa: E731
+    begin = lambda: os.sched_setaffinity(0, {min(cores)} if on_one_core else cores)
     environment = os.environ | ({"JOURDAIN_JAX_THREADS": "1"} if on_one_core else {})
-    done = subprocess.run(call("timed", lanes, folder, **options), cwd=HERE, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin)
+    done = subprocess.run(
+        call("timed", lanes, folder, **options),
+        cwd=HERE,
+        env=environment,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=begin,
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -110,9 +140,16 @@ def rate(lanes: int, folder: Path) -> Figures:
     """Rate and storage."""
     found = min((in_fresh_process(lanes, folder / "rate") for _ in range(3)), key=lambda found: found["wall"])
     cores = len(os.sched_getaffinity(0))
-    yield figure(f"discs per second of wall time, {cores} cores, storage included", MODEL, lanes / found["wall"], least=25_000)
+    yield figure(
+        f"discs per second of wall time, {cores} cores, storage included",
+        MODEL,
+        lanes / found["wall"],
+        least=25_000,
+    )
     yield figure("discs per second of processor time, storage included", MODEL, lanes / found["processor"])
-    yield figure("share of processor time spent on storage", MODEL, found["writing"] / found["processor"], 0.05)
+    yield figure(
+        "share of processor time spent on storage", MODEL, found["writing"] / found["processor"], 0.05
+    )
 
 
 def busy(lanes: int, folder: Path) -> Figures:
@@ -127,7 +164,9 @@ def busy(lanes: int, folder: Path) -> Figures:
             heapq.heapreplace(ends, ends[0] + count)
         there += WIDTH * max(ends)
         plain += len(steps[first : first + block]) * steps[first : first + block].max()
-    yield figure("busy share of lanes, by their steps, ended lanes replaced", MODEL, steps.sum() / there, least=0.9)
+    yield figure(
+        "busy share of lanes, by their steps, ended lanes replaced", MODEL, steps.sum() / there, least=0.9
+    )
     yield figure("busy share of lanes, by their steps, all waiting for the last", MODEL, steps.sum() / plain)
 
 
@@ -137,37 +176,68 @@ def memory(lanes: int, folder: Path) -> Figures:
     yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", MODEL, many - few, 300)
     ts = np.linspace(0.0, SPAN, 201).tolist()
     peak = in_fresh_process(lanes, folder / "memory", keep_every=1, ts=ts, memory="1000MB")["peak"] * 1.048576
-    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", MODEL, peak, 1000)
+    yield figure(
+        "largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'",
+        MODEL,
+        peak,
+        1000,
+    )
 
 
 def processes(lanes: int, folder: Path) -> Figures:
-    """Two processes, each on a core, over one on one core: minutes, since the start and compilation of the two, some eight seconds, are included."""
+    """Two processes, each on a core, over one on one core: minutes, since the start and compilation of the
+    two, some eight seconds, are included.
+    """
     one = in_fresh_process(200 * lanes, folder / "processes", on_one_core=True)["wall"]
     two = in_fresh_process(200 * lanes, folder / "processes", processes=2)["wall"]
     print(f"  one process {one:.1f} s, two {two:.1f} s", flush=True)
-    yield figure("wall time by one process on one core over that by two processes on two", MODEL, one / two, least=1.8)
-    dask.config.set({"distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1}})  # as docs/ensembles.md advises: no early return of memory
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+    yield figure(
+        "wall time by one process on one core over that by two processes on two", MODEL, one / two, least=1.8
+    )
+    dask.config.set(
+        {"distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1}}
+    )  # as docs/ensembles.md advises: no early return of memory
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
         began = time.perf_counter()
         run(200 * lanes, folder / "dask", client=client)
         by_cluster = time.perf_counter() - began
     print(f"  two workers of Dask {by_cluster:.1f} s", flush=True)
-    yield figure("wall time by one process on one core over that by two workers of Dask", MODEL, one / by_cluster, least=1.7)
+    yield figure(
+        "wall time by one process on one core over that by two workers of Dask",
+        MODEL,
+        one / by_cluster,
+        least=1.7,
+    )
 
 
 def bits(lanes: int, folder: Path) -> Figures:
     """Arrays that differ."""
     lanes = min(lanes, 20_000)
     plain = run(lanes, folder / "bits" / "plain")
-    ways = {"chunks of 8192": {"chunk": 8192}, "one chunk": {"chunk": 2048 * -(-lanes // 2048)}, "two processes": {"processes": 2}}
+    ways = {
+        "chunks of 8192": {"chunk": 8192},
+        "one chunk": {"chunk": 2048 * -(-lanes // 2048)},
+        "two processes": {"processes": 2},
+    }
     others = {way: run(lanes, folder / "bits" / way, **options) for way, options in ways.items()}
     run(lanes, folder / "bits" / "in two parts", shard=(2, 2))
     others["the second half first"] = run(lanes, folder / "bits" / "in two parts")
     for way, other in others.items():
         one, two = plain.to_xarray().load(), other.to_xarray().load()
         pairs = [(one[name].values, two[name].values) for name in one.variables]
-        pairs += [(getattr(plain.statistics, name), getattr(other.statistics, name)) for name in ("mean", "covariance", "counts", "extremes")]
-        yield figure(f"arrays that differ: {way}", MODEL, sum(not np.array_equal(*pair, equal_nan=True) for pair in pairs), 0)
+        pairs += [
+            (getattr(plain.statistics, name), getattr(other.statistics, name))
+            for name in ("mean", "covariance", "counts", "extremes")
+        ]
+        yield figure(
+            f"arrays that differ: {way}",
+            MODEL,
+            sum(not np.array_equal(*pair, equal_nan=True) for pair in pairs),
+            0,
+        )
 
 
 def kills(lanes: int, folder: Path) -> Figures:
@@ -186,20 +256,42 @@ def kills(lanes: int, folder: Path) -> Figures:
         process.wait()
     result = logged(lanes, path, log)
     again = len(log.read_bytes()) * result.store.study["block"] / lanes - 1.0
-    yield figure("lanes computed again after 20 kills, of all", MODEL, again, 0.02 if lanes >= 10_000_000 else None)
-    yield figure("lanes missing or repeated after 20 kills", MODEL, len(result) - sum(result.counts.values()), 0)
+    yield figure(
+        "lanes computed again after 20 kills, of all", MODEL, again, 0.02 if lanes >= 10_000_000 else None
+    )
+    yield figure(
+        "lanes missing or repeated after 20 kills", MODEL, len(result) - sum(result.counts.values()), 0
+    )
 
 
 def indices(lanes: int, folder: Path) -> Figures:
     """Ishigami's function; its indices in closed form."""
     a, b = 7.0, 0.1
-    design = Design(dict.fromkeys(("x1", "x2", "x3"), Uniform(-np.pi, np.pi)), sampler="saltelli", samples=5 * 2**14, seed=1)
+    design = Design(
+        dict.fromkeys(("x1", "x2", "x3"), Uniform(-np.pi, np.pi)),
+        sampler="saltelli",
+        samples=5 * 2**14,
+        seed=1,
+    )
     x = design.values()
-    found = sobol_indices(np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"]), design.names)
+    found = sobol_indices(
+        np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"]), design.names
+    )
     one, two, three = 0.5 * (1 + b * np.pi**4 / 5) ** 2, a**2 / 8, b**2 * np.pi**8 * (1 / 18 - 1 / 50)
-    first, total = np.array([one, two, 0.0]) / (one + two + three), np.array([one + three, two, three]) / (one + two + three)
-    errors = [abs(found.first - first) / found.first_half_width, abs(found.total - total) / found.total_half_width]
-    yield figure("largest error of a Sobol' index over its stated limit", "Ishigami's function", float(np.max(errors)), 1.0)
+    first, total = (
+        np.array([one, two, 0.0]) / (one + two + three),
+        np.array([one + three, two, three]) / (one + two + three),
+    )
+    errors = [
+        abs(found.first - first) / found.first_half_width,
+        abs(found.total - total) / found.total_half_width,
+    ]
+    yield figure(
+        "largest error of a Sobol' index over its stated limit",
+        "Ishigami's function",
+        float(np.max(errors)),
+        1.0,
+    )
 
 
 def _in_folder(measure) -> Callable[[bool], Figures]:
@@ -211,4 +303,10 @@ def _in_folder(measure) -> Callable[[bool], Figures]:
 
 
 if __name__ == "__main__":
-    main(__doc__, {measure.__name__: _in_folder(measure) for measure in (rate, busy, memory, processes, bits, kills, indices)})
+    main(
+        __doc__,
+        {
+            measure.__name__: _in_folder(measure)
+            for measure in (rate, busy, memory, processes, bits, kills, indices)
+        },
+    )

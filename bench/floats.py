@@ -7,13 +7,18 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 # Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
-FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
+FLAGS = "--xla_backend_optimization_level=0" + (
+    " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
+)
 TYPES = ("float64", "float32")
 
 
 def environment(dtype: str) -> dict[str, str]:
     """Settings of JAX."""
-    return {"XLA_FLAGS": os.environ.get("XLA_FLAGS", FLAGS), "JAX_ENABLE_X64": "1" if dtype == "float64" else "0"}
+    return {
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", FLAGS),
+        "JAX_ENABLE_X64": "1" if dtype == "float64" else "0",
+    }
 
 
 def prepare(dtype: str) -> None:

@@ -1,13 +1,15 @@
-"""Kernels of NVIDIA GPUs: what they return is that of the CPU's machine code to the last bit, and how many motions a second they make.
+"""Kernels of NVIDIA GPUs: what they return is that of the CPU's machine code to the last bit, and how many
+motions a second they make.
 
     python bench/gpu.py [--quick] [--json FILE] [--only NAME ...]
 
-Needs a checkout, llvmlite and, for figures, JAX with CUDA. Without a GPU it runs the checks that need none (threads of a GPU one after the other on the CPU;
-text for NVIDIA's driver; `ptxas`, where it is installed) and writes those rows alone. After ten minutes, with `--quick` four, the process ends.
+Needs a checkout, llvmlite and, for figures, JAX with CUDA. Without a GPU it runs the checks that need none
+(threads of a GPU one after the other on the CPU; text for NVIDIA's driver; `ptxas`, where it is installed)
+and writes those rows alone. After ten minutes, with `--quick` four, the process ends.
 
-Bits: programs run on the CPU; every call of machine code in them is made once more on the GPU, with the same numbers. Figures: starts are made on the device,
-one time is saved, and the end, its code and the counts come back; the best of three calls. `--json` writes a list of {"figure", "model", "value", "required",
-"met"}.
+Bits: programs run on the CPU; every call of machine code in them is made once more on the GPU, with the same
+numbers. Figures: starts are made on the device, one time is saved, and the end, its code and the counts come
+back; the best of three calls. `--json` writes a list of {"figure", "model", "value", "required", "met"}.
 """
 
 import re
@@ -41,7 +43,9 @@ def disc(spin_rate, t1=2.0, scene=DISC, **options):
 
 
 def bicycle(lean_rate, scene=BICYCLE):
-    return jj.simulate(scene, {**BICYCLE.upright(4.6), "lean_rate": lean_rate}, ts=[2.0], rtol=1e-6, atol=1e-6, work=False)
+    return jj.simulate(
+        scene, {**BICYCLE.upright(4.6), "lean_rate": lean_rate}, ts=[2.0], rtol=1e-6, atol=1e-6, work=False
+    )
 
 
 def ends(run: Callable) -> Callable:
@@ -67,7 +71,12 @@ DISCS = {
 BICYCLES = {
     "values": (1.8e6, ends(bicycle)),
     "tangent": (1.5e5, lambda x: jax.jacfwd(lambda m: bicycle(x, BICYCLE.replace(mB=m)).q_end)(BICYCLE.mB)),
-    "gradient": (5e4, lambda x: jax.grad(lambda new: size(bicycle(x, BICYCLE.replace(**new))))({name: getattr(BICYCLE, name) for name in NUMBERS})),
+    "gradient": (
+        5e4,
+        lambda x: jax.grad(lambda new: size(bicycle(x, BICYCLE.replace(**new))))(
+            {name: getattr(BICYCLE, name) for name in NUMBERS}
+        ),
+    ),
 }
 KINDS = {"disc": DISCS, "bicycle": BICYCLES}
 SPREAD = {"disc": (-6.0, -3.0), "bicycle": (0.1, 0.5)}
@@ -83,7 +92,13 @@ def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
 
         def call(*values):
             found = jax.ffi.ffi_call(handler(lanes, threads), results)(*operands.side_by_side(*values))
-            jax.debug.callback(lambda given, found: calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)])), values, found)
+            jax.debug.callback(
+                lambda given, found: calls.append(
+                    (how, [*map(np.asarray, given)], [*map(np.asarray, found)])
+                ),
+                values,
+                found,
+            )
             return found
 
         return mlir.lower_fun(call)(ctx, *values)
@@ -106,9 +121,14 @@ def bits(of: str, name: str, quick: bool) -> Figures:
     for how, given, expected in calls_of(KINDS[of][name][1], lanes, of):
         found = jax.jit(lambda *x, how=how: value_kernels._call_p.bind(*x, **how))(*given)
         for ours, theirs in zip(found, expected, strict=True):
-            differ += int(np.sum(np.asarray(ours).view(np.int64) != theirs.view(np.int64)) - np.sum(np.isnan(ours) & np.isnan(theirs)))
+            differ += int(
+                np.sum(np.asarray(ours).view(np.int64) != theirs.view(np.int64))
+                - np.sum(np.isnan(ours) & np.isnan(theirs))
+            )
             count += theirs.size
-    yield figure(f"numbers of {count} that differ in a bit, {name}", f"{lanes} lanes of a {of}", max(differ, 0), 0)
+    yield figure(
+        f"numbers of {count} that differ in a bit, {name}", f"{lanes} lanes of a {of}", max(differ, 0), 0
+    )
 
 
 def speed(of: str, name: str, lanes: int, quick: bool) -> Figures:
@@ -119,33 +139,58 @@ def speed(of: str, name: str, lanes: int, quick: bool) -> Figures:
     run = jax.jit(lambda: jax.vmap(function)(low + (high - low) * jnp.arange(lanes) / lanes))
     _, first = seconds_of(run, time.perf_counter)
     seconds = min(seconds_of(run, time.perf_counter)[1] for _ in range(3))
-    yield figure(f"motions a second, {name}", model, lanes / seconds, least=required if lanes >= 1e5 else None)
+    yield figure(
+        f"motions a second, {name}", model, lanes / seconds, least=required if lanes >= 1e5 else None
+    )
     yield figure(f"first call, s, {name}", model, first)
 
 
-def alone(of: str, name: str, x: float, required: float | None, first_within: float | None, quick: bool) -> Figures:
+def alone(
+    of: str, name: str, x: float, required: float | None, first_within: float | None, quick: bool
+) -> Figures:
     """One motion."""
     run = partial(jax.jit(KINDS[of][name][1]), x)
-    yield figure(f"compiled and run, s, {name}", f"one {of}", seconds_of(run, time.perf_counter)[1], first_within)
-    yield figure(f"time, ms, {name}", f"one {of}", 1e3 * min(seconds_of(run, time.perf_counter)[1] for _ in range(20)), required)
+    yield figure(
+        f"compiled and run, s, {name}", f"one {of}", seconds_of(run, time.perf_counter)[1], first_within
+    )
+    yield figure(
+        f"time, ms, {name}",
+        f"one {of}",
+        1e3 * min(seconds_of(run, time.perf_counter)[1] for _ in range(20)),
+        required,
+    )
 
 
 def study(lanes: int, least: float | None, quick: bool) -> Figures:
     """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is stored."""
     of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": Uniform(*SPREAD["disc"])}, samples=lanes)
     with tempfile.TemporaryDirectory() as folder:
-        run = partial(of.run, t1=2.0, rtol=1e-6, atol=1e-6, save="statistics", keep_every=1000, progress=False)
+        run = partial(
+            of.run, t1=2.0, rtol=1e-6, atol=1e-6, save="statistics", keep_every=1000, progress=False
+        )
         seconds = min(seconds_of(partial(run, f"{folder}/{k}"), time.perf_counter)[1] for k in range(2))
-    yield figure("motions a second, statistics of a study, one lane in a thousand stored", f"{lanes:g} discs", lanes / seconds, least=least)
+    yield figure(
+        "motions a second, statistics of a study, one lane in a thousand stored",
+        f"{lanes:g} discs",
+        lanes / seconds,
+        least=least,
+    )
 
 
 def failures(quick: bool) -> Figures:
-    """A lane that is no number leaves the others alone; what does not fit into memory is an error, after which all goes on."""
+    """A lane that is no number leaves the others alone; what does not fit into memory is an error, after
+    which all goes on.
+    """
     x = jnp.linspace(-6.0, -3.0, 1000)
     run = jax.jit(jax.vmap(DISCS["values"][1]))
     good, bad = run(x), run(x.at[500].set(jnp.nan))
     others = jnp.arange(1000) != 500
-    yield figure("lanes beside a failed one that changed", "1000 discs", int(jnp.sum(jnp.any(good[0] != bad[0], axis=1) & others)), 0)
+    yield figure(
+        "lanes beside a failed one that changed",
+        "1000 discs",
+        int(jnp.sum(jnp.any(good[0] != bad[0], axis=1) & others)),
+        0,
+    )
     yield figure("code of a lane that is no number", "disc", int(bad[2][500]), least=1)
     try:
         jax.block_until_ready(jax.jit(lambda: jax.vmap(DISCS["values"][1])(jnp.zeros(2_000_000_000)))())
@@ -176,19 +221,35 @@ def twin(of: str, name: str, quick: bool) -> Figures:
     """What needs no GPU: threads of one on the CPU, and text for its driver."""
     import gpu_twin
 
-    run = lambda: [np.asarray(x) for x in jax.tree.leaves(jax.jit(jax.vmap(KINDS[of][name][1]))(jnp.linspace(*SPREAD[of], 7)))]  # noqa: E731
+    run = lambda: [
+        np.asarray(x)
+        for x in jax.tree.leaves(jax.jit(jax.vmap(KINDS[of][name][1]))(jnp.linspace(*SPREAD[of], 7)))
+    ]
     expected = run()
     for order in ("in order", "reversed", "at once"):
         with gpu_twin.in_place_of_a_gpu(order, memory=2**20) as texts:
             differ = sum(not np.array_equal(*x) for x in zip(run(), expected, strict=True))
-        yield figure(f"arrays that differ, threads of a GPU on the CPU {order}, {name}", f"7 lanes of a {of}", differ, 0)
+        yield figure(
+            f"arrays that differ, threads of a GPU on the CPU {order}, {name}",
+            f"7 lanes of a {of}",
+            differ,
+            0,
+        )
     text = max(texts, key=len)
     for architecture in ("sm_75", "sm_80", "sm_90", "sm_100"):
         ptx = nvidia.text_for(text, architecture)
-        yield figure(f"undefined functions for {architecture}, {name}", of, len(re.findall(r"^\.extern", ptx, re.M)), 0)
+        yield figure(
+            f"undefined functions for {architecture}, {name}", of, len(re.findall(r"^\.extern", ptx, re.M)), 0
+        )
         if architecture == "sm_90" and (said := gpu_twin.said_by_assembler(ptx)):
-            for what, pattern in {"registers": r"Used (\d+) r", "bytes of stack": r"(\d+) bytes stack", "bytes spilled": r"(\d+) bytes spill st"}.items():
-                yield figure(f"{what} for sm_90, {name}", of, max(map(int, re.findall(pattern, said)), default=0))
+            for what, pattern in {
+                "registers": r"Used (\d+) r",
+                "bytes of stack": r"(\d+) bytes stack",
+                "bytes spilled": r"(\d+) bytes spill st",
+            }.items():
+                yield figure(
+                    f"{what} for sm_90, {name}", of, max(map(int, re.findall(pattern, said)), default=0)
+                )
 
 
 def device(quick: bool) -> Figures:
@@ -201,7 +262,9 @@ def without_gpu() -> tuple[dict, list[str]]:
     if reason := host.reason_against() or nvidia.reason_against_text():
         print(f"no text for GPUs is made: {reason}")
         return {}, []
-    parts = {f"on the CPU, {of}, {name}": partial(twin, of, name) for of, kinds in KINDS.items() for name in kinds}
+    parts = {
+        f"on the CPU, {of}, {name}": partial(twin, of, name) for of, kinds in KINDS.items() for name in kinds
+    }
     parts["on the CPU, study"] = partial(study, 20_000, None)  # the calls alone: the figure is one of the CPU
     return parts, [*(f"on the CPU, disc, {name}" for name in ("values", "gradient")), "on the CPU, study"]
 
@@ -209,14 +272,25 @@ def without_gpu() -> tuple[dict, list[str]]:
 def with_gpu() -> tuple[dict, list[str]]:
     """Parts, and those of `--quick`."""
     parts = {"device": device}
-    parts |= {f"bits, {of}, {name}": partial(bits, of, name) for of in KINDS for name in ("values", "tangent", "gradient")}
-    parts |= {"one disc, values": partial(alone, "disc", "values", -4.0, 1.0, 3.0), "one disc, gradient": partial(alone, "disc", "gradient", -4.0, 3.0, None)}
+    parts |= {
+        f"bits, {of}, {name}": partial(bits, of, name)
+        for of in KINDS
+        for name in ("values", "tangent", "gradient")
+    }
+    parts |= {
+        "one disc, values": partial(alone, "disc", "values", -4.0, 1.0, 3.0),
+        "one disc, gradient": partial(alone, "disc", "gradient", -4.0, 3.0, None),
+    }
     parts |= {f"speed, disc, {lanes:g}": partial(speed, "disc", "values", lanes) for lanes in (10**6, 10**7)}
     parts |= {f"speed, disc, {name}": partial(speed, "disc", name, 10**6) for name in list(DISCS)[1:]}
-    parts |= {"failures": failures, "interrupted": interrupted} | {f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES}
+    parts |= {"failures": failures, "interrupted": interrupted} | {
+        f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES
+    }
     parts["study"] = partial(study, 10**7, 2e7)
     parts["one bicycle, values"] = partial(alone, "bicycle", "values", 0.3, None, 8.0)
-    return parts, [name for name in parts if name not in ("bits, bicycle, tangent", "bits, bicycle, gradient")]
+    return parts, [
+        name for name in parts if name not in ("bits, bicycle, tangent", "bits, bicycle, gradient")
+    ]
 
 
 if __name__ == "__main__":

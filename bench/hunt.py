@@ -1,11 +1,13 @@
-"""A search for motions that are wrong and do not say so: generated scenes and uses against references that share nothing with the engine.
+"""A search for motions that are wrong and do not say so: generated scenes and uses against references that
+share nothing with the engine.
 
     python bench/hunt.py [--quick] [--json FILE] [--cases N] [--seed S] [--jobs N]
     python bench/hunt.py --only NAME [--seed N]             # one family; with a seed, that case alone
 
-Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`; refused with an error of the engine's own; wrong
-in silence; crashed with a raw error. Wrong and crashed ones are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value",
-"required", "met"}; `--records FILE` writes every case. float32 runs in processes of its own: JAX chooses once.
+Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`;
+refused with an error of the engine's own; wrong in silence; crashed with a raw error. Wrong and crashed ones
+are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value", "required",
+"met"}; `--records FILE` writes every case. float32 runs in processes of its own: JAX chooses once.
 """
 
 import argparse
@@ -52,7 +54,9 @@ def planned(arguments) -> list[tuple[str, str, list[int]]]:
 
 
 def run_all(work, jobs: int, report) -> list[dict]:
-    """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after every family."""
+    """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after
+    every family.
+    """
     from hunting.record import CRASHED
 
     found: list[dict] = []
@@ -65,7 +69,15 @@ def run_all(work, jobs: int, report) -> list[dict]:
                     new = done.result()
                 except Exception as error:  # the process died, or the family itself is broken
                     said = f"{type(error).__name__}: {error}"
-                    lost = {"family": name, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": said, "seconds": 0.0}
+                    lost = {
+                        "family": name,
+                        "dtype": dtype,
+                        "asked": "",
+                        "outcome": CRASHED,
+                        "error": None,
+                        "said": said,
+                        "seconds": 0.0,
+                    }
                     new = [lost | {"seed": seed} for seed in seeds]
                 found += _said(waiting[done], new)
                 report(found, new)
@@ -73,19 +85,32 @@ def run_all(work, jobs: int, report) -> list[dict]:
 
 
 def _said(work, records: list[dict]) -> list[dict]:
-    counts = {outcome: sum(r["outcome"] == outcome for r in records) for outcome in dict.fromkeys(r["outcome"] for r in records)}
-    print(f"{work[0]} ({work[1]}): {counts}, {sum(r['seconds'] for r in records):.0f} s", file=sys.stderr, flush=True)
+    counts = {
+        outcome: sum(r["outcome"] == outcome for r in records)
+        for outcome in dict.fromkeys(r["outcome"] for r in records)
+    }
+    print(
+        f"{work[0]} ({work[1]}): {counts}, {sum(r['seconds'] for r in records):.0f} s",
+        file=sys.stderr,
+        flush=True,
+    )
     return records
 
 
 def main() -> int:
     """Search, print, write; exit code 1 where something is wrong or crashed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} cases, float64")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--records", type=Path, help="file for the records of all cases")
-    parser.add_argument("--cases", type=int, help=f"about how many cases all families together have (default: {CASES})")
-    parser.add_argument("--seed", type=int, help="first seed (default 0); with --only and without --cases, the only one")
+    parser.add_argument(
+        "--cases", type=int, help=f"about how many cases all families together have (default: {CASES})"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="first seed (default 0); with --only and without --cases, the only one"
+    )
     parser.add_argument("--only", nargs="*", metavar="NAME", help="only these families")
     parser.add_argument("--dtype", choices=TYPES, default="float64", help="of a case that is run alone")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

@@ -2,13 +2,16 @@
 
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
-Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models,
-unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more),
-windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other:
+Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable
+(100 first guesses of a bicycle below its weave speed), chaotic (100 of a double pendulum, by growing spans
+and by multiple shooting), coverage, three (coverage of three models, unknown starts and sigmas, white noise
+and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that
+tells more), windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in
+`notebooks/data`), logs (what halves of these runs say of each other:
 numbers of the notebook on them).
-Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats.
-Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with
+fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall
+time of a fresh process.
 """
 
 import sys
@@ -27,7 +30,15 @@ sys.path.insert(0, str(HERE.parent / "tests"))  # small scenes that tests use, t
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
-from jourdain_jax.identification import Fit, Sensor, filtered_log_likelihood, huber, log_density, planned_information, student_t
+from jourdain_jax.identification import (
+    Fit,
+    Sensor,
+    filtered_log_likelihood,
+    huber,
+    log_density,
+    planned_information,
+    student_t,
+)
 from jourdain_jax.models import ChaplyginSleigh, DoublePendulumAngles, TiltingDisc
 
 START = {"lean": 0.3, "spin_rate": -3.0}
@@ -38,21 +49,30 @@ GUESS, FREE, UNKNOWN = TiltingDisc(radius=0.55, gravity=10.8), ("radius", "gravi
 
 
 def share_of_intervals(name: str, model: str, share: float, repeats: int) -> dict:
-    """How often 95 % intervals held the truth, %. Required: 93 to 96.8 % of 1,000 repeats, and of others what is as likely, 0.3 % on either side."""
+    """How often 95 % intervals held the truth, %. Required: 93 to 96.8 % of 1,000 repeats, and of others what
+    is as likely, 0.3 % on either side.
+    """
     low, high = (100 * float(x) / repeats for x in binom.ppf([0.003, 0.997], repeats, 0.95))
     return figure(name, model, share, high, least=low)
 
 
 def shares(fits: Fit, truth: dict) -> dict[str, float]:
     """How often the interval of each quantity holds its true value, %."""
-    return {name: 100 * float(np.mean((fits[name].low < truth[name]) & (truth[name] < fits[name].high))) for name in fits.labels}
+    return {
+        name: 100 * float(np.mean((fits[name].low < truth[name]) & (truth[name] < fits[name].high)))
+        for name in fits.labels
+    }
 
 
-# The disc: radius and gravity, and two unknown initial values. ------------------------------------------------------------
+# The disc: radius and gravity, and two unknown initial values. ----------------------------------------------
 
 
-def disc_data(seed: int, outlier: float = 0.0, repeats: tuple[int, ...] = (), delay: float = 0.0, **more) -> jj.Experiment:
-    """Lean and place of a rolling disc at 61 times over 2 s; the lean is seen with this delay, which is to be estimated where it is not zero."""
+def disc_data(
+    seed: int, outlier: float = 0.0, repeats: tuple[int, ...] = (), delay: float = 0.0, **more
+) -> jj.Experiment:
+    """Lean and place of a rolling disc at 61 times over 2 s; the lean is seen with this delay, which is to be
+    estimated where it is not zero.
+    """
     ts = jnp.linspace(0.1 if delay else 0.0, 2.0, 61)
     motion, noise = jj.simulate(TiltingDisc(), START, t0=0.0, ts=ts), np.random.default_rng(seed)
     exact = {name: np.asarray(motion[name]) for name in SIGMA}
@@ -62,7 +82,13 @@ def disc_data(seed: int, outlier: float = 0.0, repeats: tuple[int, ...] = (), de
         sensors = {"lean": Sensor(delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)))}
     values = {name: exact[name] + s * noise.normal(size=(*repeats, len(ts))) for name, s in SIGMA.items()}
     values["lean"][..., 17] += outlier * SIGMA["lean"]
-    options = {"start": {"lean": 0.31, "spin_rate": -2.9}, "unknown_start": UNKNOWN, "sensors": sensors, "t0": 0.0, "sigma": SIGMA} | more
+    options = {
+        "start": {"lean": 0.31, "spin_rate": -2.9},
+        "unknown_start": UNKNOWN,
+        "sensors": sensors,
+        "t0": 0.0,
+        "sigma": SIGMA,
+    } | more
     return jj.Experiment(ts, values, **options)
 
 
@@ -76,7 +102,9 @@ def disc(quick: bool) -> Figures:
 
     def residual(theta):
         scene = TiltingDisc(radius=theta[0], gravity=theta[1])
-        motion = jj.simulate(scene, {"lean": theta[2], "spin_rate": theta[3]}, ts=data.ts, events=False, work=False)
+        motion = jj.simulate(
+            scene, {"lean": theta[2], "spin_rate": theta[3]}, ts=data.ts, events=False, work=False
+        )
         return jnp.concatenate([(motion[name] - data.values[name]) / SIGMA[name] for name in SIGMA])
 
     first = np.array([0.55, 10.8, 0.31, -2.9])
@@ -101,7 +129,12 @@ def outlier(quick: bool) -> Figures:
     for name, loss in (("least squares", None), ("Huber", huber()), ("Student-t", student_t())):
         clean, spoilt = (jj.fit(GUESS, disc_data(0, outlier=far), FREE, loss=loss) for far in (0.0, 60.0))
         moved = float(np.max(np.abs(clean.values - spoilt.values) / clean.standard_errors))
-        yield figure(f"an outlier of 60 sigmas moves estimates by, standard errors, {name}", DISC, moved, None if loss is None else 0.3)
+        yield figure(
+            f"an outlier of 60 sigmas moves estimates by, standard errors, {name}",
+            DISC,
+            moved,
+            None if loss is None else 0.3,
+        )
 
 
 def bound(quick: bool) -> Figures:
@@ -109,8 +142,14 @@ def bound(quick: bool) -> Figures:
     ts, fits = np.linspace(0.0, 10.0, 101), []
     for seed in range(10):
         x = 0.3 * np.cos(np.sqrt(2.5) * ts) + 0.01 * np.random.default_rng(seed).normal(size=101)
-        fits.append(jj.fit(Oscillator(), jj.Experiment(ts, {"x": x}, 0.01, start={"x": 0.3}), ("damping", "stiffness")))
-    yield figure("steps to a damping of zero, the most of ten", "oscillator", max(int(x.steps) for x in fits), 14)
+        fits.append(
+            jj.fit(
+                Oscillator(), jj.Experiment(ts, {"x": x}, 0.01, start={"x": 0.3}), ("damping", "stiffness")
+            )
+        )
+    yield figure(
+        "steps to a damping of zero, the most of ten", "oscillator", max(int(x.steps) for x in fits), 14
+    )
     limited = sum(bool(x.converged) and bool(np.isfinite(x["damping"].high)) for x in fits)
     yield figure("such fits converged, with a limit, of ten", "oscillator", limited, least=10)
 
@@ -121,8 +160,14 @@ def starts(quick: bool) -> Figures:
     truth = jj.fit(TiltingDisc(), data, FREE)
     one = least_processor_time({"one": lambda: jj.fit(GUESS, data, FREE)}, 7)["one"]
     for factors in np.exp(generator.uniform(-np.log(5), np.log(5), (30, 4))):
-        begin = {"lean": jnp.asarray(0.3 * min(factors[2], 1.4 / 0.3)), "spin_rate": jnp.asarray(-3.0 * factors[3])}
-        run, scene = disc_data(0, start=begin), TiltingDisc(radius=0.5 * factors[0], gravity=9.81 * factors[1])
+        begin = {
+            "lean": jnp.asarray(0.3 * min(factors[2], 1.4 / 0.3)),
+            "spin_rate": jnp.asarray(-3.0 * factors[3]),
+        }
+        run, scene = (
+            disc_data(0, start=begin),
+            TiltingDisc(radius=0.5 * factors[0], gravity=9.81 * factors[1]),
+        )
         found, seconds = seconds_of(lambda scene=scene, run=run: jj.fit(scene, run, FREE))
         same = bool(found.chi_square < truth.chi_square + 0.1)
         best, false, spent = best + same, false + (not same and not found.warning), spent + seconds / 30
@@ -131,25 +176,52 @@ def starts(quick: bool) -> Figures:
     ranges = {"radius": jj.bounds(0.1, 2.5), "gravity": jj.bounds(2.0, 49.0)}
     batch = partial(jj.fit, TiltingDisc(radius=0.9, gravity=20.0), run, ranges, guesses=30)
     together, found = least_processor_time({"batch": batch}, 3)["batch"], batch()
-    yield figure("first guesses within bounds of a factor of 5, in one batch, that lead to the minimum, of 30", DISC, int(found.agreeing))
-    yield figure("this batch ends above the minimum", DISC, float(found.chi_square > truth.chi_square + 0.1), 0)
+    yield figure(
+        "first guesses within bounds of a factor of 5, in one batch, that lead to the minimum, of 30",
+        DISC,
+        int(found.agreeing),
+    )
+    yield figure(
+        "this batch ends above the minimum", DISC, float(found.chi_square > truth.chi_square + 0.1), 0
+    )
     yield figure("time of this batch over that of 30 fits from nearby", DISC, together / 30 / one, 5)
-    yield figure("first guesses within a factor of 5 from which the minimum is found, of 30", DISC, best, least=27)
+    yield figure(
+        "first guesses within a factor of 5 from which the minimum is found, of 30", DISC, best, least=27
+    )
     yield figure("of the others, without a warning", DISC, false, 0)
     yield figure("time from such a guess over that from one within a tenth", DISC, spent / one, 5)
 
 
 def coverage(quick: bool) -> Figures:
-    """How often the 95 % interval holds the truth: disc with unknown starts; with sigmas that are not known; and with the delay of a sensor."""
+    """How often the 95 % interval holds the truth: disc with unknown starts; with sigmas that are not known;
+    and with the delay of a sensor.
+    """
     repeats = 50 if quick else 500
-    truth = {"radius": 0.5, "gravity": 9.81, "run 0: lean": 0.3, "run 0: spin_rate": -3.0, "lean.delay": DISC_DELAY}
-    for name, sigma, delay in (("sigmas known", SIGMA, 0.0), ("sigmas estimated", None, 0.0), ("delay of a sensor", SIGMA, DISC_DELAY)):
-        fits = jj.fit_batch(TiltingDisc(radius=0.51, gravity=10.0), disc_data(1, repeats=(repeats,), delay=delay, sigma=sigma), FREE)
+    truth = {
+        "radius": 0.5,
+        "gravity": 9.81,
+        "run 0: lean": 0.3,
+        "run 0: spin_rate": -3.0,
+        "lean.delay": DISC_DELAY,
+    }
+    for name, sigma, delay in (
+        ("sigmas known", SIGMA, 0.0),
+        ("sigmas estimated", None, 0.0),
+        ("delay of a sensor", SIGMA, DISC_DELAY),
+    ):
+        fits = jj.fit_batch(
+            TiltingDisc(radius=0.51, gravity=10.0),
+            disc_data(1, repeats=(repeats,), delay=delay, sigma=sigma),
+            FREE,
+        )
         for label, share in shares(fits, truth).items():
-            yield share_of_intervals(f"intervals that hold the truth, %, {label}, {name}", DISC, share, repeats)
+            yield share_of_intervals(
+                f"intervals that hold the truth, %, {label}, {name}", DISC, share, repeats
+            )
 
 
-# of each model: the scene, first guesses of its free parameters, two starts (all of whose values are not known), sigma of each channel, and times
+# of each model: the scene, first guesses of its free parameters, two starts (all of whose values are not
+# known), sigma of each channel, and times
 THREE = {
     DISC: (
         TiltingDisc(), {"radius": 0.51, "gravity": 10.0}, (START, {"lean": 0.2, "spin_rate": -4.0}), {"lean": 0.005, "x": 0.005}, np.linspace(0.0, 2.0, 101),
@@ -174,7 +246,9 @@ def noisy(generator: np.random.Generator, shape: tuple[int, ...], rho: float) ->
 
 
 def three(quick: bool) -> Figures:
-    """How often the 95 % interval holds the truth: three models, two runs each with unknown starts, two channels with unknown sigmas; and noise of 0.8."""
+    """How often the 95 % interval holds the truth: three models, two runs each with unknown starts, two
+    channels with unknown sigmas; and noise of 0.8.
+    """
     repeats = 50 if quick else 1000
     for model, (scene, guesses, starts, sigma, ts) in THREE.items():
         for kind, rho in (("white noise", 0.0), ("AR(1) noise of 0.8", 0.8)):
@@ -182,30 +256,48 @@ def three(quick: bool) -> Figures:
             truth = {name: float(getattr(scene, name)) for name in guesses}
             for i, start in enumerate(starts):
                 motion = jj.simulate(scene, start, ts=ts)
-                values = {name: np.asarray(motion[name]) + s * noisy(generator, (repeats, len(ts)), rho) for name, s in sigma.items()}
+                values = {
+                    name: np.asarray(motion[name]) + s * noisy(generator, (repeats, len(ts)), rho)
+                    for name, s in sigma.items()
+                }
                 begin = {name: x + 0.01 for name, x in start.items()}
-                runs.append(jj.Experiment(ts, values, None, start=begin, unknown_start=tuple(start), correlation_time=None if rho else 0.0))
+                runs.append(
+                    jj.Experiment(
+                        ts,
+                        values,
+                        None,
+                        start=begin,
+                        unknown_start=tuple(start),
+                        correlation_time=None if rho else 0.0,
+                    )
+                )
                 truth |= {f"run {i}: {name}": x for name, x in start.items()}
             fits, seconds = seconds_of(partial(jj.fit_batch, scene.replace(**guesses), runs, tuple(guesses)))
-            inside, what = shares(fits, truth), f"intervals that hold the truth, %, unknown starts and sigmas, {kind}"
+            inside, what = (
+                shares(fits, truth),
+                f"intervals that hold the truth, %, unknown starts and sigmas, {kind}",
+            )
             yield figure(f"processor time of {repeats} fits, s, {kind}", model, seconds)
             for which, share in (("fewest", min(inside.values())), ("most", max(inside.values()))):
                 yield share_of_intervals(f"{what}, {which}", model, share, repeats)
             yield figure(f"fits converged, %, {kind}", model, 100 * float(np.mean(fits.converged)), least=99)
 
 
-# Sampling, disturbances, and a plan. -------------------------------------------------------------------------------------
+# Sampling, disturbances, and a plan. ------------------------------------------------------------------------
 
 
 def nuts(quick: bool) -> Figures:
-    """NUTS of BlackJAX on the four unknowns of the disc, whitened by the fit: effective draws for a second, one chain and four side by side."""
+    """NUTS of BlackJAX on the four unknowns of the disc, whitened by the fit: effective draws for a second,
+    one chain and four side by side.
+    """
     import blackjax
 
     data, draws, model = disc_data(0), 500 if quick else 2000, "tilting-disc, 4 unknowns"
     fit = jj.fit(GUESS, data, FREE)
     density = log_density(GUESS, data, FREE).whitened(fit)
     count = density.initial.size
-    # on a normal density of variance one nearly all trees have 3 steps of 1.1: chains side by side hardly wait for each other
+    # on a normal density of variance one nearly all trees have 3 steps of 1.1: chains side by side hardly
+    # wait for each other
     sampler = blackjax.nuts(density, step_size=1.1, inverse_mass_matrix=jnp.ones(count))
 
     def chain(key, z):
@@ -216,12 +308,19 @@ def nuts(quick: bool) -> Figures:
         return jax.lax.scan(step, sampler.init(z), jax.random.split(key, draws))[1]
 
     keys, starts = jax.random.split(jax.random.key(1), 4), jax.random.normal(jax.random.key(2), (4, count))
-    runs = {"one": partial(jax.jit(chain), keys[0], starts[0]), "four": partial(jax.jit(jax.vmap(chain)), keys, starts)}
+    runs = {
+        "one": partial(jax.jit(chain), keys[0], starts[0]),
+        "four": partial(jax.jit(jax.vmap(chain)), keys, starts),
+    }
     times = least_processor_time(runs, 5)
     one, (positions, diverged, steps) = runs["one"](), map(np.asarray, runs["four"]())
-    effective, together = (float(np.min(blackjax.diagnostics.effective_sample_size(x))) for x in (one[0][None], positions))
+    effective, together = (
+        float(np.min(blackjax.diagnostics.effective_sample_size(x))) for x in (one[0][None], positions)
+    )
     spread = np.asarray(density.constrain(jnp.asarray(positions))).reshape(-1, count).std(axis=0)
-    yield figure("NUTS: effective draws/s, the fewest of all unknowns", model, effective / times["one"], least=200)
+    yield figure(
+        "NUTS: effective draws/s, the fewest of all unknowns", model, effective / times["one"], least=200
+    )
     yield figure("NUTS: such, of four chains side by side", model, together / times["four"])
     yield figure("NUTS: divergences of 4 chains", model, int(diverged.sum() + np.asarray(one[1]).sum()), 0)
     yield figure("NUTS: 4 chains over one", model, times["four"] / times["one"], 1.5)
@@ -231,34 +330,71 @@ def nuts(quick: bool) -> Figures:
 
 
 def disturbed(quick: bool) -> Figures:
-    """How often the 95 % interval of a sleigh's offset holds the truth, whose rates are disturbed: by an extended Kalman filter, and by least squares."""
-    truth, start, ts, kicks = ChaplyginSleigh(offset=0.25), {"x_rate": -0.6, "heading_rate": 0.9}, np.linspace(0.0, 4.0, 41), 5
-    sigma, begin, repeats = {"x": 0.01, "y": 0.01, "heading": 0.01}, jj.start(truth, **start), 50 if quick else 200
+    """How often the 95 % interval of a sleigh's offset holds the truth, whose rates are disturbed: by an
+    extended Kalman filter, and by least squares.
+    """
+    truth, start, ts, kicks = (
+        ChaplyginSleigh(offset=0.25),
+        {"x_rate": -0.6, "heading_rate": 0.9},
+        np.linspace(0.0, 4.0, 41),
+        5,
+    )
+    sigma, begin, repeats = (
+        {"x": 0.01, "y": 0.01, "heading": 0.01},
+        jj.start(truth, **start),
+        50 if quick else 200,
+    )
     noise = dict.fromkeys(("x_rate", "y_rate"), 2e-4)  # (m/s)^2 / s; the rate of the heading follows
     places, h = [truth.speed_names.entries.index(n) for n in noise], (ts[1] - ts[0]) / kicks
 
     def one(key):
         def kick(carry, key):
             t, q, u = carry
-            motion = jj.simulate(truth, jj.consistent(truth, t, q, u, held=tuple(noise)), t0=t, ts=(t + h)[None], work=False, events=False)
-            u = motion.u[-1].at[jnp.array(places)].add(jnp.sqrt(2e-4 * h) * jax.random.normal(key, (len(places),)))
+            motion = jj.simulate(
+                truth,
+                jj.consistent(truth, t, q, u, held=tuple(noise)),
+                t0=t,
+                ts=(t + h)[None],
+                work=False,
+                events=False,
+            )
+            u = (
+                motion.u[-1]
+                .at[jnp.array(places)]
+                .add(jnp.sqrt(2e-4 * h) * jax.random.normal(key, (len(places),)))
+            )
             return (t + h, motion.q[-1], u), motion.q[-1]
 
-        _, q = jax.lax.scan(kick, (jnp.zeros(()), begin.q, begin.u), jax.random.split(key, kicks * (len(ts) - 1)))
+        _, q = jax.lax.scan(
+            kick, (jnp.zeros(()), begin.q, begin.u), jax.random.split(key, kicks * (len(ts) - 1))
+        )
         return jnp.concatenate([begin.q[None], q[kicks - 1 :: kicks]])
 
     q = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(3), repeats)))
     draw = np.random.default_rng(11)
-    values = {n: q[..., truth.coordinate_names.entries.index(n)] + s * draw.normal(size=q.shape[:2]) for n, s in sigma.items()}
-    plain = jj.fit_batch(truth.replace(offset=0.26), jj.Experiment(ts, values, sigma, start=start), ("offset",))
+    values = {
+        n: q[..., truth.coordinate_names.entries.index(n)] + s * draw.normal(size=q.shape[:2])
+        for n, s in sigma.items()
+    }
+    plain = jj.fit_batch(
+        truth.replace(offset=0.26), jj.Experiment(ts, values, sigma, start=start), ("offset",)
+    )
     grid = np.linspace(0.19, 0.31, 13)
 
     def along(offset, values):
         run = jj.Experiment(ts, values, sigma, start=start)
-        return filtered_log_likelihood(truth.replace(offset=offset), run, process_noise=noise, rtol=1e-7, atol=1e-7)
+        return filtered_log_likelihood(
+            truth.replace(offset=offset), run, process_noise=noise, rtol=1e-7, atol=1e-7
+        )
 
-    logs = np.asarray(jax.jit(lambda v: jax.lax.map(lambda one: jax.vmap(lambda x: along(x, one))(jnp.asarray(grid)), v))(values))
-    middle = np.clip(np.argmax(logs, axis=1), 2, len(grid) - 3)  # a quartic through the five points about the largest
+    logs = np.asarray(
+        jax.jit(lambda v: jax.lax.map(lambda one: jax.vmap(lambda x: along(x, one))(jnp.asarray(grid)), v))(
+            values
+        )
+    )
+    middle = np.clip(
+        np.argmax(logs, axis=1), 2, len(grid) - 3
+    )  # a quartic through the five points about the largest
     inside, best = [], []
     for of, k in zip(logs, middle, strict=True):
         some = slice(k - 2, k + 3)
@@ -267,20 +403,43 @@ def disturbed(quick: bool) -> Figures:
         best.append(float(fine[np.argmax(curve)]))
         inside.append(2 * (np.max(curve) - of[np.argmin(np.abs(grid - 0.25))]) < 3.841)
     model, what, spreads = "chaplygin-sleigh, disturbed", "intervals that hold the truth, %, offset,", []
-    for way, found in (("extended Kalman filter", best), ("least squares", np.asarray(plain["offset"].value))):
+    for way, found in (
+        ("extended Kalman filter", best),
+        ("least squares", np.asarray(plain["offset"].value)),
+    ):
         yield figure(f"mean estimate of an offset of 0.25 m, {way}", model, np.mean(found))
         spreads.append(np.std(found))
-    yield share_of_intervals(f"{what} extended Kalman filter", model, 100 * float(np.mean(inside)), len(inside))
+    yield share_of_intervals(
+        f"{what} extended Kalman filter", model, 100 * float(np.mean(inside)), len(inside)
+    )
     yield figure(f"{what} least squares", model, shares(plain, {"offset": 0.25})["offset"])
-    yield figure("standard deviation of the estimates by the filter over that by least squares", model, spreads[0] / spreads[1])
+    yield figure(
+        "standard deviation of the estimates by the filter over that by least squares",
+        model,
+        spreads[0] / spreads[1],
+    )
 
 
 def design(quick: bool) -> Figures:
-    """The start of a disc from which its radius and gravity are told best, within bounds, by the slope of log det; checked by repeats that are simulated."""
-    disc, ts, low, high, repeats = TiltingDisc(), jnp.linspace(0.0, 2.0, 41), jnp.array([0.1, -6.0]), jnp.array([0.5, -2.0]), 500
+    """The start of a disc from which its radius and gravity are told best, within bounds, by the slope of log
+    det; checked by repeats that are simulated.
+    """
+    disc, ts, low, high, repeats = (
+        TiltingDisc(),
+        jnp.linspace(0.0, 2.0, 41),
+        jnp.array([0.1, -6.0]),
+        jnp.array([0.5, -2.0]),
+        500,
+    )
 
     def planned(z):
-        plan = jj.Experiment(ts, dict.fromkeys(SIGMA, ts), SIGMA, start=dict(zip(UNKNOWN, z, strict=True)), unknown_start=UNKNOWN)
+        plan = jj.Experiment(
+            ts,
+            dict.fromkeys(SIGMA, ts),
+            SIGMA,
+            start=dict(zip(UNKNOWN, z, strict=True)),
+            unknown_start=UNKNOWN,
+        )
         return planned_information(disc, plan, FREE)
 
     slope, first = jax.jit(jax.jacfwd(lambda z: planned(z).log_det(FREE))), jnp.array([0.3, -3.0])
@@ -291,16 +450,39 @@ def design(quick: bool) -> Figures:
     before, after = (planned(x).standard_errors for x in (first, z))
     start = {name: float(x) for name, x in zip(UNKNOWN, z, strict=True)}
     motion, noise = jj.simulate(disc, start, ts=ts), np.random.default_rng(12)
-    values = {name: np.asarray(motion[name]) + s * noise.normal(size=(repeats, len(ts))) for name, s in SIGMA.items()}
+    values = {
+        name: np.asarray(motion[name]) + s * noise.normal(size=(repeats, len(ts)))
+        for name, s in SIGMA.items()
+    }
     fits = jj.fit_batch(disc, jj.Experiment(ts, values, SIGMA, start=start, unknown_start=UNKNOWN), FREE)
     for name in FREE:
         spread = float(np.std(np.asarray(fits[name].value)[np.asarray(fits.converged)], ddof=1))
-        yield figure(f"planned standard error of {name} at the best start over that at the first", DISC, float(after[name] / before[name]))
-        width = max(0.1, 2 / np.sqrt(2 * repeats))  # a standard deviation over n repeats is known to 1/sqrt(2 n)
+        yield figure(
+            f"planned standard error of {name} at the best start over that at the first",
+            DISC,
+            float(after[name] / before[name]),
+        )
+        width = max(
+            0.1, 2 / np.sqrt(2 * repeats)
+        )  # a standard deviation over n repeats is known to 1/sqrt(2 n)
         what = f"standard deviation of {name} over simulated repeats, over the planned one"
         yield figure(what, DISC, spread / float(after[name]), 1 + width, least=1 - width)
 
 
-PARTS = (disc, outlier, bound, starts, unstable, chaotic, coverage, three, nuts, disturbed, design, windows, logs)
+PARTS = (
+    disc,
+    outlier,
+    bound,
+    starts,
+    unstable,
+    chaotic,
+    coverage,
+    three,
+    nuts,
+    disturbed,
+    design,
+    windows,
+    logs,
+)
 if __name__ == "__main__":
     main(__doc__, PARTS, quick=[part.__name__ for part in PARTS[:-2]])

@@ -1,4 +1,6 @@
-"""Identification of a steer-by-wire bicycle from 57 runs, whose data are in `notebooks/data`: parts `windows` and `logs` of `identification.py`."""
+"""Identification of a steer-by-wire bicycle from 57 runs, whose data are in `notebooks/data`: parts `windows`
+and `logs` of `identification.py`.
+"""
 
 import contextlib
 import csv
@@ -20,7 +22,9 @@ MODEL = "steer-by-wire bicycle"
 
 
 class SteerByWire(WhippleBicycle):
-    """A Whipple bicycle whose steer motor gives `gain` times what is commanded, with damping of steer and lean."""
+    """A Whipple bicycle whose steer motor gives `gain` times what is commanded, with damping of steer and
+    lean.
+    """
 
     steer_damping: object = jj.parameter(0.3, non_negative=True)
     lean_damping: object = jj.parameter(1.0, non_negative=True)
@@ -32,7 +36,8 @@ class SteerByWire(WhippleBicycle):
         return jj.gravity(motion, self.g), jj.generalized_force(motion, lean_rate=lean, steer_rate=steer)
 
 
-# nominal parameters of the authors' models; the front frame turns the motor with it, whose inertia is a first guess
+# nominal parameters of the authors' models; the front frame turns the motor with it, whose inertia is a first
+# guess
 NOMINAL = {
     "w": 1.036, "c": 0.0803, "lam": float(np.deg2rad(18.2)), "rR": 0.3498, "mR": 10.12, "IRxx": 0.1040, "IRyy": 0.1641, "xB": 0.462, "zB": -0.698, "mB": 20.9,
     "IBxx": 1.64, "IByy": 2.0, "IBzz": 1.94, "IBxz": 0.654, "xH": 0.944, "zH": -0.595, "mH": 0.6, "IHxx": 0.1, "IHyy": 0.1, "IHzz": 0.1, "IHxz": -0.00044,
@@ -49,15 +54,39 @@ def experiments() -> list[jj.Experiment]:
     """The 57 windows: lean rate and steer rate, the command as input, and an unknown start each."""
     with gzip.open(NOTEBOOKS / "data" / "steer_by_wire" / "windows.csv.gz", "rt") as file:
         rows = list(csv.DictReader(file))
-    runs, ts, scale = [], 0.01 * np.arange(100), {"lean": 0.1, "lean_rate": 0.3, "steer": 0.1, "steer_rate": 0.5}
+    runs, ts, scale = (
+        [],
+        0.01 * np.arange(100),
+        {"lean": 0.1, "lean_rate": 0.3, "steer": 0.1, "steer_rate": 0.5},
+    )
     for k in range(0, len(rows), 100):
-        column = {name: np.array([float(row[name]) for row in rows[k : k + 100]]) for name in rows[0] if name != "log"}
-        first = {"lean": "lean_angle", "lean_rate": "lean_rate", "steer": "fork_angle", "steer_rate": "fork_rate"}
-        start = {name: column[source][0] for name, source in first.items()} | {"rear_spin_rate": column["speed"].mean() / NOMINAL["rR"]}
+        column = {
+            name: np.array([float(row[name]) for row in rows[k : k + 100]])
+            for name in rows[0]
+            if name != "log"
+        }
+        first = {
+            "lean": "lean_angle",
+            "lean_rate": "lean_rate",
+            "steer": "fork_angle",
+            "steer_rate": "fork_rate",
+        }
+        start = {name: column[source][0] for name, source in first.items()} | {
+            "rear_spin_rate": column["speed"].mean() / NOMINAL["rR"]
+        }
         values = {"lean_rate": column["lean_rate"], "steer_rate": column["fork_rate"]}
         unknown = {name: unbounded(s) for name, s in scale.items()}
         torque = jj.Sampled(ts, column["command_fork"])
-        runs.append(jj.Experiment(ts, values, {"lean_rate": 0.03, "steer_rate": 0.1}, start=start, unknown_start=unknown, inputs={"steer_torque": torque}))
+        runs.append(
+            jj.Experiment(
+                ts,
+                values,
+                {"lean_rate": 0.03, "steer_rate": 0.1},
+                start=start,
+                unknown_start=unknown,
+                inputs={"steer_torque": torque},
+            )
+        )
     return runs
 
 
@@ -67,7 +96,9 @@ def fitted(runs: list[jj.Experiment], **options) -> Fit:
 
 
 def time_of_a_step(count: int) -> float:
-    """Processor time of a warm fit of the first runs for each step that it tries, s; fits of other runs try other numbers of steps."""
+    """Processor time of a warm fit of the first runs for each step that it tries, s; fits of other runs try
+    other numbers of steps.
+    """
     runs = experiments()[:count]
     for _ in range(2):  # the first one compiles
         found, seconds = seconds_of(lambda: fitted(runs, max_iterations=20))
@@ -80,9 +111,20 @@ def told() -> dict[str, float]:
     found, cold = seconds_of(lambda: fitted(runs), time.perf_counter)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     again, warm = seconds_of(lambda: fitted(runs), time.perf_counter)
-    print("\n".join(line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()))
+    print(
+        "\n".join(
+            line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()
+        )
+    )
     ratio = time_of_a_step(32) / time_of_a_step(8)
-    return {"cold": cold + 3.0, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": float(again.converged), "ratio": ratio}
+    return {
+        "cold": cold + 3.0,
+        "warm": warm,
+        "memory": memory,
+        "steps": int(found.steps),
+        "converged": float(again.converged),
+        "ratio": ratio,
+    }
 
 
 def windows(quick: bool) -> Figures:
@@ -97,22 +139,36 @@ def windows(quick: bool) -> Figures:
 
 
 def logs(quick: bool) -> Figures:
-    """Odd and even windows, each half by itself, as the notebook on them has it: how far apart, how well each predicts the other, whether bodies can be."""
+    """Odd and even windows, each half by itself, as the notebook on them has it: how far apart, how well each
+    predicts the other, whether bodies can be.
+    """
     mpl.use("agg")
     with contextlib.chdir(NOTEBOOKS):
         begin = time.process_time()
         told = runpy.run_path("06_steer_by_wire.py")
     halves, rms, out = told["halves"].values(), told["rms"], told["out"].values()
-    yield figure("lean-rate rms on held-out windows, rad/s", MODEL, max(rms(left["lean_rate"]) for left in out), 0.027)
-    yield figure("steer-rate rms on held-out windows, rad/s", MODEL, max(rms(left["steer_rate"]) for left in out))
+    yield figure(
+        "lean-rate rms on held-out windows, rad/s", MODEL, max(rms(left["lean_rate"]) for left in out), 0.027
+    )
+    yield figure(
+        "steer-rate rms on held-out windows, rad/s", MODEL, max(rms(left["steer_rate"]) for left in out)
+    )
     yield figure("lean-rate rms by the authors' numbers, rad/s", MODEL, rms(told["plain"]["lean_rate"]))
-    yield figure("bodies that cannot be, of both halves", MODEL, sum(len(half.impossible) for half in halves), 0)
-    yield figure("halves differ by, standard errors (from how runs differ)", MODEL, max(told["apart"].values()), 3)
+    yield figure(
+        "bodies that cannot be, of both halves", MODEL, sum(len(half.impossible) for half in halves), 0
+    )
+    yield figure(
+        "halves differ by, standard errors (from how runs differ)", MODEL, max(told["apart"].values()), 3
+    )
     for rate in ("lean", "steer"):
         correlation = max(told["neighbours"](left[f"{rate}_rate"]) for left in out)
         yield figure(f"correlation of neighbouring residuals of {rate} rate", MODEL, correlation)
     yield figure("halves converged, of two", MODEL, sum(bool(half.converged) for half in halves), least=2)
     yield figure("steps, the most of both", MODEL, max(int(half.steps) for half in halves), 50)
-    yield figure("frequency of weave from 3 m/s on, off that of damped exponentials, rad/s", MODEL, told["from_3"][:, 0].max())
+    yield figure(
+        "frequency of weave from 3 m/s on, off that of damped exponentials, rad/s",
+        MODEL,
+        told["from_3"][:, 0].max(),
+    )
     yield figure("the same by the authors' numbers, the least", MODEL, told["from_3"][:, 1].min())
     yield figure("processor time of the notebook, s", MODEL, time.process_time() - begin)

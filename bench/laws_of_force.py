@@ -1,4 +1,6 @@
-"""Scenes whose forces are functions beyond sine and cosine: tyres by the Magic Formula, friction by tanh, contacts by Hertz and by any exponent."""
+"""Scenes whose forces are functions beyond sine and cosine: tyres by the Magic Formula, friction by tanh,
+contacts by Hertz and by any exponent.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,14 +10,23 @@ import jourdain_jax as jj
 
 
 class Car(jj.Scene):
-    """A single-track car that slides; each axle's force is D sin(C atan(x - E (x - atan x))), x = B times the slip angle."""
+    """A single-track car that slides; each axle's force is D sin(C atan(x - E (x - atan x))), x = B times the
+    slip angle.
+    """
 
     mass: float = jj.parameter(1200.0)
     steer: float = jj.parameter(0.05)
     coordinates = jj.coordinates("x y heading")
 
     def bodies(self, t, q):
-        return {"car": jj.RigidBody.box(self.mass, (3.6, 1.5, 1.0), position=jnp.stack([q.x, q.y, 0 * q.x]), orientation=jj.rot_z(q.heading))}
+        return {
+            "car": jj.RigidBody.box(
+                self.mass,
+                (3.6, 1.5, 1.0),
+                position=jnp.stack([q.x, q.y, 0 * q.x]),
+                orientation=jj.rot_z(q.heading),
+            )
+        }
 
     def loads(self, motion):
         u, c, s = motion.u, jnp.cos(motion.q.heading), jnp.sin(motion.q.heading)
@@ -27,7 +38,11 @@ class Car(jj.Scene):
 
         front, rear = axle(1.2, self.steer), axle(-1.4, 0.0)
         total = front + rear
-        return (jj.generalized_force(motion, x_rate=-s * total, y_rate=c * total, heading_rate=1.2 * front - 1.4 * rear),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=-s * total, y_rate=c * total, heading_rate=1.2 * front - 1.4 * rear
+            ),
+        )
 
 
 class Blocks(jj.Scene):
@@ -38,13 +53,20 @@ class Blocks(jj.Scene):
     coordinates = jj.coordinates("x y")
 
     def bodies(self, t, q):
-        return {name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x])) for name, x in (("first", q.x), ("second", q.y))}
+        return {
+            name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x]))
+            for name, x in (("first", q.x), ("second", q.y))
+        }
 
     def loads(self, motion):
         q, u, k = motion.q, motion.u, self.stiffness
-        rough = lambda v: -self.friction * 9.81 * jnp.tanh(v / 0.05)  # noqa: E731
+        rough = lambda v: -self.friction * 9.81 * jnp.tanh(v / 0.05)
         spring = k * (q.y - q.x)
-        return (jj.generalized_force(motion, x_rate=rough(u.x_rate) - k * q.x + spring, y_rate=rough(u.y_rate) - spring),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=rough(u.x_rate) - k * q.x + spring, y_rate=rough(u.y_rate) - spring
+            ),
+        )
 
 
 class Beads(jj.Scene):
@@ -56,21 +78,32 @@ class Beads(jj.Scene):
     coordinates = jj.coordinates("x y z")
 
     def bodies(self, t, q):
-        return {name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x])) for name, x in zip("abc", (q.x, q.y, q.z), strict=True)}
+        return {
+            name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x]))
+            for name, x in zip("abc", (q.x, q.y, q.z), strict=True)
+        }
 
     def loads(self, motion):
         q, exponent = motion.q, 1.5 if self.by_hertz else self.exponent
         push = [self.stiffness * jnp.maximum(d, 0.0) ** exponent for d in (-q.x, q.x - q.y, q.y - q.z, q.z)]
-        return (jj.generalized_force(motion, x_rate=push[0] - push[1], y_rate=push[1] - push[2], z_rate=push[2] - push[3]),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=push[0] - push[1], y_rate=push[1] - push[2], z_rate=push[2] - push[3]
+            ),
+        )
 
 
 def cases(lanes: int) -> dict[str, tuple[jj.Scene, dict[str, np.ndarray], float]]:
     """Name -> scene, spread starts and span."""
     random = np.random.default_rng(0)
-    normal = lambda size: size * random.normal(size=lanes)  # noqa: E731
+    normal = lambda size: size * random.normal(size=lanes)
     shoved = {"x_rate": 1 + random.random(lanes), "y": 0.01 * random.random(lanes)}
     return {
-        "car with tyres": (Car(), {"x_rate": 15 + 5 * random.random(lanes), "y_rate": normal(0.5), "heading_rate": normal(0.3)}, 3.0),
+        "car with tyres": (
+            Car(),
+            {"x_rate": 15 + 5 * random.random(lanes), "y_rate": normal(0.5), "heading_rate": normal(0.3)},
+            3.0,
+        ),
         "blocks with friction": (Blocks(), {"x": normal(1.0), "y": normal(1.0), "x_rate": normal(1.0)}, 3.0),
         "beads, Hertz": (Beads(), shoved, 1.0),
         "beads, an exponent that is a parameter": (Beads(by_hertz=False), shoved, 1.0),

@@ -1,10 +1,13 @@
-"""Long runs of nonholonomic scenes: energy and integrals against time, for each structure-preserving solver and for Tsit5 and Dopri8 at equal cost.
+"""Long runs of nonholonomic scenes: energy and integrals against time, for each structure-preserving solver
+and for Tsit5 and Dopri8 at equal cost.
 
     python bench/long_runs.py [--quick] [--json FILE] [--out bench/results]
 
-Every structure-preserving method takes the same number of steps of one length. Tsit5 and Dopri8 get the tightest tolerance (of 1e-3, ..., 1e-13) with
-which they need no more processor time than the implicit midpoint rule. Writes a list of {"figure", "model", "value", "required", "met"} and a table
-(`long_runs.md`), and draws `long_runs.png`: the largest error so far against time. `--quick`: 2,000 steps and fewer methods, under two minutes.
+Every structure-preserving method takes the same number of steps of one length. Tsit5 and Dopri8 get the
+tightest tolerance (of 1e-3, ..., 1e-13) with which they need no more processor time than the implicit
+midpoint rule. Writes a list of {"figure", "model", "value", "required", "met"} and a table (`long_runs.md`),
+and draws `long_runs.png`: the largest error so far against time. `--quick`: 2,000 steps and fewer methods,
+under two minutes.
 """
 
 from collections.abc import Callable, Iterator
@@ -46,7 +49,9 @@ class Problem:
 
 PROBLEMS = (
     Problem("contact oscillator", ContactOscillator(), 0.2, "driver"),
-    Problem("its gauge twin", GaugeTwin(), 0.2, "driver", DLA, ()),  # for the others it is the contact oscillator
+    Problem(
+        "its gauge twin", GaugeTwin(), 0.2, "driver", DLA, ()
+    ),  # for the others it is the contact oscillator
     Problem("transmission", Transmission(), 0.2, "driver"),
     Problem("Chaplygin sleigh", jj.models.ChaplyginSleigh(), 0.1, "heading and slide"),
     Problem("chaotic oscillator", ChaoticOscillator(), 0.2, None),
@@ -60,7 +65,9 @@ QUICK = (
 
 @dataclass(frozen=True)
 class Run:
-    """Errors of one run against time, of the energy (relative) and of the integral (absolute), with the largest over all, the first and the last tenth."""
+    """Errors of one run against time, of the energy (relative) and of the integral (absolute), with the
+    largest over all, the first and the last tenth.
+    """
 
     method: str
     how: str  # step or tolerance
@@ -117,7 +124,9 @@ def outcome(problem: Problem, method: str, how: str, call: Callable) -> Run:
 
 
 def _integral_of(motion: jj.Trajectory, name: str) -> np.ndarray:
-    """The integral against time; that of the sleigh in a form that has no jump where its turn rate has died away to round-off of either sign."""
+    """The integral against time; that of the sleigh in a form that has no jump where its turn rate has died
+    away to round-off of either sign.
+    """
     if not isinstance(motion.scene, jj.models.ChaplyginSleigh):
         return np.asarray(motion.invariants()[name])
     sleigh, heading = motion.scene, np.asarray(motion["heading"])
@@ -133,27 +142,42 @@ def runs(problem: Problem, steps: int) -> Iterator[Run]:
 
     def with_tolerance(solver, ts, tolerance):
         tolerance = jnp.asarray(tolerance)
-        return jj.simulate(scene, start, ts=ts, rtol=tolerance, atol=tolerance, solver=solver, max_steps=100 * steps)
+        return jj.simulate(
+            scene, start, ts=ts, rtol=tolerance, atol=tolerance, solver=solver, max_steps=100 * steps
+        )
 
     ts = jnp.linspace(0.0, span, min(SAVED, steps // 20) + 1)
     for name in problem.methods:
-        call = partial(jj.simulate, scene, start, ts=ts, solver=METHODS[name](step=problem.step), max_steps=2 * steps)
+        call = partial(
+            jj.simulate, scene, start, ts=ts, solver=METHODS[name](step=problem.step), max_steps=2 * steps
+        )
         found = outcome(problem, name, f"h = {problem.step:g} s", call)
         allowed = allowed or found.seconds / 20  # of the implicit midpoint rule, which comes first
         yield found
     for name in problem.explicit:
         # one saved time only: the steps between saved times are to be the method's own
         tolerance = tolerance_for(partial(with_tolerance, EXPLICIT[name], jnp.array([span / 20])), allowed)
-        yield outcome(problem, name, f"{tolerance:.0e}", partial(with_tolerance, EXPLICIT[name], ts, tolerance))
+        yield outcome(
+            problem, name, f"{tolerance:.0e}", partial(with_tolerance, EXPLICIT[name], ts, tolerance)
+        )
 
 
 def table(found: dict[Problem, list[Run]]) -> str:
     """The table of the documentation, in Markdown."""
-    lines = ["| scene | solver | h or tolerance | s | energy, relative | integral |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| scene | solver | h or tolerance | s | energy, relative | integral |",
+        "|---|---|---|---|---|---|",
+    ]
     for problem, each in found.items():
         for run in each:
-            shown = ["{:.0e} ({:.0e}, {:.0e})".format(*run.extremes(of)) if of in run.errors else "" for of in ("energy", "integral")]
-            lines.append(f"| {problem.name} | {run.method} | {run.how} | {run.seconds:.2g} | {shown[0]}{run.ended} | {shown[1]} |")
+            shown = [
+                "{:.0e} ({:.0e}, {:.0e})".format(*run.extremes(of)) if of in run.errors else ""
+                for of in ("energy", "integral")
+            ]
+            lines.append(
+                f"| {problem.name} | {run.method} | {run.how} | {run.seconds:.2g} | {shown[0]}{run.ended} |"
+                f" {shown[1]} |"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -161,9 +185,20 @@ def draw(found: dict[Problem, list[Run]], path: Path) -> None:
     """Largest error so far against time: a row per problem, energy and integral side by side."""
     import matplotlib.pyplot as plt
 
-    colours = dict(zip((*METHODS, *EXPLICIT), ("#0072b2", "#d55e00", "#e69f00", "#009e73", "#999999", "#000000"), strict=True))
-    looks = {name: {"color": colour, "ls": "--" if name in EXPLICIT else "-", "lw": 1.6} for name, colour in colours.items()}
-    figure, axes = plt.subplots(len(found), 2, figsize=(10, 2.5 * len(found) + 0.7), squeeze=False, sharex="all")
+    colours = dict(
+        zip(
+            (*METHODS, *EXPLICIT),
+            ("#0072b2", "#d55e00", "#e69f00", "#009e73", "#999999", "#000000"),
+            strict=True,
+        )
+    )
+    looks = {
+        name: {"color": colour, "ls": "--" if name in EXPLICIT else "-", "lw": 1.6}
+        for name, colour in colours.items()
+    }
+    figure, axes = plt.subplots(
+        len(found), 2, figsize=(10, 2.5 * len(found) + 0.7), squeeze=False, sharex="all"
+    )
     for (problem, each), pair in zip(found.items(), axes, strict=True):
         for axis, of in zip(pair, ("energy", "integral"), strict=True):
             for run in each:
@@ -171,7 +206,11 @@ def draw(found: dict[Problem, list[Run]], path: Path) -> None:
                     worst = np.maximum(np.maximum.accumulate(run.errors[of][1:]), 1e-17)
                     axis.loglog(run.motion.ts[1:], worst, **looks[run.method])
             axis.grid(alpha=0.3)
-            axis.set(xlabel="t (s)", ylim=(1e-17, 10), ylabel="error" if of == "integral" else f"{problem.name}\nrelative error")
+            axis.set(
+                xlabel="t (s)",
+                ylim=(1e-17, 10),
+                ylabel="error" if of == "integral" else f"{problem.name}\nrelative error",
+            )
             axis.set_title(of if of == "energy" else f"integral: {problem.integral}", fontsize=10)
             axis.tick_params(labelbottom=True)
         if problem.integral is None:

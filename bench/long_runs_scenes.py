@@ -1,7 +1,9 @@
-"""Scenes for long runs: nonholonomic oscillators with integrals that are known exactly. Unit masses, stiffnesses and frequencies throughout.
+"""Scenes for long runs: nonholonomic oscillators with integrals that are known exactly. Unit masses,
+stiffnesses and frequencies throughout.
 
-Sources: R. McLachlan and M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283 (contact oscillator, chaotic oscillator); K. Modin and O. Verdier, What makes
-nonholonomic integrators work?, Numer. Math. 145 (2020) 405, arXiv 1707.04514 (the twin, the transmission: its numbers here are our own choice).
+Sources: R. McLachlan and M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283 (contact oscillator, chaotic
+oscillator); K. Modin and O. Verdier, What makes nonholonomic integrators work?, Numer. Math. 145 (2020) 405,
+arXiv 1707.04514 (the twin, the transmission: its numbers here are our own choice).
 """
 
 import jax.numpy as jnp
@@ -21,7 +23,8 @@ class Point(jj.Scene):
 class ContactOscillator(Point):
     """A unit particle with the row `xdot + y zdot = 0` and V = (x^2 + y^2 + z^2 + strength x^2 z^2)/2.
 
-    y feels neither the row nor the coupling: it swings by itself, and (y^2 + ydot^2)/2 is an integral for every strength.
+    y feels neither the row nor the coupling: it swings by itself, and (y^2 + ydot^2)/2 is an integral for
+    every strength.
     """
 
     strength: object = jj.parameter(0.3, about="eps, of the coupling of x and z")
@@ -49,16 +52,32 @@ class GaugeTwin(ContactOscillator):
 
 
 class ChaoticOscillator(jj.Scene):
-    """n = 3 contact oscillators on one row `xdot + sum y_i zdot_i = 0`, V = (|q|^2 + z1^2 z2^2 + sum y_i^2 z_i^2)/2; the start is our choice."""
+    """n = 3 contact oscillators on one row `xdot + sum y_i zdot_i = 0`, V = (|q|^2 + z1^2 z2^2 + sum y_i^2
+    z_i^2)/2; the start is our choice.
+    """
 
     coordinates = jj.coordinates("x y1 y2 y3 z1 z2 z3")
     privileged = ("y1_rate", "y2_rate", "y3_rate", "z1_rate", "z2_rate", "z3_rate")
-    example = {"x": 1.0, "y1": 0.6, "y2": 0.4, "y3": 0.2, "z1": 1.0, "z2": 1.0, "z3": 1.0, "y1_rate": 0.8, "z2_rate": 0.3}
+    example = {
+        "x": 1.0,
+        "y1": 0.6,
+        "y2": 0.4,
+        "y3": 0.2,
+        "z1": 1.0,
+        "z2": 1.0,
+        "z3": 1.0,
+        "y1_rate": 0.8,
+        "z2_rate": 0.3,
+    }
     example_span = 10.0
 
     def bodies(self, t, q):
         a = q.array
-        return {"first": jj.Particle(1.0, a[:3]), "second": jj.Particle(1.0, a[3:6]), "third": jj.Particle(1.0, jnp.stack([a[6], 0.0 * a[6], 0.0 * a[6]]))}
+        return {
+            "first": jj.Particle(1.0, a[:3]),
+            "second": jj.Particle(1.0, a[3:6]),
+            "third": jj.Particle(1.0, jnp.stack([a[6], 0.0 * a[6], 0.0 * a[6]])),
+        }
 
     def potential(self, pose):
         q = pose.q.array
@@ -71,10 +90,12 @@ class ChaoticOscillator(jj.Scene):
 
 
 class Transmission(Point):
-    """A pendulum y that drives a continuously variable transmission `xdot + f(y) zdot = 0` between two oscillators x, z.
+    """A pendulum y that drives a continuously variable transmission `xdot + f(y) zdot = 0` between two
+    oscillators x, z.
 
-    V = (x^2 + z^2)/2 + 1 - cos y - asymmetry sin(2y)/2, f = y + bend y^2. The energies of the pendulum and of the oscillators are both integrals.
-    With asymmetry or bend no reflection of y helps an integrator that is only symmetric in time.
+    V = (x^2 + z^2)/2 + 1 - cos y - asymmetry sin(2y)/2, f = y + bend y^2. The energies of the pendulum and of
+    the oscillators are both integrals. With asymmetry or bend no reflection of y helps an integrator that is
+    only symmetric in time.
     """
 
     asymmetry: object = jj.parameter(0.2)

@@ -1,9 +1,11 @@
-"""Every figure about lowered equations, in one run on one core: operations, time per evaluation, whole motions, gradients, growth.
+"""Every figure about lowered equations, in one run on one core: operations, time per evaluation, whole
+motions, gradients, growth.
 
     taskset -c 0 python bench/lowering.py [--quick] [--json FILE] [--only NAME ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}. float64, warm unless said; ratios come from
-one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff, flat arrays).
+one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff,
+flat arrays).
 """
 
 import os
@@ -12,7 +14,11 @@ from collections.abc import Callable
 from functools import partial
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
-os.environ["JOURDAIN_JAX_CACHE"] = "0"  # all is found and compiled here, and what is found beyond the budget of operations is kept for nobody
+os.environ[
+    "JOURDAIN_JAX_CACHE"
+] = (  # all is found and compiled here, and what is found beyond the budget of operations is kept for nobody
+    "0"
+)
 
 import diffrax
 import equinox as eqx
@@ -31,25 +37,37 @@ BY_HAND_LANES, DENSE_LANES = 4096, 1024
 COMPILED = {"forward": 6, "reverse": 10}  # s
 
 
-def seconds_per_evaluation(rates: Callable, state, lanes: int, evaluations: int = 20, repeats: int = 60) -> float:
-    """Time per evaluation of `rates(state)` of a whole batch and per lane, inside a compiled loop, as a solver calls it: fastest of some repeats, s.
+def seconds_per_evaluation(
+    rates: Callable, state, lanes: int, evaluations: int = 20, repeats: int = 60
+) -> float:
+    """Time per evaluation of `rates(state)` of a whole batch and per lane, inside a compiled loop, as a
+    solver calls it: fastest of some repeats, s.
 
-    The loop takes explicit Euler steps, so short that the states stay where they start; one multiplication and addition per state are part of the time.
+    The loop takes explicit Euler steps, so short that the states stay where they start; one multiplication
+    and addition per state are part of the time.
     """
 
     @jax.jit
     def loop(state):
-        return jax.lax.fori_loop(0, evaluations, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
+        return jax.lax.fori_loop(
+            0, evaluations, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state
+        )
 
     return fastest(lambda: jax.block_until_ready(loop(state)), repeats) / (lanes * evaluations)
 
 
 def states(name: str, lanes: int):
-    """A scene, its lowered program, and admissible states with privileged speeds, one array of lanes per scalar."""
+    """A scene, its lowered program, and admissible states with privileged speeds, one array of lanes per
+    scalar.
+    """
     scene = jj.models.MODELS[name]()
     program = jj.lower(scene)
     _, q, u = jj.sample_states(scene, lanes)
-    return scene, program, (tuple(map(jnp.asarray, q.T)), tuple(jnp.asarray(u[:, k]) for k in program.independent))
+    return (
+        scene,
+        program,
+        (tuple(map(jnp.asarray, q.T)), tuple(jnp.asarray(u[:, k]) for k in program.independent)),
+    )
 
 
 def operation_ratios(quick: bool) -> Figures:
@@ -57,30 +75,45 @@ def operation_ratios(quick: bool) -> Figures:
     for name in HAND_DERIVED:
         value = jj.lower(jj.models.MODELS[name]()).operations / operations(name)
         yield figure("operations, lowered / by hand", name, value, 1.5)
-    yield figure("operations", "whipple-bicycle", jj.lower(jj.models.MODELS["whipple-bicycle"]()).operations, 2500)
+    yield figure(
+        "operations", "whipple-bicycle", jj.lower(jj.models.MODELS["whipple-bicycle"]()).operations, 2500
+    )
 
 
 def evaluation_time(name: str, lanes: int) -> float:
     """Seconds per evaluation and lane of the lowered program."""
     scene, program, state = states(name, lanes)
     fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
-    one = lambda q, y: program.rates(fixed, 0.0, q, y, inputs)[:2]  # noqa: E731
+    one = lambda q, y: program.rates(fixed, 0.0, q, y, inputs)[:2]
     return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]))
 
 
 def evaluation_ratios(quick: bool) -> Figures:
-    """Time per evaluation in a batch, relative to hand-written equations in the same layout, and to dense ones."""
+    """Time per evaluation in a batch, relative to hand-written equations in the same layout, and to dense
+    ones.
+    """
     for name in ("tilting-disc",) if quick else HAND_DERIVED:
         known, (scene, _, state) = HAND_DERIVED[name], states(name, BY_HAND_LANES)
         parameters = {key: getattr(scene, key) for key in known.parameters}
-        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]))
-        yield figure("time per evaluation in a batch of 4096, lowered / by hand", name, evaluation_time(name, BY_HAND_LANES) / by_hand, 1.5)
+        by_hand = seconds_per_evaluation(
+            lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0])
+        )
+        yield figure(
+            "time per evaluation in a batch of 4096, lowered / by hand",
+            name,
+            evaluation_time(name, BY_HAND_LANES) / by_hand,
+            1.5,
+        )
     scene = jj.models.MODELS["whipple-bicycle"]()
     _, q, u = jj.sample_states(scene, DENSE_LANES)
     rates = jax.vmap(lambda y: dense.bicycle_rates(dense.BICYCLE_PARAMETERS, 0.0, y))
-    by_dense = seconds_per_evaluation(rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=20)
+    by_dense = seconds_per_evaluation(
+        rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=20
+    )
     ratio = by_dense / evaluation_time("whipple-bicycle", DENSE_LANES)
-    yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, least=15)
+    yield figure(
+        "time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, least=15
+    )
 
 
 RUN = {"solver": diffrax.Dopri8(), "events": False, "formulation": jj.Formulation(stabilisation=None)}
@@ -94,7 +127,11 @@ def disc_seconds(run: Callable, starts, expected, repeats: int) -> float:
 
 def disc_motions(quick: bool) -> Figures:
     """10 s of the tilting disc, 1024 lanes, at a final error of 1e-8."""
-    scene, starts, one = jj.models.TiltingDisc(), disc_run.starts(128 if quick else disc_run.LANES), disc_run.START[None]
+    scene, starts, one = (
+        jj.models.TiltingDisc(),
+        disc_run.starts(128 if quick else disc_run.LANES),
+        disc_run.START[None],
+    )
     expected = disc_run.reference(starts)
     ours = disc_seconds(final_states(scene, disc_run.END, **RUN), starts_at(scene, starts), expected, 5)
     yield figure("10 s of the disc at error 1e-8 in a batch, ms per trajectory", "tilting-disc", 1e3 * ours)
@@ -102,8 +139,12 @@ def disc_motions(quick: bool) -> Figures:
         plain = disc_seconds(disc_run.final_states("dense"), starts, expected, 2)
         yield figure("10 s of the disc at error 1e-8, dense / ours", "tilting-disc", plain / ours, least=15)
     flat = disc_seconds(disc_run.final_states("flat"), starts, expected, 3)
-    yield figure("10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, least=3)
-    alone = disc_seconds(final_states(scene, disc_run.END, True, **RUN), starts_at(scene, one), disc_run.reference(one), 20)
+    yield figure(
+        "10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, least=3
+    )
+    alone = disc_seconds(
+        final_states(scene, disc_run.END, True, **RUN), starts_at(scene, one), disc_run.reference(one), 20
+    )
     yield figure("10 s of the disc at error 1e-8 alone, ms", "tilting-disc", 1e3 * alone)
 
 
@@ -119,19 +160,33 @@ def final_losses(name: str) -> tuple[Callable, np.ndarray]:
     """A loss of the final coordinates of every lane, as a function of eight numbers each; the eight numbers."""
     scene = jj.models.MODELS[name]()
     span, parameters, of_q, of_u = BY_EIGHT[name]
-    start = jj.start(scene, **({"lean": 0.3, "yaw_rate": 0.5, "spin_rate": -3.0} if name == "tilting-disc" else scene.example))
-    values = np.array([*(float(getattr(scene, p)) for p in parameters), *start.q[jnp.array(of_q)], *start.u[jnp.array(of_u)]])
+    start = jj.start(
+        scene,
+        **({"lean": 0.3, "yaw_rate": 0.5, "spin_rate": -3.0} if name == "tilting-disc" else scene.example),
+    )
+    values = np.array(
+        [
+            *(float(getattr(scene, p)) for p in parameters),
+            *start.q[jnp.array(of_q)],
+            *start.u[jnp.array(of_u)],
+        ]
+    )
 
     def losses(x):
         options = RUN | {"ts": jnp.array([span]), "rtol": 1e-9, "atol": 1e-9}
         starts = jax.tree.map(lambda y: jnp.broadcast_to(y, (len(x), *jnp.shape(y))), start)
         first, middle = len(parameters), len(parameters) + len(of_q)
-        q, u = starts.q.at[:, jnp.array(of_q)].set(x[:, first:middle]), starts.u.at[:, jnp.array(of_u)].set(x[:, middle:])
+        q, u = (
+            starts.q.at[:, jnp.array(of_q)].set(x[:, first:middle]),
+            starts.u.at[:, jnp.array(of_u)].set(x[:, middle:]),
+        )
         starts = eqx.tree_at(lambda state: (state.q, state.u), starts, (q, u))
         if len(x) == 1:
             own = scene.replace(**{p: x[0, k] for k, p in enumerate(parameters)})
             return jnp.sum(jj.simulate(own, jax.tree.map(lambda x: x[0], starts), **options).q_end ** 2)[None]
-        lanes = jj.rollout(scene, starts, parameters={p: x[:, k] for k, p in enumerate(parameters)}, **options).lanes
+        lanes = jj.rollout(
+            scene, starts, parameters={p: x[:, k] for k, p in enumerate(parameters)}, **options
+        ).lanes
         return jnp.sum(lanes.q_end**2, axis=1)
 
     return losses, values
@@ -149,42 +204,67 @@ def assert_close(found, expected, off: float = 1e-5) -> None:
 
 
 def gradients(quick: bool) -> Figures:
-    """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance; what each mode takes to compile."""
+    """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same
+    tolerance; what each mode takes to compile.
+    """
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
-        ways = {"solve": losses, "forward": partial(by_forward_mode, losses), "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x)))}
+        ways = {
+            "solve": losses,
+            "forward": partial(by_forward_mode, losses),
+            "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x))),
+        }
         for where, lanes in (("alone", 1), ("batched", 1024))[: 1 if quick else 2]:
             x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
             runs = {}
             for way, f in ways.items():
                 runs[way], seconds = compiled(f, x)
                 if way != "solve" and where == "alone":
-                    yield figure(f"trace and compile the gradient with respect to 8 numbers, {way}, s", name, seconds, COMPILED[way])
+                    yield figure(
+                        f"trace and compile the gradient with respect to 8 numbers, {way}, s",
+                        name,
+                        seconds,
+                        COMPILED[way],
+                    )
             assert_close(runs["forward"](), runs["reverse"]())
             timed = least_processor_time(runs, 7)
             for way, seconds in timed.items():
-                yield figure(f"gradient with respect to 8 numbers, {where}, {way}, ms", name, 1e3 * seconds / lanes)
+                yield figure(
+                    f"gradient with respect to 8 numbers, {where}, {way}, ms", name, 1e3 * seconds / lanes
+                )
             best = min(timed["forward"], timed["reverse"])
-            yield figure(f"gradient with respect to 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name])
+            yield figure(
+                f"gradient with respect to 8 numbers / one solve, {where}",
+                name,
+                best / timed["solve"],
+                AT_MOST[name],
+            )
 
 
 def second_derivatives(quick: bool) -> Figures:
-    """Second derivatives of a final-state loss by 8 numbers in two ways, relative to one solve at the same tolerance; what each takes to compile."""
+    """Second derivatives of a final-state loss by 8 numbers in two ways, relative to one solve at the same
+    tolerance; what each takes to compile.
+    """
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
         x = jnp.asarray(values)
-        loss = lambda x, losses=losses: losses(x[None])[0]  # noqa: E731
+        loss = lambda x, losses=losses: losses(x[None])[0]
         slope, step = jax.jit(jax.jacfwd(loss)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
         differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
         ways = {
             "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(loss)), differences),
             "hessian": (jax.hessian(loss), differences),
-            "hessian times a vector": (lambda x, loss=loss: jax.jvp(jax.grad(loss), (x,), (x,))[1], differences @ x),
+            "hessian times a vector": (
+                lambda x, loss=loss: jax.jvp(jax.grad(loss), (x,), (x,))[1],
+                differences @ x,
+            ),
         }
         runs, seconds = {"solve": compiled(loss, x)[0]}, {}
         for way, (f, expected) in ways.items():
             runs[way], seconds[way] = compiled(f, x)
-            np.testing.assert_allclose(runs[way](), expected, rtol=1e-4, atol=1e-4 * np.max(np.abs(differences)))
+            np.testing.assert_allclose(
+                runs[way](), expected, rtol=1e-4, atol=1e-4 * np.max(np.abs(differences))
+            )
         timed = least_processor_time(runs, 7)
         for way in ways:
             what = f"second derivatives with respect to 8 numbers, {way}"
@@ -194,14 +274,23 @@ def second_derivatives(quick: bool) -> Figures:
 
 
 def both_modes(what: str, name: str, loss: Callable, x, forward: float) -> Figures:
-    """What the derivative of a loss takes to compile by each mode (`forward`: at most, s, by that), and once it is compiled."""
+    """What the derivative of a loss takes to compile by each mode (`forward`: at most, s, by that), and once
+    it is compiled.
+    """
     jax.block_until_ready(loss(x))  # what is found of the scene is not counted
     found = {}
     for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
         run, seconds = compiled(derivative(loss), x)
         found[way] = np.concatenate([np.ravel(x) for x in jax.tree.leaves(run())])
-        yield figure(f"trace and compile a derivative {what}, {way} mode, s", name, seconds, forward if way == "forward" else COMPILED[way])
-        yield figure(f"a derivative {what}, {way} mode, ms", name, 1e3 * least_processor_time({way: run}, 7)[way])
+        yield figure(
+            f"trace and compile a derivative {what}, {way} mode, s",
+            name,
+            seconds,
+            forward if way == "forward" else COMPILED[way],
+        )
+        yield figure(
+            f"a derivative {what}, {way} mode, ms", name, 1e3 * least_processor_time({way: run}, 7)[way]
+        )
     assert_close(found["forward"], found["reverse"])
 
 
@@ -212,19 +301,34 @@ NAMED = {
 
 
 def named_starts(quick: bool) -> Figures:
-    """Derivative of 2 s of a motion by three parameters, its start being named values, which depend on them where they are put onto the rows."""
+    """Derivative of 2 s of a motion by three parameters, its start being named values, which depend on them
+    where they are put onto the rows.
+    """
     for name, (given, free) in list(NAMED.items())[: 1 if quick else 2]:
         scene, ts = jj.models.MODELS[name](), jnp.linspace(0.0, 2.0, 41)
 
         def loss(x, scene=scene, given=given, free=free, ts=ts):
-            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts)["lean"])
+            return jnp.sum(
+                jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts)["lean"]
+            )
 
-        yield from both_modes("from named values", name, loss, jnp.stack([getattr(scene, one) for one in free]), COMPILED["forward"])
+        yield from both_modes(
+            "from named values",
+            name,
+            loss,
+            jnp.stack([getattr(scene, one) for one in free]),
+            COMPILED["forward"],
+        )
 
 
 def all_parameters(quick: bool) -> Figures:
-    """Derivative of all speeds at the saved times of 1 s with respect to every parameter of a scene: what each mode takes to compile."""
-    ts, scenes = jnp.linspace(0.0, 1.0, 101), {"trailer-chain, n = 16": TrailerChain(trailers=16), "whipple-bicycle": jj.models.WhippleBicycle()}
+    """Derivative of all speeds at the saved times of 1 s with respect to every parameter of a scene: what
+    each mode takes to compile.
+    """
+    ts, scenes = (
+        jnp.linspace(0.0, 1.0, 101),
+        {"trailer-chain, n = 16": TrailerChain(trailers=16), "whipple-bicycle": jj.models.WhippleBicycle()},
+    )
     for name, scene in list(scenes.items())[: 1 if quick else 2]:
         start = jj.start(scene, **scene.example)
 
@@ -240,7 +344,10 @@ LONGEST = 200  # trailers of the chain that is to be built in a minute
 def growth(quick: bool) -> Figures:
     """Time per step over n of motions of chains of trailers and of pendulums, and their compile time."""
     few, many = (2, 4) if quick else (8, 64)
-    for name, make in (("trailer-chain", lambda n: TrailerChain(trailers=n)), ("pendulum-chain", lambda n: PendulumChain(links=n))):
+    for name, make in (
+        ("trailer-chain", lambda n: TrailerChain(trailers=n)),
+        ("pendulum-chain", lambda n: PendulumChain(links=n)),
+    ):
         laps, built = {}, {}
         for n in (few, many):
             scene, begin = make(n), time.perf_counter()
@@ -250,20 +357,41 @@ def growth(quick: bool) -> Figures:
                 print(f"  {name}, n = {n}: {reason}")
                 break
             start = jj.start(scene, **scene.example)
-            run = jax.jit(lambda start, scene=scene: jj.simulate(scene, start, ts=jnp.array([1.0]), events=False))
+            run = jax.jit(
+                lambda start, scene=scene: jj.simulate(scene, start, ts=jnp.array([1.0]), events=False)
+            )
             motion = run(start).raise_if_failed()
             built[n] = time.perf_counter() - begin
             seconds = least_processor_time({"run": lambda run=run, start=start: run(start)}, 7)["run"]
             laps[n] = seconds / int(motion.accepted + motion.rejected) / n
             yield figure(f"operations, n = {n}", name, program.operations)
             yield figure(f"us per step and link, n = {n}, {motion.reduction}", name, 1e6 * laps[n])
-        yield figure(f"time per step / n, n = {many} against n = {few}", name, laps[many] / laps[few] if many in laps else None, 3)
+        yield figure(
+            f"time per step / n, n = {many} against n = {few}",
+            name,
+            laps[many] / laps[few] if many in laps else None,
+            3,
+        )
         yield figure(f"build and compile time at n = {many}, s", name, built.get(many), 60)
     if not quick:
         begin = time.perf_counter()
         jj.simulate(TrailerChain(trailers=LONGEST), t1=1.0).raise_if_failed()
-        yield figure(f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60)
+        yield figure(
+            f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60
+        )
 
 
 if __name__ == "__main__":
-    main(__doc__, (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, all_parameters, named_starts, growth))
+    main(
+        __doc__,
+        (
+            operation_ratios,
+            evaluation_ratios,
+            disc_motions,
+            gradients,
+            second_derivatives,
+            all_parameters,
+            named_starts,
+            growth,
+        ),
+    )

@@ -1,8 +1,10 @@
-"""Parameters of bicycles from raw measurements against the published ones, and what their covariance does to the limits on the weave speed.
+"""Parameters of bicycles from raw measurements against the published ones, and what their covariance does to
+the limits on the weave speed.
 
     python bench/measured_pendulums.py [--quick] [--json FILE]
 
-Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`: three bicycles, 200 samples each instead of 2,000.
+Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`: three bicycles, 200 samples each
+instead of 2,000.
 """
 
 import jax
@@ -37,9 +39,23 @@ def against_published(name: str) -> list[dict]:
     others = [n for n in known if n not in about]
     exact = name not in ROUNDED and name not in SPLIT
     return [
-        figure("values that no mass centre enters, published sigmas apart", name, max(apart[n] for n in others), 0.1 if name in ROUNDED else 1e-6),
-        figure("their sigmas, relative to the published ones, off by", name, max(ratio[n] for n in others), 1e-6 if exact else None),
-        figure("values that follow from mass centres, published sigmas apart", name, max(apart[n] for n in about if n in known)),
+        figure(
+            "values that no mass centre enters, published sigmas apart",
+            name,
+            max(apart[n] for n in others),
+            0.1 if name in ROUNDED else 1e-6,
+        ),
+        figure(
+            "their sigmas, relative to the published ones, off by",
+            name,
+            max(ratio[n] for n in others),
+            1e-6 if exact else None,
+        ),
+        figure(
+            "values that follow from mass centres, published sigmas apart",
+            name,
+            max(apart[n] for n in about if n in known),
+        ),
     ]
 
 
@@ -48,7 +64,9 @@ def weave_speeds(values):
     return jax.vmap(lambda one: stability_speeds(*linear_matrices(one)).weave_speed)(values)
 
 
-compiled = jax.jit(weave_speeds, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0})
+compiled = jax.jit(
+    weave_speeds, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+)
 
 
 def width(bicycle, count: int) -> float:
@@ -67,12 +85,18 @@ def bicycles(quick: bool) -> Figures:
         if name in shipped_bicycles():
             yield from against_published(name)
         bicycle = benchmark_from_measurements(name)
-        together, alone = (width(one, 200 if quick else 2000) for one in (bicycle, bicycle.with_independent_errors))
+        together, alone = (
+            width(one, 200 if quick else 2000) for one in (bicycle, bicycle.with_independent_errors)
+        )
         ratios.append(together / alone)
         yield figure("95 % limits on the weave speed, width with covariance, m/s", name, together)
         yield figure("and with independent sigmas, m/s", name, alone)
         yield figure("one over the other", name, ratios[-1])
-    yield figure("widths with covariance over those with independent sigmas, median", f"{len(names)} bicycles", float(np.median(ratios)))
+    yield figure(
+        "widths with covariance over those with independent sigmas, median",
+        f"{len(names)} bicycles",
+        float(np.median(ratios)),
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Motions of this engine from and to minimal states, (lanes, states): coordinates, and the speeds that its program integrates."""
+"""Motions of this engine from and to minimal states, (lanes, states): coordinates, and the speeds that its
+program integrates.
+"""
 
 from collections.abc import Callable
 
@@ -16,7 +18,9 @@ def starts_at(scene: jj.Scene, y) -> jj.State:
 
 
 def final_states(scene: jj.Scene, end: float, alone: bool = False, **options) -> Callable:
-    """Return a compiled function of a tolerance and starts; `alone`: one motion after another inside one compiled program, not a batch."""
+    """Return a compiled function of a tolerance and starts; `alone`: one motion after another inside one
+    compiled program, not a batch.
+    """
     integrated = jnp.array(jj.lower(scene).independent)
 
     @jax.jit

@@ -1,9 +1,10 @@
-"""Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, derivatives.
+"""Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone,
+derivatives.
 
     taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|single|laws ...]
 
-Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
-time, the least of some repeats, the two ways in turn.
+Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only
+told. Times of warm motions are processor time, the least of some repeats, the two ways in turn.
 """
 
 import itertools
@@ -40,8 +41,12 @@ MOTIONS = (
 )
 
 
-def compared(what: str, model: str, call: Callable, count: int, required: float | None, repeats: int) -> Generator[dict, None, dict]:
-    """Both ways of a call, which takes a backend and returns arrays: the first time, warm, one over the other, and how far apart; returns what they give."""
+def compared(
+    what: str, model: str, call: Callable, count: int, required: float | None, repeats: int
+) -> Generator[dict, None, dict]:
+    """Both ways of a call, which takes a backend and returns arrays: the first time, warm, one over the
+    other, and how far apart; returns what they give.
+    """
     calls, found = {way: call(backend) for way, backend in WAYS.items()}, {}
     for way, run in calls.items():
         found[way], seconds = seconds_of(run)
@@ -56,12 +61,19 @@ def compared(what: str, model: str, call: Callable, count: int, required: float 
 
 
 def spread_starts(scene: jj.Scene, lanes: int) -> jj.State:
-    """Admissible starts near the scene's example: the disc's as in `disc_run`, of others each named number by 5 %."""
+    """Admissible starts near the scene's example: the disc's as in `disc_run`, of others each named number by
+    5 %.
+    """
     if isinstance(scene, jj.models.TiltingDisc):
         return starts_at(scene, disc_run.starts(lanes))
     random = np.random.default_rng(0)
-    values = {name: np.asarray(x) * (1 + 0.05 * random.normal(size=(lanes, *np.shape(x)))) for name, x in scene.example.items()}
-    return jax.vmap(lambda values: jj.start(scene, **values))({name: jnp.asarray(x) for name, x in values.items()})
+    values = {
+        name: np.asarray(x) * (1 + 0.05 * random.normal(size=(lanes, *np.shape(x))))
+        for name, x in scene.example.items()
+    }
+    return jax.vmap(lambda values: jj.start(scene, **values))(
+        {name: jnp.asarray(x) for name, x in values.items()}
+    )
 
 
 def batches(quick: bool) -> Figures:
@@ -75,7 +87,14 @@ def batches(quick: bool) -> Figures:
 
             @partial(jax.jit, static_argnums=0)
             def run(backend, tolerance, starts, scene=scene, span=span, more=more, alone=alone):
-                options = {"ts": jnp.array([span]), "solver": diffrax.Dopri8(), "rtol": tolerance, "atol": tolerance, "backend": backend, **more}
+                options = {
+                    "ts": jnp.array([span]),
+                    "solver": diffrax.Dopri8(),
+                    "rtol": tolerance,
+                    "atol": tolerance,
+                    "backend": backend,
+                    **more,
+                }
                 if alone:
                     motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
                 else:
@@ -85,8 +104,10 @@ def batches(quick: bool) -> Figures:
             for tolerance in (1e-8, 1e-10, 1e-12):
                 what = f"{who if more else f'{who}, default options'}, {tolerance:.0e}"
                 required = 0.5 if not alone and name == "tilting-disc" else 1.0
-                call = lambda backend, run=run, given=(tolerance, starts): partial(run, backend, *given)  # noqa: E731
-                found = yield from compared(what, name, call, 1 if alone else lanes, required, 3 if quick else 7)
+                call = lambda backend, run=run, given=(tolerance, starts): partial(run, backend, *given)
+                found = yield from compared(
+                    what, name, call, 1 if alone else lanes, required, 3 if quick else 7
+                )
                 for way in WAYS:
                     yield figure(f"{what}, tried steps, {way}", name, np.mean(found[way][1]))
 
@@ -102,8 +123,15 @@ def heyoka(quick: bool) -> Figures:
 
 
 def records(quick: bool) -> Figures:
-    """2 s of a bicycle whose steer torque is a record of 201 samples, or a function of time, each lane its own; and derivatives for four parameters."""
-    scene, name, lanes, scale = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle", 2 if quick else 8, 1e-8
+    """2 s of a bicycle whose steer torque is a record of 201 samples, or a function of time, each lane its
+    own; and derivatives for four parameters.
+    """
+    scene, name, lanes, scale = (
+        jj.models.MODELS["whipple-bicycle"](),
+        "whipple-bicycle",
+        2 if quick else 8,
+        1e-8,
+    )
     start, times = jj.start(scene, rear_spin_rate=15.0, lean_rate=0.05), np.linspace(0.0, 2.0, 201)
     torques = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=(lanes, 201)))
     parameters = jnp.stack([scene.mB, scene.IBxx, scene.zB, scene.mH])
@@ -116,14 +144,26 @@ def records(quick: bool) -> Figures:
 
     def rates(backend, kind, parameters, torque):
         own = scene.replace(**dict(zip(("mB", "IBxx", "zB", "mH"), parameters, strict=True)))
-        options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": scale, "atol": scale, "events": False, "backend": backend}
+        options = {
+            "ts": jnp.linspace(0.05, 2.0, 40),
+            "rtol": scale,
+            "atol": scale,
+            "events": False,
+            "backend": backend,
+        }
         return jj.simulate(own, start, inputs={"steer_torque": kinds[kind](torque)}, **options).u
 
     def call(backend, kind, function):
-        return partial(jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0))), parameters, torques)
+        return partial(
+            jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0))), parameters, torques
+        )
 
-    for kind, (what, function) in itertools.product(kinds, (("motion", lambda f: f), ("its derivatives", jax.jacfwd))):
-        yield from compared(f"{kind}, {what}", name, partial(call, kind=kind, function=function), lanes, 0.5, 3)
+    for kind, (what, function) in itertools.product(
+        kinds, (("motion", lambda f: f), ("its derivatives", jax.jacfwd))
+    ):
+        yield from compared(
+            f"{kind}, {what}", name, partial(call, kind=kind, function=function), lanes, 0.5, 3
+        )
 
 
 def times(quick: bool) -> Figures:
@@ -134,17 +174,28 @@ def times(quick: bool) -> Figures:
 
         def seen(delay, backend, scene=scene, start=start):
             ts = jnp.linspace(0.2, 1.0, 21) - delay
-            return jnp.sum(jnp.sin(jj.simulate(scene, start, t0=0.0, ts=ts, t1=1.0, backend=backend, **BARE).q))
+            return jnp.sum(
+                jnp.sin(jj.simulate(scene, start, t0=0.0, ts=ts, t1=1.0, backend=backend, **BARE).q)
+            )
 
         for mode, differentiated in (("forward", jax.jacfwd), ("reverse", jax.grad)):
             what = f"slope with respect to a delay, {mode}"
-            call = lambda backend, slope=differentiated, seen=seen: partial(jax.jit(slope(partial(seen, backend=backend))), 0.013)  # noqa: E731
+            call = lambda backend, slope=differentiated, seen=seen: partial(
+                jax.jit(slope(partial(seen, backend=backend))), 0.013
+            )
             found = yield from compared(what, name, call, 1, None, 50)
-            yield figure(f"{what}, relative difference", name, abs(float(found["native"]) / float(found["XLA"]) - 1.0), 1e-7)
+            yield figure(
+                f"{what}, relative difference",
+                name,
+                abs(float(found["native"]) / float(found["XLA"]) - 1.0),
+                1e-7,
+            )
 
 
 def watching(quick: bool) -> Figures:
-    """What it costs to judge, at every stage of every step, whether the privileged speeds still determine the others: motions with it over motions without."""
+    """What it costs to judge, at every stage of every step, whether the privileged speeds still determine the
+    others: motions with it over motions without.
+    """
     scene, name = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle"
     speeds, watched = jnp.linspace(-16.0, -15.0, 256), ByProgram.has_pivots
 
@@ -163,7 +214,12 @@ def watching(quick: bool) -> Figures:
 
     runs = {"watched": compiled(watched), "not watched": compiled(property(lambda field: False))}
     seconds = least_processor_time(runs, 15 if quick else 60)
-    yield figure("motions whose pivots are watched over such whose are not", name, seconds["watched"] / seconds["not watched"], 1.05)
+    yield figure(
+        "motions whose pivots are watched over such whose are not",
+        name,
+        seconds["watched"] / seconds["not watched"],
+        1.05,
+    )
 
 
 class Pushed(jj.Scene):
@@ -182,24 +238,43 @@ class Pushed(jj.Scene):
 
 
 def calls(quick: bool) -> Figures:
-    """What `simulate` called from Python costs more than the same motion, of 1 s saved 201 times, from a given state under the user's `jit`."""
+    """What `simulate` called from Python costs more than the same motion, of 1 s saved 201 times, from a
+    given state under the user's `jit`.
+    """
     two = {
         "two numbers": {"f": 1.0, "g": 0.5},
         "two functions of time": {"f": jnp.sin, "g": lambda t: jnp.cos(2 * t)},
-        "two records": {name: jj.Sampled(np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11) ** power) for name, power in (("f", 2), ("g", 3))},
+        "two records": {
+            name: jj.Sampled(np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11) ** power)
+            for name, power in (("f", 2), ("g", 3))
+        },
     }
-    cases = [("tilting-disc", jj.models.TiltingDisc(), None, 0.3), ("whipple-bicycle", jj.models.MODELS["whipple-bicycle"](), None, 0.3)]
+    cases = [
+        ("tilting-disc", jj.models.TiltingDisc(), None, 0.3),
+        ("whipple-bicycle", jj.models.MODELS["whipple-bicycle"](), None, 0.3),
+    ]
     cases += [(f"mass pushed by {what}", Pushed(), inputs, 0.5) for what, inputs in two.items()]
     for name, scene, inputs, required in cases[: 1 if quick else None]:
         values = dict(scene.example) or {"x": 0.1}
         options = {"t1": 1.0, "inputs": inputs}
-        state, compiled = jj.start(scene, **values), jax.jit(lambda state, scene=scene, options=options: jj.simulate(scene, state, **options))
+        state, compiled = (
+            jj.start(scene, **values),
+            jax.jit(lambda state, scene=scene, options=options: jj.simulate(scene, state, **options)),
+        )
         runs = {"jit": partial(compiled, state)}
-        runs |= {way: partial(jj.simulate, scene, start, **options) for way, start in (("a state", state), ("named values", values))}
+        runs |= {
+            way: partial(jj.simulate, scene, start, **options)
+            for way, start in (("a state", state), ("named values", values))
+        }
         seconds = least_processor_time(runs, 50 if quick else 400)
         yield figure("a call under the user's jit, ms", name, 1e3 * seconds["jit"])
         for way in ("a state", "named values"):
-            yield figure(f"called from Python with {way}, ms more", name, 1e3 * (seconds[way] - seconds["jit"]), required)
+            yield figure(
+                f"called from Python with {way}, ms more",
+                name,
+                1e3 * (seconds[way] - seconds["jit"]),
+                required,
+            )
 
 
 def in_single(name: str, lanes: int) -> list[dict]:
@@ -211,32 +286,46 @@ def in_single(name: str, lanes: int) -> list[dict]:
 
     def call(backend, qs):
         options = {"ts": ts, "rtol": 1e-5, "atol": 1e-6, "work": False, "backend": backend}
-        end = lambda q: jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, q), **options).q_end  # noqa: E731
+        end = lambda q: jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, q), **options).q_end
         return partial(jax.jit(end if qs.ndim == 1 else jax.vmap(end)), qs)
 
     for who, qs, count in (("alone", near[0], 1), (f"batch of {lanes}", near, lanes)):
-        found += compared(f"single precision, {who}", name, partial(call, qs=qs), count, 1.0, 20 if count == 1 else 3)
+        found += compared(
+            f"single precision, {who}", name, partial(call, qs=qs), count, 1.0, 20 if count == 1 else 3
+        )
     return found
 
 
 def single(quick: bool) -> Figures:
-    """Motions in single precision, in processes of their own: machine code rounds what it is given and returns, XLA all that it computes."""
+    """Motions in single precision, in processes of their own: machine code rounds what it is given and
+    returns, XLA all that it computes.
+    """
     program = "import json, native, sys; print(json.dumps(native.in_single(sys.argv[1], int(sys.argv[2]))))"
     for name in ("tilting-disc", "whipple-bicycle")[: 1 if quick else 2]:
         yield from fresh(program, name, FEW if quick else LANES, JAX_ENABLE_X64="0")
 
 
 def laws(quick: bool) -> Figures:
-    """Batches of scenes whose forces are functions beyond sine and cosine, and their derivatives with respect to the start."""
+    """Batches of scenes whose forces are functions beyond sine and cosine, and their derivatives with respect
+    to the start.
+    """
     lanes = FEW if quick else LANES
     for name, (scene, starts, span) in list(laws_of_force.cases(lanes).items())[: 1 if quick else None]:
 
         def end(start, backend, scene=scene, span=span):
-            return jj.simulate(scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, backend=backend).q_end
+            return jj.simulate(
+                scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, backend=backend
+            ).q_end
 
-        for what, count, of in (("motion", lanes, lambda f: f), ("forward mode", 8, jax.jacfwd), ("reverse mode", 8, jax.jacrev)):
+        for what, count, of in (
+            ("motion", lanes, lambda f: f),
+            ("forward mode", 8, jax.jacfwd),
+            ("reverse mode", 8, jax.jacrev),
+        ):
             given = {key: jnp.asarray(x[:count]) for key, x in starts.items()}
-            call = lambda backend, of=of, end=end, given=given: partial(jax.jit(jax.vmap(of(partial(end, backend=backend)))), given)  # noqa: E731
+            call = lambda backend, of=of, end=end, given=given: partial(
+                jax.jit(jax.vmap(of(partial(end, backend=backend)))), given
+            )
             yield from compared(what, name, call, count, 1.0, 3 if quick else 7)
 
 

@@ -1,4 +1,5 @@
-"""What the README's test command costs: wall and processor time, peak of the sum of resident memory of its processes, slowest files and tests.
+"""What the README's test command costs: wall and processor time, peak of the sum of resident memory of its
+processes, slowest files and tests.
 
     python bench/suite.py [--quick] [--json FILE]        --quick: three files alone
 
@@ -25,7 +26,9 @@ def suite(quick: bool) -> Figures:
     """Run the command; yield its times in s, its peak in GiB, and the slowest files and tests."""
     command = [*COMMAND, "--durations=0", "--durations-min=0.05", *(QUICK if quick else ())]
     begin, peak, processor = time.perf_counter(), 0, Counter()
-    run = subprocess.Popen(command, cwd=HERE.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    run = subprocess.Popen(
+        command, cwd=HERE.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     tree = psutil.Process(run.pid)
     with run.stdout as stream:
         lines: list[str] = []
@@ -50,7 +53,9 @@ def suite(quick: bool) -> Figures:
 
 
 def _resident(tree: psutil.Process, processor: Counter) -> int:
-    """Return the sum of resident memory of a process and all below it, bytes; note the processor time of each so far."""
+    """Return the sum of resident memory of a process and all below it, bytes; note the processor time of each
+    so far.
+    """
     total = 0
     with suppress(psutil.NoSuchProcess):  # the command has ended
         for process in (tree, *tree.children(recursive=True)):

@@ -1,10 +1,11 @@
-"""Work-precision charts: error against time for four problems, this engine's methods and its peers, each at its best settings.
+"""Work-precision charts: error against time for four problems, this engine's methods and its peers, each at
+its best settings.
 
     taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...] [--part NAME ...]
     python bench/work_precision.py --redraw FILE --out DIR
 
-Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained ({"reference", ...}); pictures
-(PNG and SVG); a table. The main chart is `work_precision.png`.
+Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained
+({"reference", ...}); pictures (PNG and SVG); a table. The main chart is `work_precision.png`.
 Times are wall time of the fastest of some warm runs. Peers that are not installed are skipped with a message.
 """
 
@@ -31,16 +32,40 @@ def say(text: str) -> None:
 
 def curves(names, quick: bool) -> Iterator[dict]:
     """References and single trajectories."""
-    from work_precision_cases import measure, ours, peer_c, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
+    from work_precision_cases import (
+        measure,
+        ours,
+        peer_c,
+        peer_diffrax,
+        peer_exudyn,
+        peer_heyoka,
+        peer_mujoco,
+        peer_sympy,
+    )
     from work_precision_cases.problems import PROBLEMS
 
     for name in names:
         problem = PROBLEMS[name]
         reference = problem.truth
         say(f"{name}: {reference.how}; {reference.uncertainty:.1e} from {reference.against}")
-        yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
-        peers = [*peer_sympy.curves(problem, quick), *peer_c.curves(problem), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem)]
-        for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
+        yield {
+            "reference": name,
+            "how": reference.how,
+            "against": reference.against,
+            "uncertainty": reference.uncertainty,
+        }
+        peers = [
+            *peer_sympy.curves(problem, quick),
+            *peer_c.curves(problem),
+            *peer_heyoka.curves(problem),
+            *peer_diffrax.curves(problem),
+        ]
+        for curve in [
+            *ours.curves(problem, quick),
+            *peers,
+            *peer_exudyn.curves(problem, quick),
+            *peer_mujoco.curves(problem, quick),
+        ]:
             yield from measure.points(problem, curve, say)[0]
 
 
@@ -60,13 +85,19 @@ def measured(arguments) -> Iterator[dict]:
 
 def main() -> None:
     """Measure, or read what was measured; draw and tabulate."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods: under two minutes")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="disc and sleigh, fewer methods: under two minutes"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures")
     parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS), help="only these parts")
-    parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: draw what is in this file")
+    parser.add_argument(
+        "--redraw", type=Path, metavar="FILE", help="measure nothing: draw what is in this file"
+    )
     arguments = parser.parse_args()
     if arguments.redraw:
         found = json.loads(arguments.redraw.read_text(encoding="utf-8"))

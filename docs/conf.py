@@ -1,4 +1,6 @@
-"""How the documentation is built: `python -m sphinx -W -j auto -b html docs docs/_build/html`. Nothing is fetched while it is built or read."""
+"""How the documentation is built: `python -m sphinx -W -j auto -b html docs docs/_build/html`. Nothing is
+fetched while it is built or read.
+"""
 
 import os
 import shutil
@@ -7,8 +9,11 @@ import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
-# A page runs once: less effort on machine code saves a third of the time. The kernels that run the tutorials inherit this.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+# A page runs once: less effort on machine code saves a third of the time. The kernels that run the tutorials
+# inherit this.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))  # for `sphinx_parts`
@@ -18,19 +23,31 @@ author = "The jourdain-jax developers"
 copyright = author
 version = release = installed("jourdain-jax")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_design", "sphinx_parts.docstrings", "sphinx_parts.mathml"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx_design",
+    "sphinx_parts.docstrings",
+    "sphinx_parts.mathml",
+]
 exclude_patterns = ["_build", "gallery/scenes", "README.md", "**.ipynb_checkpoints"]
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
 suppress_warnings = ["mystnb.unknown_mime_type"]
 default_role = "literal"  # docstrings quote code with single backticks
 
-# Pages run when the site is built, but for the notebooks that take minutes: these hold what their own runs printed.
+# Pages run when the site is built, but for the notebooks that take minutes: these hold what their own runs
+# printed.
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_build" / ".jupyter_cache")
 nb_execution_timeout = 240
 nb_execution_raise_on_error = True
-nb_execution_excludepatterns = ["tutorials/notebooks/02*", "tutorials/notebooks/04*", "tutorials/notebooks/05*", "tutorials/notebooks/06*"]
+nb_execution_excludepatterns = [
+    "tutorials/notebooks/02*",
+    "tutorials/notebooks/04*",
+    "tutorials/notebooks/05*",
+    "tutorials/notebooks/06*",
+]
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"

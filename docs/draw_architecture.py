@@ -111,18 +111,50 @@ def draw(path: Path) -> None:
         axes.text(left, top + 28, purpose, fontsize=7.6, va="center", color="#444444")
     axes.plot([0, WIDTH], [HEADER, HEADER], color="#888888", lw=0.8)
     axes.plot([0, WIDTH], [HEIGHT - FOOTER] * 2, color="#888888", lw=0.8)
-    axes.text(12, HEADER / 2, "packages: each imports only\nwhat lies below it", fontsize=7.6, va="center", color="#444444")
+    axes.text(
+        12,
+        HEADER / 2,
+        "packages: each imports only\nwhat lies below it",
+        fontsize=7.6,
+        va="center",
+        color="#444444",
+    )
     for k, (call, colour, steps) in enumerate(CALLS):
         left = TEXT + k * (COLUMN + GAP)
-        axes.text(left + COLUMN / 2, HEADER / 2, call, fontsize=9.2, weight="bold", color=colour, ha="center", va="center")
+        axes.text(
+            left + COLUMN / 2,
+            HEADER / 2,
+            call,
+            fontsize=9.2,
+            weight="bold",
+            color=colour,
+            ha="center",
+            va="center",
+        )
         between = (COLUMN - 2 * RADIUS - 6) / (len(steps) - 1)
         places = [(left + RADIUS + 3 + i * between, middle[room]) for i, (room, _) in enumerate(steps)]
         axes.plot(*zip(*places, strict=True), color=colour, lw=1.3, alpha=0.55, zorder=1)
         for i, (place, (_, first)) in enumerate(zip(places, steps, strict=True)):
-            axes.add_patch(Circle(place, RADIUS, facecolor="white" if first else colour, edgecolor=colour, lw=1.3, zorder=2))
-            axes.text(*place, str(i + 1), fontsize=7.2, weight="bold", color=colour if first else "white", ha="center", va="center_baseline", zorder=3)
+            axes.add_patch(
+                Circle(
+                    place, RADIUS, facecolor="white" if first else colour, edgecolor=colour, lw=1.3, zorder=2
+                )
+            )
+            axes.text(
+                *place,
+                str(i + 1),
+                fontsize=7.2,
+                weight="bold",
+                color=colour if first else "white",
+                ha="center",
+                va="center_baseline",
+                zorder=3,
+            )
     low = HEIGHT - FOOTER / 2
-    for x, face, text in ((320, "#555555", "in every call"), (450, "white", "worked out in the first call, looked up in later ones")):
+    for x, face, text in (
+        (320, "#555555", "in every call"),
+        (450, "white", "worked out in the first call, looked up in later ones"),
+    ):
         axes.add_patch(Circle((x, low), RADIUS, facecolor=face, edgecolor="#555555", lw=1.3))
         axes.text(x + 15, low, text, fontsize=7.6, va="center", color="#444444")
     axes.text(12, low, "numbers: the lists in architecture.md", fontsize=7.6, va="center", color="#444444")

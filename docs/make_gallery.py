@@ -1,10 +1,12 @@
-"""Writes the pages of the gallery: one for every scene of `docs/gallery/scenes` and every model of `jj.models.MODELS`, and their index.
+"""Writes the pages of the gallery: one for every scene of `docs/gallery/scenes` and every model of
+`jj.models.MODELS`, and their index.
 
     python docs/make_gallery.py [--out DIR] [--processes N] [NAME ...]
 
-A page shows a picture, the lines that draw it (they are what this script runs), what to look at, and the source. Pages are MyST Markdown for Sphinx with
-sphinx-design; nothing is fetched.
-Without names all pages are written (about 80 s by two processes), with names those alone; the index lists all pages of the folder.
+A page shows a picture, the lines that draw it (they are what this script runs), what to look at, and the
+source. Pages are MyST Markdown for Sphinx with sphinx-design; nothing is fetched.
+Without names all pages are written (about 80 s by two processes), with names those alone; the index lists all
+pages of the folder.
 """
 
 import argparse
@@ -22,7 +24,9 @@ from multiprocessing import get_context
 from pathlib import Path
 
 # a page runs once: less effort on machine code saves a third of the time
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 import jourdain_jax as jj
@@ -35,7 +39,9 @@ WIDTH = 112  # columns of code on a page
 
 @dataclass(frozen=True)
 class Picture:
-    """How a motion is drawn, as pieces of the code on its page, and what to look at (scenes say the latter themselves, as `LOOK`)."""
+    """How a motion is drawn, as pieces of the code on its page, and what to look at (scenes say the latter
+    themselves, as `LOOK`).
+    """
 
     look: str = ""
     title: str = ""
@@ -60,7 +66,12 @@ SCENE_PICTURES = {
         view='"above"',
         paths='[("car", (-1.3, 0, 0)), ("trailer 2", (0, 0, 0))]',
     ),
-    "tricycle": Picture(title="Tricycle", at="2", span="2.2", paths='[("front", (0, 0, 0)), ("left", (0, 0, 0)), ("right", (0, 0, 0))]'),
+    "tricycle": Picture(
+        title="Tricycle",
+        at="2",
+        span="2.2",
+        paths='[("front", (0, 0, 0)), ("left", (0, 0, 0)), ("right", (0, 0, 0))]',
+    ),
     "kick_scooter": Picture(
         title="Kick scooter",
         view="(18, -60)",
@@ -69,15 +80,28 @@ SCENE_PICTURES = {
         paths='[("rear frame", (0, 0, 0))]',
         inputs='{"push": lambda t: 150.0 * jnp.exp(-(((t - 0.3) / 0.1) ** 2))}',
     ),
-    "unicycle": Picture(title="Unicycle with a rider", at="4", span="1.6", paths='[("rider", (0, 0, 0)), ("wheel", (0, 0, 0))]'),
+    "unicycle": Picture(
+        title="Unicycle with a rider",
+        at="4",
+        span="1.6",
+        paths='[("rider", (0, 0, 0)), ("wheel", (0, 0, 0))]',
+    ),
     "ball_on_plate": Picture(
         title="Ball on a plate",
         at="1",
         view="(38, -60)",
         paths='[("ball", (0, 0, 0))]',
-        inputs='{"wanted_x": lambda t: 0.12 * jnp.cos(1.5 * t), "wanted_y": lambda t: 0.12 * jnp.sin(1.5 * t)}',
+        inputs=(
+            '{"wanted_x": lambda t: 0.12 * jnp.cos(1.5 * t), "wanted_y": lambda t: 0.12 * jnp.sin(1.5 * t)}'
+        ),
     ),
-    "spherical_robot": Picture(title="Spherical robot driven by a pendulum", at="3", span="1.2", paths='[("shell", (0, 0, 0))]', inputs='{"drive": 0.2}'),
+    "spherical_robot": Picture(
+        title="Spherical robot driven by a pendulum",
+        at="3",
+        span="1.2",
+        paths='[("shell", (0, 0, 0))]',
+        inputs='{"drive": 0.2}',
+    ),
     "roller_racer": Picture(
         title="Roller racer",
         view='"above"',
@@ -87,7 +111,10 @@ SCENE_PICTURES = {
         inputs='{"wanted": lambda t: 0.7 * jnp.sin(5.0 * t)}',
     ),
     "two_wheeled_pendulum": Picture(
-        title="Two-wheeled inverted pendulum", span="4.0", start="pitch=0.0", inputs='{"speed": 1.0, "turn": lambda t: 0.5 * jnp.sin(2.0 * t)}'
+        title="Two-wheeled inverted pendulum",
+        span="4.0",
+        start="pitch=0.0",
+        inputs='{"speed": 1.0, "turn": lambda t: 0.5 * jnp.sin(2.0 * t)}',
     ),
     "satellite": Picture(
         title="Satellite with reaction wheels",
@@ -96,11 +123,14 @@ SCENE_PICTURES = {
         start="",
         span="2.0",
         paths='[("bus", (0.3, 0.25, 0.2))]',
-        inputs='{"torque_x": lambda t: 1.0 * (t - 1.0), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}',
+        inputs=(
+            '{"torque_x": lambda t: 1.0 * (t - 1.0), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}'
+        ),
     ),
 }
 AXLE = Picture(
-    "All methods of the paper agree: heading and axle turn evenly, and it drifts across the slope (x points downhill) instead of running away.",
+    "All methods of the paper agree: heading and axle turn evenly, and it drifts across the slope (x points"
+    " downhill) instead of running away.",
     view='"above"',
     at="4",
     span="5.0",
@@ -112,18 +142,49 @@ MODEL_PICTURES = {
     "two-wheel-axle-coordinates": AXLE,
     "two-wheel-axle-quasi": AXLE,
     "two-wheel-axle-redundant": AXLE,
-    "skate": Picture("Set turning, it drifts across the slope (x points downhill) and comes back up, in cycloids.", view='"above"', at="6", span="5.0"),
-    "chaplygin-sleigh": Picture("It starts backwards, turns over, and runs off straight with the blade behind.", view='"above"', at="6"),
-    "vertical-disc": Picture("Both rates stay what they are: the path is a circle.", at="3", start="heading_rate=0.5, roll_rate=2.0", span="5.0"),
-    "tilting-disc": Picture("It rolls along loops while its lean and its turning swing about a steady motion.", at="(0.0, 0.9, 1.8)", span="2.4"),
+    "skate": Picture(
+        "Set turning, it drifts across the slope (x points downhill) and comes back up, in cycloids.",
+        view='"above"',
+        at="6",
+        span="5.0",
+    ),
+    "chaplygin-sleigh": Picture(
+        "It starts backwards, turns over, and runs off straight with the blade behind.",
+        view='"above"',
+        at="6",
+    ),
+    "vertical-disc": Picture(
+        "Both rates stay what they are: the path is a circle.",
+        at="3",
+        start="heading_rate=0.5, roll_rate=2.0",
+        span="5.0",
+    ),
+    "tilting-disc": Picture(
+        "It rolls along loops while its lean and its turning swing about a steady motion.",
+        at="(0.0, 0.9, 1.8)",
+        span="2.4",
+    ),
     "tilting-disc-quaternion": Picture(
-        "The same disc with its attitude as a quaternion, which also serves where it lies flat.", at="(0.0, 0.9, 1.8)", span="2.4"
+        "The same disc with its attitude as a quaternion, which also serves where it lies flat.",
+        at="(0.0, 0.9, 1.8)",
+        span="2.4",
     ),
-    "rosenberg-particle": Picture("No force acts, and yet the row bends the path: y grows evenly, and x slows down as y moves away from zero.", at="4"),
+    "rosenberg-particle": Picture(
+        "No force acts, and yet the row bends the path: y grows evenly, and x slows down as y moves away from"
+        " zero.",
+        at="4",
+    ),
     "heisenberg-particle": Picture(
-        "Rows on the velocities need not bend a path: this one is a straight line, where a vakonomic reading gives a helix.", at="4", span="4.0"
+        "Rows on the velocities need not bend a path: this one is a straight line, where a vakonomic reading"
+        " gives a helix.",
+        at="4",
+        span="4.0",
     ),
-    "ball-on-turntable": Picture("On a turning table the ball goes round in a circle, like a charge in a magnetic field, at 2/7 of the table's rate.", at="4"),
+    "ball-on-turntable": Picture(
+        "On a turning table the ball goes round in a circle, like a charge in a magnetic field, at 2/7 of the"
+        " table's rate.",
+        at="4",
+    ),
     "suslov": Picture(
         "It ends in a steady turn about its second axis, whatever the start.",
         at="(3.0,)",
@@ -139,7 +200,11 @@ MODEL_PICTURES = {
         paths='[("board", (0, 0, 0))]',
     ),
     "rattleback": Picture(
-        "Spun the wrong way, it rattles; in the end it turns back.", at="(0.05,)", span="0.5", view="(30, -60)", paths='[("stone", (0.2, 0, 0))]'
+        "Spun the wrong way, it rattles; in the end it turns back.",
+        at="(0.05,)",
+        span="0.5",
+        view="(30, -60)",
+        paths='[("stone", (0.2, 0, 0))]',
     ),
     "whipple-bicycle": Picture(
         "At 4.5 m/s it catches itself: lean turns the handlebar into the fall.",
@@ -147,23 +212,43 @@ MODEL_PICTURES = {
         span="0.6",
         paths='[("rear wheel", (0, 0, 0)), ("front wheel", (0, 0, 0))]',
     ),
-    "double-pendulum-rods": Picture("Two rods of fixed length as geometric rows; compare the pendulum in angles.", view='"side"', span="1.2", paths=BOTH),
-    "double-pendulum-angles": Picture("The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH),
+    "double-pendulum-rods": Picture(
+        "Two rods of fixed length as geometric rows; compare the pendulum in angles.",
+        view='"side"',
+        span="1.2",
+        paths=BOTH,
+    ),
+    "double-pendulum-angles": Picture(
+        "The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH
+    ),
     "free-rigid-body": Picture(
         "The end of an axis runs along a curve that need not close: Euler's equations.",
         at="(8.0,)",
         span="8.0",
         paths='[("body", (1.0, 0.0, 0.0))]',
     ),
-    "spring-and-rod": Picture("A rod keeps two particles apart while a spring holds the first to the origin.", view='"side"', span="1.5", paths=BOTH),
+    "spring-and-rod": Picture(
+        "A rod keeps two particles apart while a spring holds the first to the origin.",
+        view='"side"',
+        span="1.5",
+        paths=BOTH,
+    ),
     "isokinetic-particle": Picture(
-        "A row that is quadratic in the speeds keeps the speed: the path bends down along a closed form.", view='"side"', at="5", span="0.6"
+        "A row that is quadratic in the speeds keeps the speed: the path bends down along a closed form.",
+        view='"side"',
+        at="5",
+        span="0.6",
     ),
     "trailer-chain": Picture(
-        "The trailers follow the car on smaller and smaller circles.", view='"above"', paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]'
+        "The trailers follow the car on smaller and smaller circles.",
+        view='"above"',
+        paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]',
     ),
     "pendulum-chain": Picture(
-        "Rods alone hold the particles; without damping the energy stays.", view='"side"', span="1.0", paths='[("particle 5", (0, 0, 0))]'
+        "Rods alone hold the particles; without damping the energy stays.",
+        view='"side"',
+        span="1.0",
+        paths='[("particle 5", (0, 0, 0))]',
     ),
 }
 
@@ -209,11 +294,25 @@ def entries() -> dict[str, Entry]:
     found = {}
     for path in sorted(SCENES.glob("*.py")):
         module = importlib.import_module(f"scenes.{path.stem}")
-        kind = next(k for k in vars(module).values() if isinstance(k, type) and issubclass(k, jj.Scene) and k.__module__ == module.__name__)
+        kind = next(
+            k
+            for k in vars(module).values()
+            if isinstance(k, type) and issubclass(k, jj.Scene) and k.__module__ == module.__name__
+        )
         name, picture = path.stem.replace("_", "-"), SCENE_PICTURES.get(path.stem, Picture())
-        found[name] = Entry(name, kind, path, f"from scenes.{path.stem} import {kind.__name__}\n", f"{kind.__name__}()", picture, module.LOOK)
+        found[name] = Entry(
+            name,
+            kind,
+            path,
+            f"from scenes.{path.stem} import {kind.__name__}\n",
+            f"{kind.__name__}()",
+            picture,
+            module.LOOK,
+        )
     for name, kind in jj.models.MODELS.items():
-        picture = MODEL_PICTURES.get(name, Picture(look=f"How {name.replace('-', ' ')} moves from its example start."))
+        picture = MODEL_PICTURES.get(
+            name, Picture(look=f"How {name.replace('-', ' ')} moves from its example start.")
+        )
         source = ROOT / f"src/{kind.__module__.replace('.', '/')}.py"
         found[name] = Entry(name, kind, source, "", f"jj.models.{kind.__name__}()", picture, picture.look)
     return found
@@ -239,14 +338,21 @@ def code_of(entry: Entry) -> str:
 
 
 def prose_of(docstring: str) -> str:
-    """A docstring as Markdown: what is indented becomes a block of its own, stars and underscores stay what they are."""
+    """A docstring as Markdown: what is indented becomes a block of its own, stars and underscores stay what
+    they are.
+    """
     blocks = []
     for block in re.split(r"\n\s*\n", inspect.cleandoc(docstring)):
         if block.startswith("    "):
             blocks.append(f"```text\n{inspect.cleandoc(block)}\n```")
         else:
             parts = re.split(r"(`[^`]*`)", block)
-            blocks.append("".join(part if part.startswith("`") else re.sub(r"([*_<$~\[\]])", r"\\\1", part) for part in parts))
+            blocks.append(
+                "".join(
+                    part if part.startswith("`") else re.sub(r"([*_<$~\[\]])", r"\\\1", part)
+                    for part in parts
+                )
+            )
     return "\n\n".join(blocks)
 
 
@@ -255,7 +361,11 @@ def page_of(entry: Entry, out: Path) -> str:
     link = Path(os.path.relpath(entry.source, out)).as_posix()
     shown = entry.source.relative_to(ROOT).as_posix()
     where = " in the folder `docs/gallery`" if entry.import_line else ""
-    included = f"\n## The scene\n\n```{{literalinclude}} {link}\n:language: python\n```\n" if entry.import_line else ""
+    included = (
+        f"\n## The scene\n\n```{{literalinclude}} {link}\n:language: python\n```\n"
+        if entry.import_line
+        else ""
+    )
     told = "\n\n".join(filter(None, map(inspect.getdoc, (inspect.getmodule(entry.kind), entry.kind))))
     return f"""# {entry.title}
 
@@ -278,7 +388,9 @@ Source: [{shown}]({link})
 
 
 def caption_of(entry: Entry) -> str:
-    """What the scene is, in one line: the first sentence of the docstring of its class, or of its file where that has one scene."""
+    """What the scene is, in one line: the first sentence of the docstring of its class, or of its file where
+    that has one scene.
+    """
     told = inspect.getdoc(inspect.getmodule(entry.kind) if entry.source.parent == SCENES else entry.kind)
     return re.split(r"(?<=[.;])\s", " ".join(told.split("\n\n")[0].split()))[0].rstrip(".:;")
 
@@ -286,7 +398,8 @@ def caption_of(entry: Entry) -> str:
 def index_of(chosen: list[Entry]) -> str:
     """Thumbnails of the chosen pages, and their table of contents."""
     cards = "\n".join(
-        f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type: doc\n\n{caption_of(entry)}\n:::\n"
+        f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type:"
+        f" doc\n\n{caption_of(entry)}\n:::\n"
         for entry in chosen
     )
     pages = "\n".join(entry.name for entry in chosen)
@@ -325,16 +438,29 @@ def write_named(name: str, out: Path) -> str:
     """Write the page of this name; how long that took, as a line of text."""
     began = time.perf_counter(), time.process_time()
     write(entries()[name], out)
-    return f"{name}: {time.perf_counter() - began[0]:.1f} s, {time.process_time() - began[1]:.1f} s of processor time"
+    return (
+        f"{name}: {time.perf_counter() - began[0]:.1f} s, {time.process_time() - began[1]:.1f} s of processor"
+        " time"
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Write the pages that are asked for; exits with a message where a name is unknown."""
     parser = argparse.ArgumentParser(description="Write the pages of the gallery.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="pages (default: all)")
-    parser.add_argument("--out", type=Path, default=PAGES, metavar="DIR", help="folder to write to (default: docs/gallery/pages)")
     parser.add_argument(
-        "--processes", type=int, default=min(4, os.cpu_count() or 1), metavar="N", help="how many write at once (default: one per core, at most 4)"
+        "--out",
+        type=Path,
+        default=PAGES,
+        metavar="DIR",
+        help="folder to write to (default: docs/gallery/pages)",
+    )
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=min(4, os.cpu_count() or 1),
+        metavar="N",
+        help="how many write at once (default: one per core, at most 4)",
     )
     asked = parser.parse_args(arguments)
     os.environ.setdefault("MPLBACKEND", "Agg")

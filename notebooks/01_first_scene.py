@@ -14,11 +14,12 @@
 # %% [markdown]
 # # A first scene: the Chaplygin sleigh, from description to gradient
 #
-# A sleigh stands on two smooth feet and one blade. The blade can slide along itself and can turn, but it cannot slip sideways. That one
-# condition is a *nonholonomic* constraint: it limits the velocities, yet it does not limit where the sleigh can get to.
+# A sleigh stands on two smooth feet and one blade. The blade can slide along itself and can turn, but it
+# cannot slip sideways. That one condition is a *nonholonomic* constraint: it limits the velocities, yet it
+# does not limit where the sleigh can get to.
 #
-# We describe the sleigh in a dozen lines, let the engine derive its equations of motion by Jourdain's principle, compare the motion with
-# Chaplygin's closed form, and differentiate the whole simulation.
+# We describe the sleigh in a dozen lines, let the engine derive its equations of motion by Jourdain's
+# principle, compare the motion with Chaplygin's closed form, and differentiate the whole simulation.
 
 # %%
 import jax
@@ -31,8 +32,9 @@ import jourdain_jax as jj
 # %% [markdown]
 # ## Describe it
 #
-# A scene is a class. Its fields are physical parameters, its methods say where the bodies are and what holds them. Velocities, the mass matrix
-# and the constraint's Jacobian are found by automatic differentiation: we never write them.
+# A scene is a class. Its fields are physical parameters, its methods say where the bodies are and what holds
+# them. Velocities, the mass matrix and the constraint's Jacobian are found by automatic differentiation: we
+# never write them.
 
 
 # %%
@@ -61,8 +63,8 @@ sleigh = Sleigh()
 # %% [markdown]
 # ## What kind of system is it?
 #
-# Before simulating, ask. Three speeds, one row, two degrees of freedom; the row is not integrable; and the growth vector (2, 3) says that from
-# two admissible velocities all three coordinates can be reached.
+# Before simulating, ask. Three speeds, one row, two degrees of freedom; the row is not integrable; and the
+# growth vector (2, 3) says that from two admissible velocities all three coordinates can be reached.
 
 # %%
 print(jj.report(sleigh))
@@ -70,7 +72,8 @@ print(jj.report(sleigh))
 # %% [markdown]
 # ## Let it go
 #
-# We give the forward speed of the mass centre, and how fast the sleigh turns. What we do not give (the sideways speed) follows from the blade.
+# We give the forward speed of the mass centre, and how fast the sleigh turns. What we do not give (the
+# sideways speed) follows from the blade.
 
 # %%
 v0, w0 = -0.6, 0.9
@@ -81,12 +84,13 @@ print(motion)
 # %% [markdown]
 # ## Compare with the closed form
 #
-# With $k^2 = (I + m a^2)/m$, Chaplygin found that $v^2 + k^2\omega^2 = V^2$ stays constant, and with $\tau = a V (t - t_0)/k^2$
+# With $k^2 = (I + m a^2)/m$, Chaplygin found that $v^2 + k^2\omega^2 = V^2$ stays constant, and with $\tau =
+# a V (t - t_0)/k^2$
 #
 # $$ v = V \tanh\tau, \qquad \omega = \frac{V}{k}\,\mathrm{sech}\,\tau . $$
 #
-# The sleigh always ends up going straight ahead, blade behind the mass centre, whichever way it started: it is reversible, energy is conserved, and
-# yet it behaves as if it were damped.
+# The sleigh always ends up going straight ahead, blade behind the mass centre, whichever way it started: it
+# is reversible, energy is conserved, and yet it behaves as if it were damped.
 
 # %%
 m, inertia, a = (float(x) for x in (sleigh.mass, sleigh.inertia, sleigh.offset))
@@ -96,14 +100,22 @@ tau = a * V * np.asarray(motion.ts) / k**2 + np.arctanh(v0 / V)
 heading = np.asarray(motion["heading"])
 forward = np.asarray(motion["x_rate"]) * np.cos(heading) + np.asarray(motion["y_rate"]) * np.sin(heading)
 
-error = max(np.max(np.abs(forward - V * np.tanh(tau))), np.max(np.abs(np.asarray(motion["heading_rate"]) - V / k / np.cosh(tau))))
+error = max(
+    np.max(np.abs(forward - V * np.tanh(tau))),
+    np.max(np.abs(np.asarray(motion["heading_rate"]) - V / k / np.cosh(tau))),
+)
 print(f"largest difference from the closed form: {error:.1e}")
 assert error < 1e-8
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
 left.plot(motion["x"], motion["y"], label="mass centre")
 left.plot(*np.asarray(motion.point("sleigh", (-a, 0.0, 0.0)))[:, :2].T, "--", label="blade")
-left.set(xlabel="x in m", ylabel="y in m", aspect="equal", title="the blade's path has a cusp, the centre's has none")
+left.set(
+    xlabel="x in m",
+    ylabel="y in m",
+    aspect="equal",
+    title="the blade's path has a cusp, the centre's has none",
+)
 left.legend()
 right.plot(motion.ts, forward, label="forward speed in m/s")
 right.plot(motion.ts, motion["heading_rate"], label="turning rate in rad/s")
@@ -116,14 +128,17 @@ fig.tight_layout()
 # %% [markdown]
 # ## Differentiate the simulation
 #
-# How does the heading at the end depend on where the mass centre lies? The simulation is one JAX function; `jax.grad` goes through it. From
-# $t = -\infty$ to $\infty$ the sleigh turns by $\pi k/a$, so more offset must mean less turning.
+# How does the heading at the end depend on where the mass centre lies? The simulation is one JAX function;
+# `jax.grad` goes through it. From $t = -\infty$ to $\infty$ the sleigh turns by $\pi k/a$, so more offset
+# must mean less turning.
 
 
 # %%
 def final_heading(offset):
     scene = sleigh.replace(offset=offset)
-    return jj.simulate(scene, jj.start(scene, x_rate=v0, heading_rate=w0), t1=12.0, rtol=1e-10, atol=1e-10).q_end[2]
+    return jj.simulate(
+        scene, jj.start(scene, x_rate=v0, heading_rate=w0), t1=12.0, rtol=1e-10, atol=1e-10
+    ).q_end[2]
 
 
 slope = jax.grad(final_heading)(0.25)

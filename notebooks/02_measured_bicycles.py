@@ -14,21 +14,30 @@
 # %% [markdown]
 # # Measured bicycles: at which speeds do they stay upright by themselves?
 #
-# Ten bicycles were taken apart, weighed, balanced and swung, and each of the 26 numbers of the Whipple model was published with its standard
-# deviation. We build the *nonlinear* bicycle (two rolling wheels, front contact found from geometry), linearise it about upright running, find
-# the speeds where it becomes stable and unstable, and carry the measured uncertainties through to these speeds.
+# Ten bicycles were taken apart, weighed, balanced and swung, and each of the 26 numbers of the Whipple model
+# was published with its standard deviation. We build the *nonlinear* bicycle (two rolling wheels, front
+# contact found from geometry), linearise it about upright running, find the speeds where it becomes stable
+# and unstable, and carry the measured uncertainties through to these speeds.
 
 # %%
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
-from jourdain_jax.bicycle import interval, linear_matrices, read_bicycle, sample_parameters, shipped_bicycles, stability_speeds
+from jourdain_jax.bicycle import (
+    interval,
+    linear_matrices,
+    read_bicycle,
+    sample_parameters,
+    shipped_bicycles,
+    stability_speeds,
+)
 
 # %% [markdown]
 # ## One bicycle
 #
-# The benchmark bicycle of Meijaard, Papadopoulos, Ruina and Schwab (2007) has no uncertainty and published results: stable from 4.29238253634111 to
+# The benchmark bicycle of Meijaard, Papadopoulos, Ruina and Schwab (2007) has no uncertainty and published
+# results: stable from 4.29238253634111 to
 # 6.02426201538837 m/s. The linear matrices below come from the nonlinear model by automatic differentiation, not from the published formulas.
 
 
@@ -48,8 +57,8 @@ assert abs(found.capsize_speed - 6.02426201538837) < 1e-10
 # %% [markdown]
 # ## Measured ones, with their uncertainty
 #
-# 500 bicycles are drawn around each measured one, all sigmas taken as independent (the files carry no covariance), and their speeds found in one
-# batch. The bar holds 95 % of the samples that have the speed.
+# 500 bicycles are drawn around each measured one, all sigmas taken as independent (the files carry no
+# covariance), and their speeds found in one batch. The bar holds 95 % of the samples that have the speed.
 
 # %%
 batch = jax.jit(jax.vmap(speeds_of))
@@ -60,15 +69,23 @@ for name in names:
     samples = sample_parameters(bicycle, jax.random.key(1), 500)
     speeds = batch(samples.by_name())
     nominal = speeds_of({key: jnp.asarray(value) for key, value in bicycle.values.items()})
-    limits = [interval(getattr(speeds, speed), nominal=getattr(nominal, speed), counted=samples.physical) for speed in ("weave_speed", "capsize_speed")]
+    limits = [
+        interval(getattr(speeds, speed), nominal=getattr(nominal, speed), counted=samples.physical)
+        for speed in ("weave_speed", "capsize_speed")
+    ]
     rows.append(limits)
     weave, capsize = limits
-    print(f"{name:<10} weave {weave.value:.3f} [{weave.low:.3f}, {weave.high:.3f}]   capsize {capsize.value:.3f} [{capsize.low:.3f}, {capsize.high:.3f}] m/s")
+    print(
+        f"{name:<10} weave {weave.value:.3f} [{weave.low:.3f}, {weave.high:.3f}]   capsize"
+        f" {capsize.value:.3f} [{capsize.low:.3f}, {capsize.high:.3f}] m/s"
+    )
 
 # %%
 fig, axis = plt.subplots(figsize=(8, 3.6), layout="constrained")
 for i, (weave, capsize) in enumerate(rows):
-    axis.plot([weave.value, capsize.value], [i, i], color="tab:green", lw=6, alpha=0.25, solid_capstyle="butt")
+    axis.plot(
+        [weave.value, capsize.value], [i, i], color="tab:green", lw=6, alpha=0.25, solid_capstyle="butt"
+    )
     for limit, colour in ((weave, "tab:blue"), (capsize, "tab:orange")):
         axis.plot([limit.low, limit.high], [i, i], color=colour, lw=2)
         axis.plot(limit.value, i, "o", color=colour)

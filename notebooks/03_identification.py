@@ -14,8 +14,9 @@
 # %% [markdown]
 # # Identification with uncertainty: what a sleigh tells about itself
 #
-# A Chaplygin sleigh is pushed and filmed. From its noisy track we estimate its inertia and the place of its mass centre, with honest intervals.
-# Then we ask for the mass as well, which the track cannot tell, and see that the engine says so instead of inventing a number.
+# A Chaplygin sleigh is pushed and filmed. From its noisy track we estimate its inertia and the place of its
+# mass centre, with honest intervals. Then we ask for the mass as well, which the track cannot tell, and see
+# that the engine says so instead of inventing a number.
 
 # %%
 import jax.numpy as jnp
@@ -27,7 +28,8 @@ import jourdain_jax as jj
 # %% [markdown]
 # ## A noisy measurement
 #
-# Twenty-five positions and headings in six seconds, with 5 mm and 0.01 rad of noise. The truth is known here, so that we can check the answer.
+# Twenty-five positions and headings in six seconds, with 5 mm and 0.01 rad of noise. The truth is known here,
+# so that we can check the answer.
 
 # %%
 truth = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
@@ -63,15 +65,20 @@ track.legend()
 for name, r in found.residuals[0].items():
     residuals.plot(ts, r, ".-", lw=0.6, label=name)
 residuals.axhspan(-1.96, 1.96, color="0.9")
-residuals.set(xlabel="t in s", ylabel="residual / sigma", title=f"reduced chi-square {float(found.reduced_chi_square):.2f}")
+residuals.set(
+    xlabel="t in s",
+    ylabel="residual / sigma",
+    title=f"reduced chi-square {float(found.reduced_chi_square):.2f}",
+)
 residuals.legend()
 plt.show()
 
 # %% [markdown]
 # ## Ask too much
 #
-# A track shows lengths and times, no forces: only $(I + m a^2)/m$ and $a$ can be told. With the mass free as well, one combination of mass and inertia
-# stays hidden. It is named, and neither gets an interval; the offset keeps its own.
+# A track shows lengths and times, no forces: only $(I + m a^2)/m$ and $a$ can be told. With the mass free as
+# well, one combination of mass and inertia stays hidden. It is named, and neither gets an interval; the
+# offset keeps its own.
 
 # %%
 asked = jj.fit(guess, data, free=("mass", "inertia", "offset"))

@@ -14,9 +14,10 @@
 # %% [markdown]
 # # Which discs fall? A study of many motions
 #
-# A disc that rolls fast enough stays up; a slow one falls over. Where the border lies depends on how it is let go. One simulation answers for one
-# start; here we run a hundred thousand, keep what matters of each in a folder that survives a crash, and ask which start value matters most. Then we ask a
-# measured bicycle where it falls, and which of its measurements deserves to be made again.
+# A disc that rolls fast enough stays up; a slow one falls over. Where the border lies depends on how it is
+# let go. One simulation answers for one start; here we run a hundred thousand, keep what matters of each in a
+# folder that survives a crash, and ask which start value matters most. Then we ask a measured bicycle where
+# it falls, and which of its measurements deserves to be made again.
 
 # %%
 import os
@@ -34,8 +35,9 @@ disc = jj.models.TiltingDisc()
 # %% [markdown]
 # ## Say what varies
 #
-# Lean, lean rate and spin are drawn by a Sobol sequence, which fills the space more evenly than random numbers do. Sample k follows from the seed
-# and k alone: the study may be cut into any pieces, stopped and continued, and every number keeps its bits.
+# Lean, lean rate and spin are drawn by a Sobol sequence, which fills the space more evenly than random
+# numbers do. Sample k follows from the seed and k alone: the study may be cut into any pieces, stopped and
+# continued, and every number keeps its bits.
 
 # %%
 start = {"lean": Uniform(-0.6, 0.6), "lean_rate": Normal(0.0, 0.3), "spin_rate": Uniform(-1.5, 0.0)}
@@ -45,16 +47,29 @@ study
 # %% [markdown]
 # ## Run it
 #
-# Of each motion we keep whether the disc fell within two seconds, when, and its largest lean. A fallen disc ends its lane at once, and another takes its place.
+# Of each motion we keep whether the disc fell within two seconds, when, and its largest lean. A fallen disc
+# ends its lane at once, and another takes its place.
 
 # %%
-outputs = {"fell": Happened("fallen"), "fall time": EventTime("fallen"), "largest lean": LargestMagnitude("lean", "rad")}
-asked = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 41), "rtol": 1e-6, "atol": 1e-6, "outputs": outputs, "progress": False}
+outputs = {
+    "fell": Happened("fallen"),
+    "fall time": EventTime("fallen"),
+    "largest lean": LargestMagnitude("lean", "rad"),
+}
+asked = {
+    "t1": 2.0,
+    "ts": np.linspace(0.0, 2.0, 41),
+    "rtol": 1e-6,
+    "atol": 1e-6,
+    "outputs": outputs,
+    "progress": False,
+}
 result = study.run("discs.zarr", **asked)
 result
 
 # %% [markdown]
-# The folder is a Zarr store. The same call again computes nothing: all chunks are there, and their checksums hold.
+# The folder is a Zarr store. The same call again computes nothing: all chunks are there, and their checksums
+# hold.
 
 # %%
 study.run("discs.zarr", **asked)
@@ -82,7 +97,8 @@ axes[1].set(xlabel="time of the fall (s)", ylabel="discs")
 axes[1].spines[["top", "right"]].set_visible(False)
 
 # %% [markdown]
-# Slow discs fall, and the more a disc leans, the more spin it needs. The one that fell first, alone, with all there is to know of its motion:
+# Slow discs fall, and the more a disc leans, the more spin it needs. The one that fell first, alone, with all
+# there is to know of its motion:
 
 # %%
 first = int(np.nanargmin(arrays["fall time"].values))
@@ -93,18 +109,32 @@ print(lane.simulate())
 # %% [markdown]
 # ## What matters most
 #
-# Sobol' indices share out the variance of the largest lean: of first order, what each start value does alone; in total, with all that it does together with
-# others. They need a design of their own, after Saltelli.
+# Sobol' indices share out the variance of the largest lean: of first order, what each start value does alone;
+# in total, with all that it does together with others. They need a design of their own, after Saltelli.
 
 # %%
-indices = jj.Study(disc, start=start, sampler="saltelli", samples=5 * 2**12, seed=7).run("indices.zarr", **asked).sensitivity("largest lean")
+indices = (
+    jj.Study(disc, start=start, sampler="saltelli", samples=5 * 2**12, seed=7)
+    .run("indices.zarr", **asked)
+    .sensitivity("largest lean")
+)
 indices
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3), layout="constrained")
 place = np.arange(3)
-axis.bar(place - 0.2, indices.first, 0.4, yerr=indices.first_half_width, capsize=3, color="#1f5fa8", label="first order")
-axis.bar(place + 0.2, indices.total, 0.4, yerr=indices.total_half_width, capsize=3, color="#b3470f", label="total")
+axis.bar(
+    place - 0.2,
+    indices.first,
+    0.4,
+    yerr=indices.first_half_width,
+    capsize=3,
+    color="#1f5fa8",
+    label="first order",
+)
+axis.bar(
+    place + 0.2, indices.total, 0.4, yerr=indices.total_half_width, capsize=3, color="#b3470f", label="total"
+)
 axis.set_xticks(place, [name.removesuffix("_at_start").replace("_", " ") for name in indices.names])
 axis.set_ylabel("share of variance")
 axis.legend(frameon=False)
@@ -113,15 +143,20 @@ axis.spines[["top", "right"]].set_visible(False)
 # %% [markdown]
 # ## Where a bicycle falls
 #
-# The Browser is a Dutch city bicycle that was measured at TU Delft and UC Davis; `measured_bicycle` knows its 25 numbers and their standard deviations. Here it
-# rides on its own for five seconds, from random speeds and leans. (`bench/ensemble_cases.py` does this with a million rides.)
+# The Browser is a Dutch city bicycle that was measured at TU Delft and UC Davis; `measured_bicycle` knows its
+# 25 numbers and their standard deviations. Here it rides on its own for five seconds, from random speeds and
+# leans. (`bench/ensemble_cases.py` does this with a million rides.)
 
 # %%
 from jourdain_jax.bicycle import linear_matrices, measured_bicycle, stability_speeds
 
 bicycle = measured_bicycle("Browser")
 radius = bicycle.values["rR"]
-start = {"rear_spin_rate": Uniform(1.0 / radius, 10.0 / radius), "lean": Uniform(-0.6, 0.6), "lean_rate": Normal(0.0, 0.2)}
+start = {
+    "rear_spin_rate": Uniform(1.0 / radius, 10.0 / radius),
+    "lean": Uniform(-0.6, 0.6),
+    "lean_rate": Normal(0.0, 0.2),
+}
 rides = jj.Study(bicycle.scene, start=start, sampler="sobol", samples=2**17, seed=7)
 asked = {"t1": 5.0, "rtol": 1e-6, "atol": 1e-6, "progress": False}
 ridden = rides.run("rides.zarr", outputs={"fell": Happened("fallen")}, **asked)
@@ -139,13 +174,15 @@ figure.colorbar(mesh, ax=axis, label="share that fell within 5 s")
 axis.set(xlabel="speed at the start (m/s)", ylabel="lean at the start (rad)")
 
 # %% [markdown]
-# Below 3 m/s it falls from any start. Beyond, the lean from which it recovers grows with the speed. The border has steps: a fall lasts longer with each swing
-# of the weave, and what has not fallen by five seconds counts as standing.
+# Below 3 m/s it falls from any start. Beyond, the lean from which it recovers grows with the speed. The
+# border has steps: a fall lasts longer with each swing of the weave, and what has not fallen by five seconds
+# counts as standing.
 #
 # ## Which measurement deserves to be made again?
 #
-# Above its weave speed this bicycle rides by itself. How well do we know that speed, and which of the 25 measured numbers is to blame for what we do not know?
-# No motion is needed: the design alone gives the samples, and `jj.studies.sobol_indices` takes whatever was computed from them.
+# Above its weave speed this bicycle rides by itself. How well do we know that speed, and which of the 25
+# measured numbers is to blame for what we do not know? No motion is needed: the design alone gives the
+# samples, and `jj.studies.sobol_indices` takes whatever was computed from them.
 
 # %%
 import jax
@@ -167,7 +204,13 @@ order = np.argsort(-of_weave.total)[:8]
 from jourdain_jax.bicycle.parameters import PARAMETERS
 
 figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-axis.barh(np.arange(8)[::-1], of_weave.total[order], xerr=of_weave.total_half_width[order], capsize=2, color="#b3470f")
+axis.barh(
+    np.arange(8)[::-1],
+    of_weave.total[order],
+    xerr=of_weave.total_half_width[order],
+    capsize=2,
+    color="#b3470f",
+)
 axis.set_yticks(np.arange(8)[::-1], [PARAMETERS[of_weave.names[k]]["about"] for k in order])
 axis.set_xlabel("total Sobol' index of the weave speed")
 axis.spines[["top", "right"]].set_visible(False)
@@ -176,8 +219,9 @@ axis.spines[["top", "right"]].set_visible(False)
 # Half of the variance comes from the tilt of the steer axis: that angle deserves a better measurement first.
 
 # %% [markdown]
-# The checks that hold this notebook to its numbers: every lane has a result, none failed, fast discs stay up, and the repeated lane is the stored one; slow
-# bicycles fall, fast ones that stand upright do not; and the steer axis comes first.
+# The checks that hold this notebook to its numbers: every lane has a result, none failed, fast discs stay up,
+# and the repeated lane is the stored one; slow bicycles fall, fast ones that stand upright do not; and the
+# steer axis comes first.
 
 # %%
 assert result.complete

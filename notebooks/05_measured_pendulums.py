@@ -14,9 +14,11 @@
 # %% [markdown]
 # # From pendulums to limits on the weave speed
 #
-# The parts of twelve bicycles were weighed, hung up, swung about an axle and twisted on a rod. From these readings follow the 26 parameters of the Whipple
-# bicycle. Files of parameters tell their standard deviations, but not that they came of the same readings: every moment of inertia shares the stiffness of
-# one rod. We go back to the readings, differentiate the way from them to the parameters, and ask what the covariance does to the limits on the weave speed.
+# The parts of twelve bicycles were weighed, hung up, swung about an axle and twisted on a rod. From these
+# readings follow the 26 parameters of the Whipple bicycle. Files of parameters tell their standard
+# deviations, but not that they came of the same readings: every moment of inertia shares the stiffness of one
+# rod. We go back to the readings, differentiate the way from them to the parameters, and ask what the
+# covariance does to the limits on the weave speed.
 
 # %%
 import jax
@@ -24,7 +26,14 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jourdain_jax.bicycle import benchmark_from_measurements, interval, linear_matrices, measured_bicycle, sample_parameters, shipped_measurements
+from jourdain_jax.bicycle import (
+    benchmark_from_measurements,
+    interval,
+    linear_matrices,
+    measured_bicycle,
+    sample_parameters,
+    shipped_measurements,
+)
 from jourdain_jax.bicycle import stability_speeds as speeds_of_matrices
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import read_readings
@@ -32,10 +41,12 @@ from jourdain_jax.bicycle.readings import read_readings
 # %% [markdown]
 # ## Readings
 #
-# Of the rear frame: a compound pendulum about the rear axle gives $I_{yy}$, since $T = 2\pi\sqrt{(I_{yy} + m l^2)/(m g l)}$. Clamped to a rod in three
-# orientations, it twists with $T_i = 2\pi\sqrt{n_i^\top I n_i/k}$, which gives the three moments in its plane. The line of the rod then passes through the
-# mass centre. Both pendulums are scenes, from which the periods come; the parameters are those with which the scenes have the periods that were timed, and
-# their derivatives with respect to the readings follow from the implicit function theorem.
+# Of the rear frame: a compound pendulum about the rear axle gives $I_{yy}$, since $T = 2\pi\sqrt{(I_{yy} + m
+# l^2)/(m g l)}$. Clamped to a rod in three orientations, it twists with $T_i = 2\pi\sqrt{n_i^\top I n_i/k}$,
+# which gives the three moments in its plane. The line of the rod then passes through the mass centre. Both
+# pendulums are scenes, from which the periods come; the parameters are those with which the scenes have the
+# periods that were timed, and their derivatives with respect to the readings follow from the implicit
+# function theorem.
 
 # %%
 readings = read_readings(shipped_measurements()["Browser"])
@@ -45,9 +56,10 @@ for name in ("mB", "TcB1", "alphaB1", "aB1", "TtB1", "TtP1"):
 # %% [markdown]
 # ## Against the published parameters
 #
-# Values and sigmas of 20 of the 26 parameters are the published ones to all their digits. The others depend on where the lines through a mass centre meet: the
-# published value is the mean over all pairs of lines, ours has the least squares of distances to the lines. With sigmas as they are stated, they differ by up
-# to 1.5 of them.
+# Values and sigmas of 20 of the 26 parameters are the published ones to all their digits. The others depend
+# on where the lines through a mass centre meet: the published value is the mean over all pairs of lines, ours
+# has the least squares of distances to the lines. With sigmas as they are stated, they differ by up to 1.5 of
+# them.
 
 # %%
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")
@@ -56,18 +68,24 @@ for bicycle_name in ("Browser", "Browserins", "Crescendo", "Fisher", "Pista", "Y
     apart = {n: (found.values[n] - published.values[n]) / published.sigmas[n] for n in PARAMETER_NAMES}
     ratio = {n: found.sigmas[n] / published.sigmas[n] for n in PARAMETER_NAMES}
     print(f"{bicycle_name:<11}" + "".join(f"  {n} {apart[n]:+.2f} ({ratio[n]:.2f})" for n in ABOUT_CENTRES))
-    assert all(abs(apart[n]) < 1e-6 and abs(ratio[n] - 1) < 1e-6 for n in PARAMETER_NAMES if n not in ABOUT_CENTRES)
+    assert all(
+        abs(apart[n]) < 1e-6 and abs(ratio[n] - 1) < 1e-6 for n in PARAMETER_NAMES if n not in ABOUT_CENTRES
+    )
     assert all(abs(apart[n]) < 1.5 for n in ABOUT_CENTRES)
 print("apart by so many published sigmas (our sigma over theirs)")
 
 # %% [markdown]
-# Two of the three lines of the Pista's frame are almost parallel. Where they meet is hardly known, and enters the mean as much as the other two crossings. Its
-# ellipse holds 95 %.
+# Two of the three lines of the Pista's frame are almost parallel. Where they meet is hardly known, and enters
+# the mean as much as the other two crossings. Its ellipse holds 95 %.
 
 
 # %%
 def draw_lines(axis, name, part="B"):
-    raw, ours, theirs = read_readings(shipped_measurements()[name]), benchmark_from_measurements(name), measured_bicycle(name)
+    raw, ours, theirs = (
+        read_readings(shipped_measurements()[name]),
+        benchmark_from_measurements(name),
+        measured_bicycle(name),
+    )
     angles = np.linspace(0, 2 * np.pi, 100)
     i, j = PARAMETER_NAMES.index(f"x{part}"), PARAMETER_NAMES.index(f"z{part}")
     square = ours.covariance[np.ix_([i, j], [i, j])]
@@ -82,7 +100,9 @@ def draw_lines(axis, name, part="B"):
         axis.plot(ends[0], -ends[1], color="0.6", lw=1)
     axis.plot(x + ellipse[0], -(z + ellipse[1]), color="tab:blue", label="least squares, 95 %")
     axis.plot(x, -z, "o", color="tab:blue")
-    axis.plot(theirs.values[f"x{part}"], -theirs.values[f"z{part}"], "s", color="tab:orange", label="published")
+    axis.plot(
+        theirs.values[f"x{part}"], -theirs.values[f"z{part}"], "s", color="tab:orange", label="published"
+    )
     axis.set(title=f"{name}, rear frame", xlabel="forward in m", ylabel="up in m", aspect="equal")
 
 
@@ -108,13 +128,17 @@ axis.set_title("Browser: correlation of parameters that come of the same reading
 fig.colorbar(image, shrink=0.8)
 plt.show()
 of = dict(zip(PARAMETER_NAMES, correlation, strict=True))
-print(f"IRxx and IFxx {of['IRxx'][PARAMETER_NAMES.index('IFxx')]:.3f}, mF and IFyy {of['mF'][PARAMETER_NAMES.index('IFyy')]:.2f}")
+print(
+    f"IRxx and IFxx {of['IRxx'][PARAMETER_NAMES.index('IFxx')]:.3f}, mF and IFyy"
+    f" {of['mF'][PARAMETER_NAMES.index('IFyy')]:.2f}"
+)
 assert of["IRxx"][PARAMETER_NAMES.index("IFxx")] > 0.99
 
 # %% [markdown]
 # ## What the covariance does to the limits
 #
-# The same parameters, drawn 500 times: as if independent, and with their covariance. Grey: the published file, as in the notebook on measured bicycles.
+# The same parameters, drawn 500 times: as if independent, and with their covariance. Grey: the published
+# file, as in the notebook on measured bicycles.
 
 
 # %%
@@ -123,7 +147,10 @@ def weave_speeds_of(values):
 
 
 # it is run a few times: what it costs is its compilation
-weave_speeds = jax.jit(weave_speeds_of, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0})
+weave_speeds = jax.jit(
+    weave_speeds_of,
+    compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
+)
 
 
 def limits(bicycle):
@@ -138,7 +165,13 @@ names, rows = ["Browser", "Crescendo", "Fisher", "Pista", "Yellow", "Stratos"], 
 for name in names:
     with_covariance = benchmark_from_measurements(name)
     independent = with_covariance.with_independent_errors
-    rows.append((limits(independent), limits(with_covariance), limits(measured_bicycle(name)) if name != "Stratos" else None))
+    rows.append(
+        (
+            limits(independent),
+            limits(with_covariance),
+            limits(measured_bicycle(name)) if name != "Stratos" else None,
+        )
+    )
     alone, together = rows[-1][:2]
     narrower = 100 * (1 - float((together.high - together.low) / (alone.high - alone.low)))
     print(
@@ -151,10 +184,16 @@ for name in names:
 fig, axis = plt.subplots(figsize=(8, 3.8), layout="constrained")
 for i, row in enumerate(rows):
     for limit, colour, label, up in zip(
-        row, ("tab:blue", "tab:green", "0.6"), ("sigmas independent", "with covariance", "published, independent"), (0.0, 0.2, -0.2), strict=True
+        row,
+        ("tab:blue", "tab:green", "0.6"),
+        ("sigmas independent", "with covariance", "published, independent"),
+        (0.0, 0.2, -0.2),
+        strict=True,
     ):
         if limit is not None:
-            axis.plot([limit.low, limit.high], [i + up, i + up], color=colour, lw=3, label=label if i == 0 else None)
+            axis.plot(
+                [limit.low, limit.high], [i + up, i + up], color=colour, lw=3, label=label if i == 0 else None
+            )
             axis.plot(limit.value, i + up, "o", color=colour, ms=5)
 axis.set_yticks(range(len(names)), names)
 axis.set(xlabel="weave speed in m/s", title="95 % limits on the weave speed, by what is known of the errors")

@@ -14,12 +14,14 @@
 # %% [markdown]
 # # A real bicycle: what impulse responses of a steer-by-wire bicycle tell
 #
-# The fork of this bicycle of TU Delft is turned by a motor; its handlebar was strapped to the frame, and nobody sat on it. On a treadmill, at eight speeds,
-# it was pushed sideways, and a controller steered it into the lean: it asked the motor for $T = k\,(6.5\ \mathrm{m/s} - v)\,\dot\varphi$,
-# $k = 2\ \mathrm{N\,s^2/rad}$, with the lean rate $\dot\varphi$ as the gyroscope showed it. The logs hold that command. So we have 57 responses of one
-# second with a known input, and ask what they tell.
+# The fork of this bicycle of TU Delft is turned by a motor; its handlebar was strapped to the frame, and
+# nobody sat on it. On a treadmill, at eight speeds, it was pushed sideways, and a controller steered it into
+# the lean: it asked the motor for $T = k\,(6.5\ \mathrm{m/s} - v)\,\dot\varphi$, $k = 2\
+# \mathrm{N\,s^2/rad}$, with the lean rate $\dot\varphi$ as the gyroscope showed it. The logs hold that
+# command. So we have 57 responses of one second with a known input, and ask what they tell.
 #
-# Data: github.com/mechmotum/sbw_bicycle_with_model_matching, MIT licence, (c) 2017-2022 G. Dialynas and S. Drauksas; `data/steer_by_wire/SOURCES.md`.
+# Data: github.com/mechmotum/sbw_bicycle_with_model_matching, MIT licence, (c) 2017-2022 G. Dialynas and S.
+# Drauksas; `data/steer_by_wire/SOURCES.md`.
 
 # %%
 import csv
@@ -41,15 +43,25 @@ from jourdain_jax.studies import Normal
 with gzip.open(Path("data/steer_by_wire/windows.csv.gz"), "rt") as file:
     rows = list(csv.DictReader(file))
 ts = 0.01 * np.arange(100)  # s
-windows = [{name: np.array([float(row[name]) for row in rows[k : k + 100]]) for name in rows[0]} for k in range(0, len(rows), 100)]
+windows = [
+    {name: np.array([float(row[name]) for row in rows[k : k + 100]]) for name in rows[0]}
+    for k in range(0, len(rows), 100)
+]
 speeds = np.array([window["speed"].mean() for window in windows])
 logs = np.array([window["log"][0] for window in windows])
 
 fig, axes = plt.subplots(1, 3, figsize=(11, 3), layout="constrained")
-for axis, name, label in zip(axes, ("lean_rate", "fork_rate", "command_fork"), ("lean rate in rad/s", "steer rate in rad/s", "command in N m"), strict=True):
+for axis, name, label in zip(
+    axes,
+    ("lean_rate", "fork_rate", "command_fork"),
+    ("lean rate in rad/s", "steer rate in rad/s", "command in N m"),
+    strict=True,
+):
     for log, colour in ((5.4, "tab:blue"), (9.0, "tab:green"), (18.0, "tab:orange")):
         for i, k in enumerate(np.flatnonzero(logs == log)):
-            axis.plot(ts, windows[k][name], color=colour, lw=0.8, label=f"{speeds[k]:.1f} m/s" if i == 0 else None)
+            axis.plot(
+                ts, windows[k][name], color=colour, lw=0.8, label=f"{speeds[k]:.1f} m/s" if i == 0 else None
+            )
     axis.set(xlabel="time in s", ylabel=label)
 axes[0].legend()
 plt.show()
@@ -71,11 +83,13 @@ plt.show()
 # | steer rate | difference of two angles 0.01 s apart | 0.005 s late |
 # | gyroscope | on a carrier that is "wonky" | its delay is estimated; its gain cannot be |
 #
-# The last one is no choice of ours. Responses are nearly linear: with motions and torques smaller by one factor, and the gains of both sensors larger by it,
-# all data stay as they are. One gain has to be known, and everything else is relative to the gyroscope.
+# The last one is no choice of ours. Responses are nearly linear: with motions and torques smaller by one
+# factor, and the gains of both sensors larger by it, all data stay as they are. One gain has to be known, and
+# everything else is relative to the gyroscope.
 #
-# The drift is one number for all windows. At the start of each window four values are unknown. Lean and steer have been measured, so they have priors:
-# without these, and without the drift, a fit moves the lean at the start far from where it was measured, to make up for what the scene does not have.
+# The drift is one number for all windows. At the start of each window four values are unknown. Lean and steer
+# have been measured, so they have priors: without these, and without the drift, a fit moves the lean at the
+# start far from where it was measured, to make up for what the scene does not have.
 
 
 # %%
@@ -83,7 +97,9 @@ class SteerByWire(WhippleBicycle):
     """A Whipple bicycle whose fork is turned by a motor behind a gear, with friction."""
 
     gain: jnp.ndarray = jj.parameter(1.0, about="torque of the motor over its command")
-    turned: jnp.ndarray = jj.parameter(0.035, unit="kg m^2", non_negative=True, about="inertia of the rotor, seen from the fork")
+    turned: jnp.ndarray = jj.parameter(
+        0.035, unit="kg m^2", non_negative=True, about="inertia of the rotor, seen from the fork"
+    )
     friction: jnp.ndarray = jj.parameter(0.2, unit="N m", non_negative=True)
     steer_damping: jnp.ndarray = jj.parameter(0.5, unit="N m s/rad", non_negative=True)
     lean_damping: jnp.ndarray = jj.parameter(5.0, unit="N m s/rad")
@@ -98,8 +114,15 @@ class SteerByWire(WhippleBicycle):
 
     def loads(self, motion):
         u = motion.u
-        steer = self.gain * motion.inputs.steer_torque + self.drift - self.steer_damping * u.steer_rate - self.friction * jnp.tanh(u.steer_rate / 0.05)
-        return jj.gravity(motion, self.g), jj.generalized_force(motion, lean_rate=-self.lean_damping * u.lean_rate, steer_rate=steer)
+        steer = (
+            self.gain * motion.inputs.steer_torque
+            + self.drift
+            - self.steer_damping * u.steer_rate
+            - self.friction * jnp.tanh(u.steer_rate / 0.05)
+        )
+        return jj.gravity(motion, self.g), jj.generalized_force(
+            motion, lean_rate=-self.lean_damping * u.lean_rate, steer_rate=steer
+        )
 
 
 nominal = SteerByWire(
@@ -123,15 +146,33 @@ late = {
 
 def run_of(window, sensors):
     """One window; the first 0.05 s wait for the sensors."""
-    start = {"lean": window["lean_angle"][0], "lean_rate": window["lean_rate"][0], "steer": window["fork_angle"][0], "steer_rate": window["fork_rate"][0]}
+    start = {
+        "lean": window["lean_angle"][0],
+        "lean_rate": window["lean_rate"][0],
+        "steer": window["fork_angle"][0],
+        "steer_rate": window["fork_rate"][0],
+    }
     unknown = {
         "lean": jj.Estimate(prior=Normal(start["lean"], 0.02)), "steer": jj.Estimate(prior=Normal(start["steer"], 0.03)),
         "lean_rate": unbounded(0.3), "steer_rate": unbounded(0.5),
     }  # fmt: skip
-    values = {"lean_rate": np.where(ts < 0.0499, np.nan, window["lean_rate"]), "steer_rate": np.where(ts < 0.0499, np.nan, window["fork_rate"])}
+    values = {
+        "lean_rate": np.where(ts < 0.0499, np.nan, window["lean_rate"]),
+        "steer_rate": np.where(ts < 0.0499, np.nan, window["fork_rate"]),
+    }
     start["rear_spin_rate"] = window["speed"].mean() / 0.3498
-    torque = Actuator(jj.Sampled(ts, window["command_fork"]), hold=True)  # the controller holds a command for 0.01 s
-    return jj.Experiment(ts, values, SIGMA, start=start, unknown_start=unknown, inputs={"steer_torque": torque}, sensors=sensors)
+    torque = Actuator(
+        jj.Sampled(ts, window["command_fork"]), hold=True
+    )  # the controller holds a command for 0.01 s
+    return jj.Experiment(
+        ts,
+        values,
+        SIGMA,
+        start=start,
+        unknown_start=unknown,
+        inputs={"steer_torque": torque},
+        sensors=sensors,
+    )
 
 
 # %% [markdown]
@@ -142,7 +183,10 @@ def run_of(window, sensors):
 # %%
 guess = nominal.replace(turned=0.035, friction=0.3, steer_damping=0.5, lean_damping=5.0, drift=-0.1)
 parts = {"odd": windows[::2], "even": windows[1::2]}
-halves = {name: jj.fit(guess, [run_of(window, late) for window in part], free, rtol=1e-6, atol=1e-6, errors="runs") for name, part in parts.items()}
+halves = {
+    name: jj.fit(guess, [run_of(window, late) for window in part], free, rtol=1e-6, atol=1e-6, errors="runs")
+    for name, part in parts.items()
+}
 odd, even = halves.values()
 shared = [label for label in odd.labels if not label.startswith("run ")]
 print(f"{'':<16}{'odd windows':>20}{'even windows':>20}  apart, in standard errors")
@@ -150,9 +194,15 @@ apart = {}
 for name in shared:
     a, b = odd[name], even[name]
     apart[name] = float(abs(a.value - b.value) / np.hypot(a.standard_error, b.standard_error))
-    print(f"{name:<16}{a.value:10.4f} +- {a.standard_error:6.4f}{b.value:10.4f} +- {b.standard_error:6.4f}  {apart[name]:.1f}")
+    print(
+        f"{name:<16}{a.value:10.4f} +- {a.standard_error:6.4f}{b.value:10.4f} +- {b.standard_error:6.4f} "
+        f" {apart[name]:.1f}"
+    )
 for name, half in halves.items():
-    print(f"{name}: converged {bool(half.converged)}, {int(half.steps)} steps, bodies that cannot be: {len(half.impossible)}")
+    print(
+        f"{name}: converged {bool(half.converged)}, {int(half.steps)} steps, bodies that cannot be:"
+        f" {len(half.impossible)}"
+    )
 assert odd.converged
 assert even.converged
 assert max(odd.steps, even.steps) < 50
@@ -163,8 +213,9 @@ assert not even.impossible
 # %% [markdown]
 # ## Windows that were held out
 #
-# Each half predicts the windows of the other one; of these, the four start values alone are fitted. Beside it, the bicycle as the authors have it: their
-# numbers, a motor that does as it is told, no friction, ideal sensors.
+# Each half predicts the windows of the other one; of these, the four start values alone are fitted. Beside
+# it, the bicycle as the authors have it: their numbers, a motor that does as it is told, no friction, ideal
+# sensors.
 
 
 # %%
@@ -176,7 +227,10 @@ def residuals(scene, part, sensors):
 
 def sensors_of(half):
     known = {name: half[name].value for name in ("lean_rate.delay", "steer_rate.gain")}
-    return {"lean_rate": Sensor(delay=known["lean_rate.delay"]), "steer_rate": Sensor(gain=known["steer_rate.gain"], delay=0.005)}
+    return {
+        "lean_rate": Sensor(delay=known["lean_rate.delay"]),
+        "steer_rate": Sensor(gain=known["steer_rate.gain"], delay=0.005),
+    }
 
 
 def rms(values):
@@ -189,12 +243,21 @@ def neighbours(values):
     return float(np.sum(inside[:, 1:] * inside[:, :-1]) / np.sum(inside**2))
 
 
-out = {"odd": residuals(odd.scene, parts["even"], sensors_of(odd)), "even": residuals(even.scene, parts["odd"], sensors_of(even))}
+out = {
+    "odd": residuals(odd.scene, parts["even"], sensors_of(odd)),
+    "even": residuals(even.scene, parts["odd"], sensors_of(even)),
+}
 # ideal sensors, to nine digits: the same compiled program serves
 ideal = {"lean_rate": Sensor(delay=1e-9), "steer_rate": Sensor(gain=1.0 + 1e-9, delay=0.005)}
 plain = residuals(nominal, windows, ideal)
-for what, left in (*((f"fitted to {name} windows, the others", left) for name, left in out.items()), ("the authors' numbers, all windows", plain)):
-    told = ", ".join(f"{name} {rms(left[name]):.3f} rad/s (neighbours correlate by {neighbours(left[name]):.2f})" for name in SIGMA)
+for what, left in (
+    *((f"fitted to {name} windows, the others", left) for name, left in out.items()),
+    ("the authors' numbers, all windows", plain),
+):
+    told = ", ".join(
+        f"{name} {rms(left[name]):.3f} rad/s (neighbours correlate by {neighbours(left[name]):.2f})"
+        for name in SIGMA
+    )
     print(f"{what}: {told}")
 assert max(rms(left["lean_rate"]) for left in out.values()) <= 0.027
 assert rms(plain["lean_rate"]) > 0.04
@@ -202,26 +265,32 @@ assert rms(plain["lean_rate"]) > 0.04
 # %% [markdown]
 # ## The weave eigenvalue over speed
 #
-# What a laboratory often does with such responses: fit $c_1 + e^{\sigma t}(c_2 \cos\omega t + c_3 \sin\omega t)$ to the lean rate of each, which asks for no
-# scene at all. $\sigma + i\omega$ is the weave eigenvalue of bicycle and controller together. From the scene it follows by its linear equations at that speed,
+# What a laboratory often does with such responses: fit $c_1 + e^{\sigma t}(c_2 \cos\omega t + c_3 \sin\omega
+# t)$ to the lean rate of each, which asks for no scene at all. $\sigma + i\omega$ is the weave eigenvalue of
+# bicycle and controller together. From the scene it follows by its linear equations at that speed,
 #
 # $$\det\left(M s^2 + (C + D) s + K - g\,k\,(6.5 - v)\,s\,e^{-s\tau}\,e_2 e_1^\top\right) = 0,$$
 #
-# with the gain $g$ of the motor, the delay $\tau$ of the gyroscope, and dampings $D$. Friction is no linear thing: at a steer rate of amplitude $a$ it takes as
-# much energy as a damping of $4F/\pi a$. We take $a$ from the windows at that speed; the band is for half of it and twice as much.
+# with the gain $g$ of the motor, the delay $\tau$ of the gyroscope, and dampings $D$. Friction is no linear
+# thing: at a steer rate of amplitude $a$ it takes as much energy as a damping of $4F/\pi a$. We take $a$ from
+# the windows at that speed; the band is for half of it and twice as much.
 
 
 # %%
 def eigenvalues(scene, late, amplitude):
-    """The weave eigenvalue at the speeds of the grid, 1/s: followed from the fastest down to the slowest by Newton's method."""
+    """The weave eigenvalue at the speeds of the grid, 1/s: followed from the fastest down to the slowest by
+    Newton's method.
+    """
     of = linear_matrices({name: getattr(scene, name) for name in PARAMETER_NAMES})
     M, C1, K0, K2 = (np.asarray(x) for x in (of.M, of.C1, of.K0 * of.g, of.K2))
     M = M + np.diag([0.0, float(scene.turned)])
     found = []
     for v, a in zip(grid[::-1], amplitude[::-1], strict=True):
-        C = C1 * v + np.diag([float(scene.lean_damping), float(scene.steer_damping + 4 * scene.friction / (np.pi * a))])
+        C = C1 * v + np.diag(
+            [float(scene.lean_damping), float(scene.steer_damping + 4 * scene.friction / (np.pi * a))]
+        )
         K, back = K0 + K2 * v**2, float(scene.gain) * 2.0 * (6.5 - v) * np.array([[0.0, 0.0], [1.0, 0.0]])
-        det = lambda s, C=C, K=K, back=back: np.linalg.det(M * s**2 + (C - back * np.exp(-s * late)) * s + K)  # noqa: E731
+        det = lambda s, C=C, K=K, back=back: np.linalg.det(M * s**2 + (C - back * np.exp(-s * late)) * s + K)
         s = found[-1] if found else -2.0 + 9.0j
         for _ in range(20):
             s = s - det(s) * 2e-6 / (det(s + 1e-6) - det(s - 1e-6))
@@ -234,19 +303,38 @@ def damped(t, decay, frequency, c1, c2, c3):
 
 
 measured = np.array(
-    [scipy.optimize.curve_fit(damped, ts, one["lean_rate"], (-2.5, 8.0, 0.0, one["lean_rate"][0], 0.0), maxfev=20_000)[0][:2] for one in windows]
+    [
+        scipy.optimize.curve_fit(
+            damped, ts, one["lean_rate"], (-2.5, 8.0, 0.0, one["lean_rate"][0], 0.0), maxfev=20_000
+        )[0][:2]
+        for one in windows
+    ]
 )
-amplitudes = {log: np.sqrt(2) * rms([windows[k]["fork_rate"] / 0.9 for k in np.flatnonzero(logs == log)]) for log in np.unique(logs)}
+amplitudes = {
+    log: np.sqrt(2) * rms([windows[k]["fork_rate"] / 0.9 for k in np.flatnonzero(logs == log)])
+    for log in np.unique(logs)
+}
 middle = {log: speeds[logs == log].mean() for log in np.unique(logs)}
 grid = np.linspace(1.48, 5.16, 47)
 usual = np.interp(grid, list(middle.values()), list(amplitudes.values()))
 delays = {name: float(half["lean_rate.delay"].value) for name, half in halves.items()}
-fitted = {name: [eigenvalues(half.scene, delays[name], scale * usual) for scale in (1.0, 0.5, 2.0)] for name, half in halves.items()}
+fitted = {
+    name: [eigenvalues(half.scene, delays[name], scale * usual) for scale in (1.0, 0.5, 2.0)]
+    for name, half in halves.items()
+}
 theirs = eigenvalues(nominal, 0.0, usual)
 
 fig, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-for axis, part, label in zip(axes, (np.real, np.imag), ("real part in 1/s", "imaginary part in rad/s"), strict=True):
-    axis.plot(speeds, measured[:, 0] if part is np.real else np.abs(measured[:, 1]), "k.", ms=4, label="damped exponential, each window")
+for axis, part, label in zip(
+    axes, (np.real, np.imag), ("real part in 1/s", "imaginary part in rad/s"), strict=True
+):
+    axis.plot(
+        speeds,
+        measured[:, 0] if part is np.real else np.abs(measured[:, 1]),
+        "k.",
+        ms=4,
+        label="damped exponential, each window",
+    )
     axis.plot(grid, part(theirs), color="0.4", ls="--", label="the authors' numbers")
     for (name, (mean, low, high)), colour in zip(fitted.items(), ("tab:blue", "tab:green"), strict=True):
         axis.plot(grid, part(mean), color=colour, label=f"fitted to {name} windows")
@@ -276,7 +364,8 @@ assert from_3[:, 0].max() < 0.4 < 0.8 < from_3[:, 1].min()
 # - Halves agree, with possible bodies, and predict each other to 0.02 rad/s of lean rate. From 3 m/s on, the frequency of weave is that of the damped
 #   exponentials to 0.4 rad/s; the authors' numbers put it 0.9 rad/s and more too high.
 # - The decay of weave is stronger than that of the exponentials, slightly at 5 m/s and by a factor of two at 2 m/s. There, friction stops the fork before the
-#   window ends: the response is no exponential, and no equivalent damping stands for that. The authors' numbers agree better with these decays.
+# window ends: the response is no exponential, and no equivalent damping stands for that. The authors' numbers
+# agree better with these decays.
 # - The moment of inertia of the frame about the vertical, 2.8 and 3.1 kg m², is near the 2.7 that the authors found to fit better; that about the roll axis
 #   is hardly known: its standard error is as large as its prior.
 # - A lean damping of 22 N m s/rad has no cause in a bicycle without a rider, and 0.027 s is long for a gyroscope. Both may stand for what this scene lacks,

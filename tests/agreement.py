@@ -13,15 +13,18 @@ def admissible_states(scene: jj.Scene, count, seed=0):
 
 
 def disagreement(scene: jj.Scene, count=20, seed=0):
-    """Largest difference of accelerations and constraint forces from those by QR, relative to the largest at each state.
+    """Largest difference of accelerations and constraint forces from those by QR, relative to the largest at
+    each state.
 
-    The size of forces is the largest of constraint, impressed and inertia forces, for scenes without constraints. Reductions that
-    say that they do not apply at some state are left out.
+    The size of forces is the largest of constraint, impressed and inertia forces, for scenes without
+    constraints. Reductions that say that they do not apply at some state are left out.
     """
     by_name = jj.reductions(scene)
 
     def all_of_them(t, q, u):
-        found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
+        found = {
+            name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()
+        }
         equations = unconstrained_equations(scene, t, q, u)
         forces = np.stack([equations.h, equations.Q, found["qr"].constraint_force])
         sizes = np.max(np.abs(found["qr"].udot)), np.max(np.abs(forces))

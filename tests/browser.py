@@ -1,4 +1,6 @@
-"""Pages in headless Chromium (Debian's `chromium`), drawn by software: screenshots for tests that look at pixels."""
+"""Pages in headless Chromium (Debian's `chromium`), drawn by software: screenshots for tests that look at
+pixels.
+"""
 
 import os
 import shutil
@@ -9,17 +11,38 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))),
+    None,
+)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 # no network: every host name is unknown, but for this machine
-_FLAGS = "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars --no-first-run --disable-extensions"
+_FLAGS = (
+    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars"
+    " --no-first-run --disable-extensions"
+)
 
 
 def _run(url, *flags: str, budget=4000):
     with tempfile.TemporaryDirectory() as profile:
         hosts = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE localhost"
-        command = [str(CHROMIUM), *_FLAGS.split(), hosts, f"--user-data-dir={profile}", f"--virtual-time-budget={budget}", *flags, url]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=os.environ | {"HOME": profile}, check=False)
+        command = [
+            str(CHROMIUM),
+            *_FLAGS.split(),
+            hosts,
+            f"--user-data-dir={profile}",
+            f"--virtual-time-budget={budget}",
+            *flags,
+            url,
+        ]
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env=os.environ | {"HOME": profile},
+            check=False,
+        )
     return done.stdout
 
 

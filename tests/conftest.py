@@ -15,21 +15,40 @@ import psutil
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long. Timings are taken in
-# `bench/`, with none of this.
-quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
+# Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as
+# long. Timings are taken in `bench/`, with none of this.
+quick = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    " --xla_cpu_parallel_codegen_split_count=1"
+)
 # Of loops as large as a motion these passes take a fourth of XLA's time.
 quick += " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # from 0.11.1 on, an unknown flag
     quick += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", quick)
-os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line numbers for each operation of a program
+os.environ.setdefault(
+    "JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0"
+)  # no line numbers for each operation of a program
 
-# Every annotated function of these layers that is not inside of another is checked, shapes and dtypes included. Not in the layers whose small
-# functions are called a million times while scenes are traced: there it takes a tenth of the time of all tests.
-LAYERS = ("equations", "dynamics", "integrate", "motion", "analysis", "identification", "studies", "models", "bicycle", "views", "cli")
+# Every annotated function of these layers that is not inside of another is checked, shapes and dtypes
+# included. Not in the layers whose small functions are called a million times while scenes are traced: there
+# it takes a tenth of the time of all tests.
+LAYERS = (
+    "equations",
+    "dynamics",
+    "integrate",
+    "motion",
+    "analysis",
+    "identification",
+    "studies",
+    "models",
+    "bicycle",
+    "views",
+    "cli",
+)
 
-# What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
+# What takes longest, longest first: started last, one of these would keep one worker busy while the others
+# have nothing to do.
 LONGEST = """
 friction modes sides held_rows crossings linearize identify malformed_inputs native_mutants inertia gpu mutants
 periodic study_faults result_codes load_jumps native events feasible_starts types stiff sensors log_density simulate
@@ -38,7 +57,9 @@ quality native_functions native_derivatives call_costs rows_lost_at_rest extreme
 """
 
 
-SLOW = frozenset(line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#"))
+SLOW = frozenset(
+    line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#")
+)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks at marks
@@ -53,7 +74,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish(session):
-    """Tracing makes millions of objects that live for a moment: what is there for good is not looked through again and again for garbage among it."""
+    """Tracing makes millions of objects that live for a moment: what is there for good is not looked through
+    again and again for garbage among it.
+    """
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
     gc.enable()
@@ -64,16 +87,20 @@ CHECKED: set = set()  # annotated functions that the file has called
 
 @pytest.fixture(autouse=True, scope="module")
 def _types_are_checked():
-    """In the first call of each function in each file: in every call, checks took a tenth of the time of all tests."""
+    """In the first call of each function in each file: in every call, checks took a tenth of the time of all
+    tests.
+    """
     CHECKED.clear()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _less_effort():
-    """Machine code of our own is made with less effort, which changes no bit of a number, and XLA's programs of a file share a context of MLIR.
+    """Machine code of our own is made with less effort, which changes no bit of a number, and XLA's programs
+    of a file share a context of MLIR.
 
-    JAX makes one for each, at 3 ms and a megabyte. A program that is lowered while another is gets its own. And JAX does not note for each operation
-    all the lines that led to it, which took 3 to 5 % of a first motion.
+    JAX makes one for each, at 3 ms and a megabyte. A program that is lowered while another is gets its own.
+    And JAX does not note for each operation all the lines that led to it, which took 3 to 5 % of a first
+    motion.
     """
     from jax._src import source_info_util
     from jax._src.interpreters import mlir
@@ -101,9 +128,11 @@ MOST_RESIDENT = 1.9e9  # bytes of a process between files: two workers, with wha
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
-    """Compiled programs are dropped after a file where they hold much memory: machine code and its memory maps, of which a process may have 65530.
+    """Compiled programs are dropped after a file where they hold much memory: machine code and its memory
+    maps, of which a process may have 65530.
 
-    What a file leaves behind is kept by caches: it is not searched for garbage until these are emptied, or else the search takes longer from file to file.
+    What a file leaves behind is kept by caches: it is not searched for garbage until these are emptied, or
+    else the search takes longer from file to file.
     """
     yield
     if psutil.Process().memory_info().rss > MOST_RESIDENT:
@@ -133,7 +162,11 @@ def drawn(monkeypatch):
     from matplotlib.figure import Figure
 
     figures, written = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *given, **named: figures.append(self) or written(self, *given, **named))
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda self, *given, **named: figures.append(self) or written(self, *given, **named),
+    )
     return figures
 
 
@@ -143,16 +176,21 @@ def compilations():
     import jax
 
     found: list = []
-    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: found.append(event) if event.endswith("backend_compile_duration") else None)
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: found.append(event) if event.endswith("backend_compile_duration") else None
+    )
     return found
 
 
 def pytest_configure(config):
-    """In a process that runs tests: run-time checks; machine code of our own is kept in pytest's cache, so that a second run does not make it again.
+    """In a process that runs tests: run-time checks; machine code of our own is kept in pytest's cache, so
+    that a second run does not make it again.
 
     Programs that XLA compiles are not kept: working out the key of each takes a tenth of its compilation.
     """
-    config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above
+    config.option.loadscopereorder = (
+        False  # pytest-xdist would hand out files by their number of tests, and not in the order above
+    )
     if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
     gc.disable()  # until all tests are collected: what imports make is there for good
@@ -166,7 +204,9 @@ def pytest_configure(config):
     visit = _import_hook.JaxtypingTransformer.visit_FunctionDef
 
     def without_inner_functions(transformer, node):
-        """These are made anew with each call of the one around them: making their checks anew each time took a tenth of the time of all tests."""
+        """These are made anew with each call of the one around them: making their checks anew each time took
+        a tenth of the time of all tests.
+        """
         body, node.body = node.body, []
         visit(transformer, node)
         node.body = body
@@ -175,7 +215,9 @@ def pytest_configure(config):
     jaxtyped = jaxtyping.jaxtyped
 
     def checked_first(function, typechecker):
-        """The function, checked the first time that a file of tests calls it; a class with its fields checked, each time that one is made."""
+        """The function, checked the first time that a file of tests calls it; a class with its fields
+        checked, each time that one is made.
+        """
         if isinstance(function, type):
             return jaxtyped(function, typechecker=typechecker)
         checked = cache(lambda: jaxtyped(function, typechecker=typechecker))  # where it is called
@@ -187,13 +229,17 @@ def pytest_configure(config):
             CHECKED.add(function)
             return checked()(*args, **kwargs)
 
-        call.__code__ = call.__code__.replace(co_filename=jaxtyping._decorator.__file__)  # in tracebacks no line of a user
+        call.__code__ = call.__code__.replace(
+            co_filename=jaxtyping._decorator.__file__
+        )  # in tracebacks no line of a user
         return call
 
     if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
         jaxtyping.jaxtyped = lambda typechecker: partial(checked_first, typechecker=typechecker)
         _import_hook.JaxtypingTransformer.visit_FunctionDef = without_inner_functions
-        install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
+        install_import_hook(
+            [f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype"
+        )  # before any import of the package
 
 
 def pytest_sessionfinish(session, exitstatus):

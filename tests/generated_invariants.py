@@ -1,7 +1,9 @@
-"""What must hold of every scene at every admissible state, as residuals relative to the size of what is compared.
+"""What must hold of every scene at every admissible state, as residuals relative to the size of what is
+compared.
 
-`evaluated` works everything out in one program per structure, with parameters, states and ways of looking (`seen_differently`) as batches: on NumPy
-without compiling, or compiled. `residuals` compares; a reduction is judged where it says that it applies.
+`evaluated` works everything out in one program per structure, with parameters, states and ways of looking
+(`seen_differently`) as batches: on NumPy without compiling, or compiled. `residuals` compares; a reduction is
+judged where it says that it applies.
 """
 
 from functools import partial
@@ -19,7 +21,15 @@ from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, presen
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.equations import GibbsAppell, coordinate_rates, gibbs_function, kinetic_energy, partial_velocities, potential_energy, velocity_residual
+from jourdain_jax.equations import (
+    GibbsAppell,
+    coordinate_rates,
+    gibbs_function,
+    kinetic_energy,
+    partial_velocities,
+    potential_energy,
+    velocity_residual,
+)
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
@@ -30,11 +40,15 @@ from jourdain_jax.scene.identity import reference_parameters
 from jourdain_jax.structure.trace import power_of_loads
 
 PUSH = 0.7  # value of the input, where a scene has one
-NEAR = 0.03  # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is left out
+# smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is
+# left out
+NEAR = 0.03
 
 
 def instances(recipe: Recipe, parameters, states, seed):
-    """Scenes with random parameters as one batch, the first of them alone, and states off the rows: (t, q, u), `states` of them for each scene."""
+    """Scenes with random parameters as one batch, the first of them alone, and states off the rows: (t, q,
+    u), `states` of them for each scene.
+    """
     scenes = [generated(recipe, seed + k) for k in range(parameters)]
     draw = np.random.default_rng([recipe.seed, seed, 7])
     scene = scenes[0]
@@ -56,24 +70,34 @@ def dimensions(recipe: Recipe):
 
 
 def evaluated(recipe: Recipe, *, parameters, states, seed=0, compiled=False, looks=True):
-    """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen differently."""
+    """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen
+    differently.
+    """
     stacked, scene, t, q, u = instances(recipe, parameters, states, seed)
     run = jax.jit if compiled else partial(uncompiled_lanes, shared=None)
     leaves, treedef = jax.tree.flatten(stacked)
     leaves = [np.repeat(x, states, axis=0) for x in leaves]
 
     def plain(leaves, t, q, u, sign):
-        return jax.vmap(lambda leaves, *state: _plain(jax.tree.unflatten(treedef, leaves), *state))(leaves, t, q, u, sign)
+        return jax.vmap(lambda leaves, *state: _plain(jax.tree.unflatten(treedef, leaves), *state))(
+            leaves, t, q, u, sign
+        )
 
     names, ways = views(len(scene.coordinate_names), len(scene.speed_names))
 
     def seen(leaves, ways, *state):
-        return jax.vmap(lambda leaves, *view_and_state: _seen(recipe, jax.tree.unflatten(treedef, leaves), *view_and_state))(leaves, ways, *state)
+        return jax.vmap(
+            lambda leaves, *view_and_state: _seen(
+                recipe, jax.tree.unflatten(treedef, leaves), *view_and_state
+            )
+        )(leaves, ways, *state)
 
     with reference_parameters(scene):
         both = [np.concatenate([x, x]) for x in (*leaves, t, q, u)]
         found = jax.tree.map(np.asarray, run(plain)(both[:-3], *both[-3:], np.repeat([1.0, -1.0], len(t))))
-        forwards, backwards = (jax.tree.map(lambda x, half=half: x[half], found) for half in (slice(len(t)), slice(len(t), None)))
+        forwards, backwards = (
+            jax.tree.map(lambda x, half=half: x[half], found) for half in (slice(len(t)), slice(len(t), None))
+        )
         forwards["reversed"] = backwards["udot"]
         if not looks:
             return forwards
@@ -110,16 +134,29 @@ def _bases(independent, equations, rows):
         R = jnp.where(there[:, None] & there, mixed, jnp.eye(n))
         other[name] = _by_null_space(problem, basis @ R)[0]
     C = jnp.where(split.pivot() > NEAR, split.C, 0.0)
-    return {"A": problem.A, "Z": Z, "C": C, "other bases": other, "M": problem.M, "sigma": jnp.linalg.svd(problem.M, compute_uv=False)[-1]}
+    return {
+        "A": problem.A,
+        "Z": Z,
+        "C": C,
+        "other bases": other,
+        "M": problem.M,
+        "sigma": jnp.linalg.svd(problem.M, compute_uv=False)[-1],
+    }
 
 
 def _accelerations(scene, ways, t, q, u, inputs):
     """By every reduction, and the equations and rows they came from."""
     equations, rows = equations_module.equations_and_rows(scene, t, q, u, inputs)
     gibbs = {name: way for name, way in ways.items() if isinstance(way, GibbsAppell)}
-    rows = ConstraintRows(rows.phi, rows.A, rows.drift, ())  # without names, so that one trace serves all rows of one shape
+    rows = ConstraintRows(
+        rows.phi, rows.A, rows.drift, ()
+    )  # without names, so that one trace serves all rows of one shape
     found = _solved({name: way for name, way in ways.items() if name not in gibbs}, equations, rows)
-    return found | {name: way.accelerations(scene, t, q, u, equations, rows) for name, way in gibbs.items()}, equations, rows
+    return (
+        found | {name: way.accelerations(scene, t, q, u, equations, rows) for name, way in gibbs.items()},
+        equations,
+        rows,
+    )
 
 
 def _seen(recipe: Recipe, scene, view, t, q, u, rate):
@@ -154,21 +191,33 @@ def _plain(scene, t, q, u, sign):
     c = scaled(equations, rows).c
     motion = jj.motion_at(scene, t, q, u, inputs)
     along = jnp.cos(1.0 + jnp.arange(u.shape[0])) / c  # any direction, for Hessians
-    h, M_along = jax.jvp(jax.grad(lambda a: gibbs_function(scene, t, q, u, a)), (jnp.zeros_like(u),), (along,))
+    h, M_along = jax.jvp(
+        jax.grad(lambda a: gibbs_function(scene, t, q, u, a)), (jnp.zeros_like(u),), (along,)
+    )
 
     def T(u, t=t, q=q):
         return kinetic_energy(scene, t, q, u)
 
     def energies(t, q, u):
-        return T(u, t, q), potential_energy(scene, jj.motion_at(scene, t, q, u, inputs)), velocity_residual(scene, t, q, u, inputs)
+        return (
+            T(u, t, q),
+            potential_energy(scene, jj.motion_at(scene, t, q, u, inputs)),
+            velocity_residual(scene, t, q, u, inputs),
+        )
 
     rates = (jnp.ones_like(t), coordinate_rates(scene, t, q, u), best.udot)
     (kinetic, V, _), (T_rate, V_rate, phi_rate) = jax.jvp(energies, (t, q, u), rates)
     (at_rest, slope), (_, T_along) = jax.jvp(jax.value_and_grad(T), (jnp.zeros_like(u),), (along,))
     reactions = row_reactions(scene, t, q, u, best, inputs)
     partial = partial_velocities(scene, t, q, u)
-    turned = jnp.einsum("bji,sbj->sbi", jnp.stack([body.orientation for body in motion.bodies.values()]), reactions.torque)
-    by_row = jnp.einsum("bik,sbi->sk", partial.linear, reactions.force) + jnp.einsum("bik,sbi->sk", partial.angular, turned) + reactions.direct
+    turned = jnp.einsum(
+        "bji,sbj->sbi", jnp.stack([body.orientation for body in motion.bodies.values()]), reactions.torque
+    )
+    by_row = (
+        jnp.einsum("bik,sbi->sk", partial.linear, reactions.force)
+        + jnp.einsum("bik,sbi->sk", partial.angular, turned)
+        + reactions.direct
+    )
     return {
         "M": c[:, None] * equations.M * c,
         "h": c * equations.h,
@@ -208,7 +257,12 @@ def _plain(scene, t, q, u, sign):
 def admitted(found) -> np.ndarray:
     """Which instances lie on the rows, away from a loss of rank (of the rows, or of M)."""
     rank = found["rank"]
-    return (found["miss"] < 1e-10) & (found["sigma"] > NEAR) & (found["sigma of M"] > NEAR**2) & (rank == rank.max())
+    return (
+        (found["miss"] < 1e-10)
+        & (found["sigma"] > NEAR)
+        & (found["sigma of M"] > NEAR**2)
+        & (rank == rank.max())
+    )
 
 
 def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
@@ -216,7 +270,7 @@ def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
     good = admitted(found)
     found = jax.tree.map(lambda x: x[good], found)
     M = found["M"]
-    largest = lambda x: np.max(np.abs(x), axis=tuple(range(1, x.ndim)), initial=0.0)  # noqa: E731
+    largest = lambda x: np.max(np.abs(x), axis=tuple(range(1, x.ndim)), initial=0.0)
     force = largest(found["Q"]) + largest(found["h"]) + largest(found["force"]["svd"]) + found["speed"] ** 2
     size = force + largest(found["udot"]["svd"])
     out = {
@@ -228,12 +282,16 @@ def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
         "h is the gradient of the Gibbs function": largest(found["h"] - found["h of G"]) / force,
         "rows hold along the motion": largest(found["row rates"]) / size,
         "reactions add up": largest(np.sum(found["row forces"], axis=1) - found["force"]["svd"]) / force,
-        "dE/dt is the power of all that works": np.abs(found["E rate"] - found["power"]) / (np.abs(found["E"]) + found["speed"] * size),
+        "dE/dt is the power of all that works": (
+            np.abs(found["E rate"] - found["power"]) / (np.abs(found["E"]) + found["speed"] * size)
+        ),
     }
     for name, Z in found["Z"].items():
         out[f"A Z = 0, {name}"] = largest(found["A"] @ Z)
         out[f"Z' reaction of each row = 0, {name}"] = largest(found["row forces"] @ Z) / force
-        out[f"Z -> Z R changes nothing, {name}"] = largest(found["other bases"][name] - found["udot"]["svd"]) / size
+        out[f"Z -> Z R changes nothing, {name}"] = (
+            largest(found["other bases"][name] - found["udot"]["svd"]) / size
+        )
     out["A C = 0, privileged"] = largest(found["A"] @ found["C"]) / (1 + largest(found["C"]))
     for name, udot in found["udot"].items():
         serves = found["applicable"][name]
@@ -243,10 +301,14 @@ def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
         if name in ("qr", "svd", "kkt", "udwadia-kalaba"):
             out[f"applies, {name}"] = np.where(serves, 0.0, 1.0)
     if recipe.scleronomic:
-        out["dE/dt is the power of impressed forces"] = np.abs(found["E rate"] - found["power of loads"]) / (np.abs(found["E"]) + found["speed"] * size)
+        out["dE/dt is the power of impressed forces"] = np.abs(found["E rate"] - found["power of loads"]) / (
+            np.abs(found["E"]) + found["speed"] * size
+        )
     if recipe.reversible:
         for name, udot in found["reversed"].items():
-            out[f"time reversal, {name}"] = np.where(found["applicable"][name], largest(udot - found["udot"][name]) / size, 0.0)
+            out[f"time reversal, {name}"] = np.where(
+                found["applicable"][name], largest(udot - found["udot"][name]) / size, 0.0
+            )
     return out | (_of_views(found) if "seen" in found else {})
 
 
@@ -261,5 +323,7 @@ def _of_views(found) -> dict[str, np.ndarray]:
         out[f"{view}: the rank of the rows"] = np.where(seen["rank"][:, k] == found["rank"], 0.0, 1.0)
         for name, udot in seen["udot"].items():
             serves = seen["applicable"][name][:, k]
-            out[f"{view} changes nothing, {name}"] = np.where(serves, np.max(np.abs(udot[:, k] - expected), axis=1) / size, 0.0)
+            out[f"{view} changes nothing, {name}"] = np.where(
+                serves, np.max(np.abs(udot[:, k] - expected), axis=1) / size, 0.0
+            )
     return out

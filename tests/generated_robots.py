@@ -1,4 +1,6 @@
-"""Planar robots on wheels and beads on curves, drawn by a seed: their rows are written along axes that no heading makes privileged."""
+"""Planar robots on wheels and beads on curves, drawn by a seed: their rows are written along axes that no
+heading makes privileged.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,9 +12,11 @@ HULL = (0.1, 0.0, 0.0)
 
 
 class PlanarRobot(jj.Scene):
-    """A hull on two driven discs and a train of trailers, each on an axle; the rows of the discs lie along world axes turned by `turned`.
+    """A hull on two driven discs and a train of trailers, each on an axle; the rows of the discs lie along
+    world axes turned by `turned`.
 
-    `maximal`: x, y and heading of every trailer with pins between them, otherwise headings only; `by_rate`: hitches are rows of velocity.
+    `maximal`: x, y and heading of every trailer with pins between them, otherwise headings only; `by_rate`:
+    hitches are rows of velocity.
     """
 
     trailers: int = eqx.field(static=True, default=0)
@@ -36,11 +40,17 @@ class PlanarRobot(jj.Scene):
         made = {"hull": jj.RigidBody(3.0, 0.2 * jnp.ones(3), at + R @ jnp.array(HULL), R)}
         for name, side in (("left", 1.0), ("right", -1.0)):
             centre = at + R @ jnp.stack([o, o + side * self.track, o])
-            made[name] = jj.RigidBody.thin_disc(0.3, 0.1, axis="y", position=centre, orientation=R @ jj.rot_y(q[name]))
+            made[name] = jj.RigidBody.thin_disc(
+                0.3, 0.1, axis="y", position=centre, orientation=R @ jj.rot_y(q[name])
+            )
         ahead = at - R @ jnp.stack([self.hitch, o, o])
         for i in range(self.trailers):
             R = jj.rot_z(q[f"h{i}"])
-            axle = jnp.stack([q[f"x{i}"], q[f"y{i}"], o]) if self.maximal else ahead - R @ jnp.stack([self.length, o, o])
+            axle = (
+                jnp.stack([q[f"x{i}"], q[f"y{i}"], o])
+                if self.maximal
+                else ahead - R @ jnp.stack([self.length, o, o])
+            )
             made[f"trailer{i}"] = jj.RigidBody(self.trailer_mass, self.trailer_inertia * jnp.ones(3), axle, R)
             ahead = axle
         return made
@@ -48,7 +58,9 @@ class PlanarRobot(jj.Scene):
     def _pins(self, given):
         """Misses of the hitches, of a pose or a motion."""
         o, made = 0 * given.q.x, {}
-        ahead = jnp.stack([given.q.x, given.q.y, o]) - jj.rot_z(given.q.heading) @ jnp.stack([self.hitch, o, o])
+        ahead = jnp.stack([given.q.x, given.q.y, o]) - jj.rot_z(given.q.heading) @ jnp.stack(
+            [self.hitch, o, o]
+        )
         for i in range(self.trailers):
             body = given[f"trailer{i}"]
             made[f"hitch{i}"] = (body.place([self.length, o, o]) - ahead)[:2]
@@ -64,12 +76,16 @@ class PlanarRobot(jj.Scene):
             v = m[name].velocity + jnp.cross(m[name].angular_velocity, jnp.array([0.0, 0.0, -0.1]))
             rows[name] = jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
         hull = m["hull"]
-        ahead = hull.velocity + jnp.cross(hull.angular_velocity, hull.orientation @ (jnp.stack([-self.hitch, 0.0, 0.0]) - jnp.array(HULL)))
+        ahead = hull.velocity + jnp.cross(
+            hull.angular_velocity, hull.orientation @ (jnp.stack([-self.hitch, 0.0, 0.0]) - jnp.array(HULL))
+        )
         for i in range(self.trailers):
             body = m[f"trailer{i}"]
             rows[f"trailer{i}"] = jj.knife_edge(body, body.position, body.orientation[:, 1])
             if self.maximal and self.by_rate:
-                tongue = body.velocity + jnp.cross(body.angular_velocity, body.orientation @ jnp.stack([self.length, 0.0, 0.0]))
+                tongue = body.velocity + jnp.cross(
+                    body.angular_velocity, body.orientation @ jnp.stack([self.length, 0.0, 0.0])
+                )
                 rows[f"hitch{i}"] = (tongue - ahead)[:2]
             ahead = body.velocity
         return rows
@@ -88,7 +104,9 @@ class PlanarRobot(jj.Scene):
 
 
 class BeadOnCurve(jj.Scene):
-    """A bead on an ellipse in the plane, by a geometric row or one of velocity, whose way round a slider `s` follows by a row; `turned` axes."""
+    """A bead on an ellipse in the plane, by a geometric row or one of velocity, whose way round a slider `s`
+    follows by a row; `turned` axes.
+    """
 
     by_rate: bool = eqx.field(static=True, default=False)
     a: object = jj.parameter(1.0, unit="m", positive=True)
@@ -132,4 +150,12 @@ def drawn(seed):
     maximal, by_rate, _, massless = draw.integers(2, size=4).astype(bool).tolist()
     weight = {"trailer_mass": 0.0, "trailer_inertia": 0.0} if massless else {}
     hitch, length = draw.uniform([0.0, 0.6], [0.2, 1.0]).tolist()
-    return PlanarRobot(trailers=int(draw.integers(3)), maximal=maximal, by_rate=by_rate, turned=turned, hitch=hitch, length=length, **weight)
+    return PlanarRobot(
+        trailers=int(draw.integers(3)),
+        maximal=maximal,
+        by_rate=by_rate,
+        turned=turned,
+        hitch=hitch,
+        length=length,
+        **weight,
+    )

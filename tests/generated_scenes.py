@@ -1,7 +1,8 @@
-"""Scenes put together from parts by a seeded generator: bodies, rows, loads, drives, redundancies and quasi-velocities, mixed as no textbook mixes them.
+"""Scenes put together from parts by a seeded generator: bodies, rows, loads, drives, redundancies and
+quasi-velocities, mixed as no textbook mixes them.
 
-`recipe(seed)` is the structure (static), `generated(recipe, seed)` a scene of it with random parameters: assembled at its reference configuration,
-the middle of its domain, whatever the parameters are.
+`recipe(seed)` is the structure (static), `generated(recipe, seed)` a scene of it with random parameters:
+assembled at its reference configuration, the middle of its domain, whatever the parameters are.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,9 @@ MOST_SPEEDS = 6
 
 @dataclass(frozen=True)
 class Part:
-    """A row or load: its kind, and the numbers of the bodies (`GROUND`), coordinates or rows that it is about."""
+    """A row or load: its kind, and the numbers of the bodies (`GROUND`), coordinates or rows that it is
+    about.
+    """
 
     kind: str
     on: tuple[int, ...] = ()
@@ -39,7 +42,10 @@ class Recipe:
         rows = ", ".join(f"{p.kind}{list(p.on)}" for p in self.rows)
         loads = ", ".join(f"{p.kind}{list(p.on)}" for p in self.loads)
         own = self.own_speeds or "none"
-        return f"structure {self.seed}: bodies {', '.join(self.bodies)}; rows {rows or 'none'}; loads {loads or 'none'}; own speeds: {own}"
+        return (
+            f"structure {self.seed}: bodies {', '.join(self.bodies)}; rows {rows or 'none'}; loads"
+            f" {loads or 'none'}; own speeds: {own}"
+        )
 
     def kinds(self):
         """Everything that occurs in it."""
@@ -57,8 +63,13 @@ class Recipe:
         return self.scleronomic and self.kinds().isdisjoint(ODD)
 
 
-# Coordinates by kind of body: stems, the middle of their domain, and whether each is a length. "*" stands for a quaternion.
-FLAT, SPACE, TURNED = (("x", 0.0), ("y", 0.0)), (("x", 0.0), ("y", 0.0), ("z", 0.6)), (("yaw", 0.4), ("lean", 0.3), ("spin", 0.2))
+# Coordinates by kind of body: stems, the middle of their domain, and whether each is a length. "*" stands for
+# a quaternion.
+FLAT, SPACE, TURNED = (
+    (("x", 0.0), ("y", 0.0)),
+    (("x", 0.0), ("y", 0.0), ("z", 0.6)),
+    (("yaw", 0.4), ("lean", 0.3), ("spin", 0.2)),
+)
 KINDS = {
     "particle": SPACE,
     "bead": FLAT,
@@ -77,20 +88,33 @@ KINDS = {
 }
 RIGID = {"plate", "block", "top", "disc", "wheel", "arm"}
 TIMED = {"ball on a lift", "swing", "timed row", "driven", "gust", "tide"}
-MOVING = {"ball on a turntable", "ball on a belt", "affine row", "affine quasi-velocities", "constant speed", "input"}
+MOVING = {
+    "ball on a turntable",
+    "ball on a belt",
+    "affine row",
+    "affine quasi-velocities",
+    "constant speed",
+    "input",
+}
 ODD = {"damper", "drag", "magnet", "steering"}
 GEOMETRIC = {"rod", "pin", "flat pin", "curve"}
 LENGTHS = {"x", "y", "z"}
 
 
 def coordinates_of(kind):
-    """Stems and middles of the coordinates of a body of this kind; methods of scenes may not read the dictionary itself."""
+    """Stems and middles of the coordinates of a body of this kind; methods of scenes may not read the
+    dictionary itself.
+    """
     return KINDS[kind]
 
 
 def coordinate_list(recipe: Recipe):
     """Body, stem and middle of every coordinate; a quaternion counts once."""
-    return [(i, stem, middle + (1.1 * i if stem == "x" else 0.0)) for i, kind in enumerate(recipe.bodies) for stem, middle in KINDS[kind]]
+    return [
+        (i, stem, middle + (1.1 * i if stem == "x" else 0.0))
+        for i, kind in enumerate(recipe.bodies)
+        for stem, middle in KINDS[kind]
+    ]
 
 
 def speed_count(kind):
@@ -126,7 +150,12 @@ class Generated(jj.Scene):
 
     @property
     def coordinates(self):
-        return jj.coordinates(*(jj.quaternion(f"q{i}") if stem == "*" else f"{stem}{i}" for i, stem, _ in coordinate_list(self.recipe)))
+        return jj.coordinates(
+            *(
+                jj.quaternion(f"q{i}") if stem == "*" else f"{stem}{i}"
+                for i, stem, _ in coordinate_list(self.recipe)
+            )
+        )
 
     @property
     def inputs(self):
@@ -134,7 +163,11 @@ class Generated(jj.Scene):
 
     @property
     def domain(self):
-        return {f"{stem}{i}": (middle - 0.5, middle + 0.5) for i, stem, middle in coordinate_list(self.recipe) if stem != "*"}
+        return {
+            f"{stem}{i}": (middle - 0.5, middle + 0.5)
+            for i, stem, middle in coordinate_list(self.recipe)
+            if stem != "*"
+        }
 
     def reference(self) -> np.ndarray:
         """The configuration at which it is assembled."""
@@ -154,14 +187,18 @@ class Generated(jj.Scene):
         value = {stem: q[f"{stem}{i}"] for stem, _ in coordinates_of(kind) if stem != "*"}
         if kind == "swing":
             pivot = jnp.stack([0.3 * jnp.sin(2.0 * t), o, o])
-            return jj.Particle(m, pivot + size * jnp.stack([jnp.sin(value["turn"]), o, -jnp.cos(value["turn"])]))
+            return jj.Particle(
+                m, pivot + size * jnp.stack([jnp.sin(value["turn"]), o, -jnp.cos(value["turn"])])
+            )
         if kind in ("arm", "slider"):
             at = jnp.zeros(3) if parent is None else parent.position
             frame = parent.orientation if isinstance(parent, jj.RigidBody) else jnp.eye(3)
             if kind == "slider":
                 return jj.Particle(m, at + frame @ jnp.stack([value["x"], o, o + 0.2 * size]))
             frame = frame @ (jj.rot_y, jj.rot_x, jj.rot_z)[i](value["turn"])
-            return jj.RigidBody(m, self._moments(i), at + frame @ jnp.stack([size, 0.2 * size, -0.5 * size]), frame)
+            return jj.RigidBody(
+                m, self._moments(i), at + frame @ jnp.stack([size, 0.2 * size, -0.5 * size]), frame
+            )
         position = jnp.stack([value["x"], value["y"], value.get("z", o)])
         if kind in ("particle", "bead"):
             return jj.Particle(m, position)
@@ -171,7 +208,12 @@ class Generated(jj.Scene):
             frame = jj.quaternion_to_matrix(q[f"q{i}"])
             if kind == "top":
                 return jj.RigidBody(m, self._moments(i), position, frame)
-            return jj.RigidBody.ball(m, size, position=position if "z" in value else position + jnp.stack([o, o, size]), orientation=frame)
+            return jj.RigidBody.ball(
+                m,
+                size,
+                position=position if "z" in value else position + jnp.stack([o, o, size]),
+                orientation=frame,
+            )
         frame = jj.rot_z(value["yaw"]) @ jj.rot_x(value["lean"])
         whole = frame @ jj.rot_y(value["spin"])
         if kind == "block":
@@ -189,12 +231,20 @@ class Generated(jj.Scene):
         for i, kind in enumerate(self.recipe.bodies):
             name, size = body_name(i), self.sizes[i]
             if kind in ("disc", "wheel"):
-                made[f"rim {i}"] = jj.disc_contact(pose[name], size, height="row" if kind == "wheel" else "coordinates")
+                made[f"rim {i}"] = jj.disc_contact(
+                    pose[name], size, height="row" if kind == "wheel" else "coordinates"
+                )
             elif kind == "ball on a lift":
-                lift = jj.Plane(jnp.stack([o, o, 0.2 * jnp.sin(pose.t)]), velocity=jnp.stack([o + 0.1, o, 0.2 * jnp.cos(pose.t)]))
+                lift = jj.Plane(
+                    jnp.stack([o, o, 0.2 * jnp.sin(pose.t)]),
+                    velocity=jnp.stack([o + 0.1, o, 0.2 * jnp.cos(pose.t)]),
+                )
                 made[f"lift {i}"] = jj.ball_contact(pose[name], size, ground=lift, height="row")
             elif kind.startswith("ball"):
-                plane = {"ball on a turntable": jj.Plane(angular_velocity=(0.0, 0.0, 0.7)), "ball on a belt": jj.Plane(velocity=(0.3, -0.2, 0.0))}.get(kind)
+                plane = {
+                    "ball on a turntable": jj.Plane(angular_velocity=(0.0, 0.0, 0.7)),
+                    "ball on a belt": jj.Plane(velocity=(0.3, -0.2, 0.0)),
+                }.get(kind)
                 made[f"ground {i}"] = jj.ball_contact(pose[name], size, ground=plane)
         return made
 
@@ -254,7 +304,11 @@ class Generated(jj.Scene):
 
     def prescribed(self, t):
         names, middles = self.coordinate_names.entries, self.reference()
-        return {names[p.on[0]]: middles[p.on[0]] + 0.3 * jnp.sin(1.5 * t) for p in self.recipe.rows if p.kind == "driven"}
+        return {
+            names[p.on[0]]: middles[p.on[0]] + 0.3 * jnp.sin(1.5 * t)
+            for p in self.recipe.rows
+            if p.kind == "driven"
+        }
 
     def loads(self, motion):
         made = []
@@ -269,9 +323,14 @@ class Generated(jj.Scene):
             speed, w = self.speed_names.entries[part.on[0]], u[part.on[0]]
             if part.kind == "drag":
                 return jj.generalized_force(motion, **{speed: -strength * w * (1 + w * w)})
-            return jj.generalized_force(motion, **{speed: strength * motion.inputs.push * jnp.cos(motion.q.array[0])})
+            return jj.generalized_force(
+                motion, **{speed: strength * motion.inputs.push * jnp.cos(motion.q.array[0])}
+            )
         bodies = [None if i == GROUND else motion[body_name(i)] for i in part.on]
-        ends = [jj.fixed_point((0.2, -0.9, 1.4)) if body is None else body.point((0.1, 0.2, 0.1)) for body in bodies[:2]]
+        ends = [
+            jj.fixed_point((0.2, -0.9, 1.4)) if body is None else body.point((0.1, 0.2, 0.1))
+            for body in bodies[:2]
+        ]
         if part.kind == "weight":
             return jj.gravity(motion, self.gravity, np.array((0.1, -0.6, -0.7)) / 0.86**0.5)
         if part.kind == "spring":
@@ -285,9 +344,13 @@ class Generated(jj.Scene):
         if part.kind == "follower":
             return jj.point_force(bodies[0].point((0.2, 0.0, 0.1)), strength * bodies[0].orientation[:, 0])
         if part.kind == "magnet":
-            return jj.point_force(bodies[0].point(), strength * jnp.cross(bodies[0].velocity, jnp.array([0.2, -0.4, 1.0])))
+            return jj.point_force(
+                bodies[0].point(), strength * jnp.cross(bodies[0].velocity, jnp.array([0.2, -0.4, 1.0]))
+            )
         if part.kind == "gust":
-            return jj.point_force(bodies[0].point(), strength * jnp.stack([jnp.sin(3.0 * t), 0.5 + 0.0 * t, jnp.cos(t)]))
+            return jj.point_force(
+                bodies[0].point(), strength * jnp.stack([jnp.sin(3.0 * t), 0.5 + 0.0 * t, jnp.cos(t)])
+            )
         return None  # potentials of the scene itself
 
     def potential(self, pose):
@@ -295,7 +358,9 @@ class Generated(jj.Scene):
         for k, part in enumerate(self.recipe.loads):
             if part.kind in ("well", "tide"):
                 grows = jnp.cos(2.0 * pose.t) if part.kind == "tide" else 1.0
-                more = self.strengths[k] * grows * (0.5 * q[0] ** 2 + 0.25 * q[-1] ** 4 + q[0] * jnp.sin(q[-1]))
+                more = (
+                    self.strengths[k] * grows * (0.5 * q[0] ** 2 + 0.25 * q[-1] ** 4 + q[0] * jnp.sin(q[-1]))
+                )
                 V = more if V is None else V + more
         return V
 
@@ -322,7 +387,9 @@ class GeneratedWithOwnSpeeds(Generated):
 
 
 def recipe(seed) -> Recipe:
-    """The structure with this number: first body and first row go through all kinds in turn, the rest is drawn."""
+    """The structure with this number: first body and first row go through all kinds in turn, the rest is
+    drawn.
+    """
     draw = np.random.default_rng(1000 + seed)
     names = list(KINDS)
     bodies = [names[seed % len(names)]]
@@ -339,24 +406,53 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
     held = {"disc": 2, "wheel": 3, "ball on a lift": 3}
     left = sum(speed_count(kind) - held.get(kind, 2 * kind.startswith("ball")) for kind in bodies)
     held_down = [kind in ("disc", "wheel") or kind.startswith("ball") for kind in bodies]
-    kinds = ["edge", "rod", "flat pin", "pin", "steered row", "curve", "affine row", "timed row", "driven", "constant speed", "rod", "edge"]
-    wanted = [kinds[(7 * made.seed + 4 + k) % len(kinds)] for k in range(len(kinds))][: 1 + int(draw.integers(0, 3))]
+    kinds = [
+        "edge",
+        "rod",
+        "flat pin",
+        "pin",
+        "steered row",
+        "curve",
+        "affine row",
+        "timed row",
+        "driven",
+        "constant speed",
+        "rod",
+        "edge",
+    ]
+    wanted = [kinds[(7 * made.seed + 4 + k) % len(kinds)] for k in range(len(kinds))][
+        : 1 + int(draw.integers(0, 3))
+    ]
     rows: list[Part] = []
     for kind in wanted:
         part, count = None, 1
-        loose = [i for i, body in enumerate(bodies) if body not in ("arm", "slider", "swing") and not held_down[i]]
+        loose = [
+            i for i, body in enumerate(bodies) if body not in ("arm", "slider", "swing") and not held_down[i]
+        ]
         if kind == "edge":
             on = [i for i in loose if bodies[i] in RIGID]
             part = Part(kind, (on[0],)) if on else None
         elif kind in GEOMETRIC:
-            tied = {part.on[0] for part in rows if part.kind in GEOMETRIC}  # a second such row on one body may contradict the first
-            on = [i for i in loose if i not in tied and (kind != "pin" or bodies[i] in ("particle", "block", "top"))]
+            tied = {
+                part.on[0] for part in rows if part.kind in GEOMETRIC
+            }  # a second such row on one body may contradict the first
+            on = [
+                i
+                for i in loose
+                if i not in tied and (kind != "pin" or bodies[i] in ("particle", "block", "top"))
+            ]
             if on:
                 other = [j for j in range(len(bodies)) if j < on[-1]]
-                part = Part(kind, (on[-1], int(draw.choice([GROUND, *other])))) if kind != "curve" else Part(kind, (on[-1],))
+                part = (
+                    Part(kind, (on[-1], int(draw.choice([GROUND, *other]))))
+                    if kind != "curve"
+                    else Part(kind, (on[-1],))
+                )
             count = {"pin": 3, "flat pin": 2}.get(kind, 1)
         elif kind == "driven":
-            first = [i for i, (body, stem, _) in enumerate(coordinate_list(made)) if body in loose and stem == "x"]
+            first = [
+                i for i, (body, stem, _) in enumerate(coordinate_list(made)) if body in loose and stem == "x"
+            ]
             part = Part(kind, (_coordinate_index(made, first[0]),)) if first else None
         elif kind == "constant speed":
             part = Part(kind, (loose[0],)) if loose and bodies[loose[0]] in ("particle", "bead") else None
@@ -367,7 +463,11 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
             rows.append(part)
             left -= count
     geometric = [s for s, part in enumerate(rows) if part.kind in GEOMETRIC]
-    alike = [group for group in (geometric, [s for s, p in enumerate(rows) if s not in geometric and p.kind != "driven"]) if group]
+    alike = [
+        group
+        for group in (geometric, [s for s, p in enumerate(rows) if s not in geometric and p.kind != "driven"])
+        if group
+    ]
     if alike and made.seed % 3 != 1:
         group = alike[int(draw.integers(len(alike)))]
         rows.append(Part("copy", (group[0],)) if len(group) == 1 else Part("sum", tuple(group[:2])))
@@ -397,7 +497,10 @@ def _drawn_loads(made: Recipe, draw) -> tuple[Part, ...]:
         "tide": (),
         "input": (free[0],),
     }
-    usual, odd = ["spring", "well", "torque", "follower"], ["damper", "steering", "magnet", "drag", "gust", "tide", "input"]
+    usual, odd = (
+        ["spring", "well", "torque", "follower"],
+        ["damper", "steering", "magnet", "drag", "gust", "tide", "input"],
+    )
     wanted = ["weight", usual[made.seed % 4], usual[int(draw.integers(4))]]
     if made.seed % 2:
         wanted += [odd[(made.seed // 2) % 7], odd[int(draw.integers(7))]]
@@ -431,7 +534,9 @@ def _anchors(scene, q):
         own = pose[body_name(on)].place(jnp.stack([0.3, 0.1, -0.2]) * scene.sizes[on])
         held = jnp.ones(3)
         if part.kind == "rod":
-            held = jnp.linalg.norm(own - scene.place(pose, part.on[1], jnp.stack([0.1, -0.2, 0.1]))) * jnp.ones(3)
+            held = jnp.linalg.norm(
+                own - scene.place(pose, part.on[1], jnp.stack([0.1, -0.2, 0.1]))
+            ) * jnp.ones(3)
         elif part.kind in ("pin", "flat pin"):
             other = None if part.on[1] == GROUND else pose[body_name(part.on[1])]
             held = own if other is None else other.orientation.T @ (own - other.position)

@@ -1,5 +1,5 @@
-"""A GPU that is not there: what JAX calls on one is called on the CPU, by the same lowering and handler; a driver made here runs the kernels' LLVM IR,
-compiled for the CPU, once for each thread."""
+"""A GPU that is not there: what JAX calls on one is called on the CPU, by the same lowering and handler; a
+driver made here runs the kernels' LLVM IR, compiled for the CPU, once for each thread."""
 
 import ctypes
 import functools
@@ -69,13 +69,19 @@ def twin_text(text: str) -> str:
     return text + _ENDS.replace("KEY", str(_key())).replace("WORDS", str(ffi.WORDS * ffi.MOST_BUFFERS))
 
 
-_SAID = {1: b"invalid argument", 2: b"out of memory", 400: b"invalid resource handle"}  # of values of `CUresult`
+_SAID = {
+    1: b"invalid argument",
+    2: b"out of memory",
+    400: b"invalid resource handle",
+}  # of values of `CUresult`
 _C = ctypes.CFUNCTYPE
 _int, _long, _pointer = ctypes.c_uint32, ctypes.c_uint64, ctypes.c_void_p
 
 
 class Driver:
-    """Those functions of `libcuda` that the handler calls, as they are declared in NVIDIA's `cuda.h`; `order`: of threads, `fails`: what a launch returns."""
+    """Those functions of `libcuda` that the handler calls, as they are declared in NVIDIA's `cuda.h`;
+    `order`: of threads, `fails`: what a launch returns.
+    """
 
     order, fails = "in order", 0
 
@@ -86,21 +92,36 @@ class Driver:
         memset = _C(ctypes.c_int, _long, _int, ctypes.c_size_t, _pointer)
         launch = _C(ctypes.c_int, _pointer, *[_int] * 7, _pointer, ctypes.POINTER(_pointer), _pointer)
         error = _C(ctypes.c_int, ctypes.c_int, ctypes.POINTER(ctypes.c_char_p))
-        self.library = SimpleNamespace(cuMemsetD32Async=memset(self._memset), cuLaunchKernel=launch(self._launch), cuGetErrorString=error(self._error))
+        self.library = SimpleNamespace(
+            cuMemsetD32Async=memset(self._memset),
+            cuLaunchKernel=launch(self._launch),
+            cuGetErrorString=error(self._error),
+        )
 
     def _memset(self, place, value, count, stream) -> int:
         ctypes.memmove(place, (_int * count)(*[value] * count), 4 * count)
         return 0
 
-    def _launch(self, function, across, y, z, threads, threads_y, threads_z, shared, stream, parameters, extra) -> int:
-        if (y, z, threads, threads_y, threads_z, shared, stream, extra) != (1, 1, nvidia.WARP, 1, 1, 0, 99, None) or not across:
+    def _launch(
+        self, function, across, y, z, threads, threads_y, threads_z, shared, stream, parameters, extra
+    ) -> int:
+        if (y, z, threads, threads_y, threads_z, shared, stream, extra) != (
+            1,
+            1,
+            nvidia.WARP,
+            1,
+            1,
+            0,
+            99,
+            None,
+        ) or not across:
             return 1  # of a grid without blocks, too
         if not function or self.fails:
             return self.fails or 400
         self.launched[self.loaded[function - 1]] += 1
         run, count = _C(None, _pointer, _pointer)(self._twin(function)), across * threads
         each = range(count) if self.order == "in order" else reversed(range(count))
-        call = lambda number: run(parameters[0], number | count << 32)  # noqa: E731
+        call = lambda number: run(parameters[0], number | count << 32)
         if self.order == "at once":
             with ThreadPoolExecutor(4) as pool:
                 list(pool.map(call, each))
@@ -160,8 +181,14 @@ declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 
 @contextmanager
 def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int = 0) -> Iterator[Counter[str]]:
-    """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts of all kernels, each with how often it ran."""
-    register, launched, text = ffi.register, Counter[str](), gpu.handler_text().replace("@handler(", "@served(") + _STREAM
+    """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts
+    of all kernels, each with how often it ran.
+    """
+    register, launched, text = (
+        ffi.register,
+        Counter[str](),
+        gpu.handler_text().replace("@handler(", "@served(") + _STREAM,
+    )
     jax.clear_caches()
     with (
         mock.patch.multiple(jax, default_backend=lambda: "gpu"),
@@ -187,11 +214,17 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int =
             jax.clear_caches()
 
 
-def driver_of_devices(capabilities: list[tuple[int, int]], fails: int = 0, missing: str = "") -> SimpleNamespace:
-    """Functions by which a driver describes its devices; `fails`: what its start returns, `missing`: a function that it has not."""
+def driver_of_devices(
+    capabilities: list[tuple[int, int]], fails: int = 0, missing: str = ""
+) -> SimpleNamespace:
+    """Functions by which a driver describes its devices; `fails`: what its start returns, `missing`: a
+    function that it has not.
+    """
 
     def says(what: Callable) -> Callable:
-        return lambda *given: setattr(next(x for x in given if hasattr(x, "_obj"))._obj, "value", what(*given)) or 0
+        return lambda *given: (
+            setattr(next(x for x in given if hasattr(x, "_obj"))._obj, "value", what(*given)) or 0
+        )
 
     own = {
         "cuInit": lambda _: fails,
@@ -203,10 +236,16 @@ def driver_of_devices(capabilities: list[tuple[int, int]], fails: int = 0, missi
 
 
 def said_by_assembler(ptx: str) -> str:
-    """What NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit, says of text for compute capability 9.0; empty where there is none."""
-    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")] + [shutil.which("ptxas")]
+    """What NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit, says of text for compute
+    capability 9.0; empty where there is none.
+    """
+    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")] + [
+        shutil.which("ptxas")
+    ]
     if not found[0]:
         return ""
-    done = subprocess.run([found[0], "-arch=sm_90", "-v", "-o", "/dev/null", "-"], input=ptx, capture_output=True, text=True)
+    done = subprocess.run(
+        [found[0], "-arch=sm_90", "-v", "-o", "/dev/null", "-"], input=ptx, capture_output=True, text=True
+    )
     assert not done.returncode, done.stderr
     return done.stderr

@@ -1,4 +1,6 @@
-"""Functions of the table in as many digits as one likes, and what the round-off of their arguments makes of them."""
+"""Functions of the table in as many digits as one likes, and what the round-off of their arguments makes of
+them.
+"""
 
 import operator
 from collections.abc import Callable
@@ -37,9 +39,11 @@ class Known(NamedTuple):
 
 
 def found(op, arguments, round_off) -> Known | bool | None:
-    """What an operation makes of numbers that are known so well, given its own round-off, relative; None where that is not settled.
+    """What an operation makes of numbers that are known so well, given its own round-off, relative; None
+    where that is not settled.
 
-    Nothing is settled by an argument that is not, near a jump or a bound of the domain, or where a number is no usual one.
+    Nothing is settled by an argument that is not, near a jump or a bound of the domain, or where a number is
+    no usual one.
     """
     if op == "select":
         condition, otherwise, value = arguments
@@ -57,11 +61,19 @@ def found(op, arguments, round_off) -> Known | bool | None:
     function, values = in_mpmath(op), [a.value for a in arguments]
     try:
         value = function(*values)
-        nearby = [function(*values[:i], a.value + way * a.error, *values[i + 1 :]) for i, a in enumerate(arguments) for way in (-1, 1)]
+        nearby = [
+            function(*values[:i], a.value + way * a.error, *values[i + 1 :])
+            for i, a in enumerate(arguments)
+            for way in (-1, 1)
+        ]
     except (ZeroDivisionError, OverflowError, ValueError):
         return None
     if any(isinstance(x, mpmath.mpc) or not mpmath.isfinite(x) for x in (value, *nearby)):
         return None
     error = 2 * sum(abs(x - value) for x in nearby) + round_off * abs(value)
     usual = value == 0 or 1e-150 < abs(value) < 1e150
-    return Known(value, error) if usual and error <= 1e-8 * abs(value) + (1e-12 if op not in STEPS else 0) else None
+    return (
+        Known(value, error)
+        if usual and error <= 1e-8 * abs(value) + (1e-12 if op not in STEPS else 0)
+        else None
+    )

@@ -13,7 +13,9 @@ def _particle(x, z):
 
 
 class Parallelogram(jj.Scene):
-    """Three rods in angles; two cranks of equal length. Flat, with cranks at right angles, it has one row less."""
+    """Three rods in angles; two cranks of equal length. Flat, with cranks at right angles, it has one row
+    less.
+    """
 
     unit: Float[Array, ""] = jj.parameter(1.0)  # of the row along x
     coordinates = jj.coordinates("a b c")
@@ -24,7 +26,9 @@ class Parallelogram(jj.Scene):
         return first, second, second - jnp.stack([jnp.sin(q.c), -jnp.cos(q.c)])
 
     def bodies(self, t, q):
-        return {name: _particle(*point) for name, point in zip(("first", "second"), self._points(q), strict=False)}
+        return {
+            name: _particle(*point) for name, point in zip(("first", "second"), self._points(q), strict=False)
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -46,11 +50,16 @@ class SliderCrank(jj.Scene):
 
     def geometric_constraints(self, pose):
         q = pose.q
-        return {"along": self.unit * (jnp.cos(q.a) + self.rod * jnp.cos(q.b) - q.x), "across": jnp.sin(q.a) + self.rod * jnp.sin(q.b)}
+        return {
+            "along": self.unit * (jnp.cos(q.a) + self.rod * jnp.cos(q.b) - q.x),
+            "across": jnp.sin(q.a) + self.rod * jnp.sin(q.b),
+        }
 
 
 class Loop(jj.Scene):
-    """A closed chain of hinges in space, by Denavit and Hartenberg: lengths and twists of the links. Twelve rows close it."""
+    """A closed chain of hinges in space, by Denavit and Hartenberg: lengths and twists of the links. Twelve
+    rows close it.
+    """
 
     lengths: tuple[float, ...] = eqx.field(static=True, default=())
     twists: tuple[float, ...] = eqx.field(static=True, default=())
@@ -70,7 +79,10 @@ class Loop(jj.Scene):
         return links
 
     def bodies(self, t, q):
-        return {f"link {i}": jj.RigidBody(1.0, np.diag([0.1, 0.12, 0.15]), r, R) for i, (r, R) in enumerate(self._links(q)[:-1])}
+        return {
+            f"link {i}": jj.RigidBody(1.0, np.diag([0.1, 0.12, 0.15]), r, R)
+            for i, (r, R) in enumerate(self._links(q)[:-1])
+        }
 
     def geometric_constraints(self, pose):
         r, R = self._links(pose.q)[-1]
@@ -84,7 +96,9 @@ def bennett(twist, other, length=1.0) -> Loop:
 
 
 def bricard(*lengths: float) -> Loop:
-    """Bricard's trihedral six-bar linkage from five lengths: the sums of squares of even and odd links are equal, twists are right angles by turns."""
+    """Bricard's trihedral six-bar linkage from five lengths: the sums of squares of even and odd links are
+    equal, twists are right angles by turns.
+    """
     squares = np.square(lengths)
     last = float(np.sqrt(squares[[0, 2, 4]].sum() - squares[[1, 3]].sum()))
     return Loop((*lengths, last), (np.pi / 2, -np.pi / 2) * 3)
@@ -101,13 +115,19 @@ class Windows(jj.Scene):
         return jj.coordinates(*(f"x{i} z{i} u{i} w{i}" for i in range(self.count)))
 
     def bodies(self, t, q):
-        pairs = [(q[f"x{i}"], q[f"z{i}"]) for i in range(self.count)] + [(q[f"u{i}"], q[f"w{i}"]) for i in range(self.count)]
+        pairs = [(q[f"x{i}"], q[f"z{i}"]) for i in range(self.count)] + [
+            (q[f"u{i}"], q[f"w{i}"]) for i in range(self.count)
+        ]
         return {f"point {k}": _particle(*pair) for k, pair in enumerate(pairs)}
 
     def geometric_constraints(self, pose):
         q, rows, left, right = pose.q, {}, jnp.zeros(3), jnp.array([2.0, 0.0, 0.0])
         for i in range(self.count):
             p, r = (jnp.stack([q[f"{x}{i}"], 0.0, q[f"{z}{i}"]]) for x, z in ("xz", "uw"))
-            rows |= {f"left {i}": jj.rod(left, p, 1.0), f"coupler {i}": jj.rod(p, r, 2.0), f"right {i}": jj.rod(right, r, 1.0)}
+            rows |= {
+                f"left {i}": jj.rod(left, p, 1.0),
+                f"coupler {i}": jj.rod(p, r, 2.0),
+                f"right {i}": jj.rod(right, r, 1.0),
+            }
             left, right = p, r
         return rows

@@ -1,4 +1,6 @@
-"""Planar linkages of rods, in angles and in Cartesian coordinates, that pass through configurations at which their rows lose rank."""
+"""Planar linkages of rods, in angles and in Cartesian coordinates, that pass through configurations at which
+their rows lose rank.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +25,8 @@ def pinned(name, first: Float[Array, "3"], second: Float[Array, "3"]):
 
 
 class Parallelogram(jj.Scene):
-    """Two cranks a, c of equal length and a coupler b as long as the ground: flat at a = 0 and a = pi, where both rows have no independent gradient.
+    """Two cranks a, c of equal length and a coupler b as long as the ground: flat at a = 0 and a = pi, where
+    both rows have no independent gradient.
 
     Without loads the parallelogram's branch is a = c = a_0 + w t, b = 0.
     """
@@ -44,13 +47,17 @@ class Parallelogram(jj.Scene):
         }
 
     def geometric_constraints(self, pose):
-        return pinned("loop", end_of(pose["coupler"], 0.5 * self.coupler), end_of(pose["second"], 0.5 * self.crank))
+        return pinned(
+            "loop", end_of(pose["coupler"], 0.5 * self.coupler), end_of(pose["second"], 0.5 * self.crank)
+        )
 
 
 class SliderCrank(jj.Scene):
-    """A crank a and a rod b of the same length 1 m that moves a slider x along the x axis; at a = pi/2 the slider passes the crank's axis.
+    """A crank a and a rod b of the same length 1 m that moves a slider x along the x axis; at a = pi/2 the
+    slider passes the crank's axis.
 
-    The branch b = -a, x = 2 cos a crosses there the branch on which rod and crank turn as one and the slider rests.
+    The branch b = -a, x = 2 cos a crosses there the branch on which rod and crank turn as one and the slider
+    rests.
     """
 
     slider: Float[Array, ""] = jj.parameter(0.5, unit="kg", positive=True)
@@ -73,20 +80,38 @@ class SliderCrank(jj.Scene):
 def slider_crank_motion(a_0, rate, ts, slider=0.5) -> np.ndarray:
     """Angle a (rad) of `SliderCrank` at times `ts` on its branch b = -a, by quadrature of the energy.
 
-    T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the rod: (3/2 cos a, 1/2 sin a).
+    T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the
+    rod: (3/2 cos a, 1/2 sin a).
     """
     from scipy.integrate import solve_ivp
 
     def inertia(a):
-        return 1 / 12 + 1 / 4 + 1 / 12 + (1.5 * np.sin(a)) ** 2 + (0.5 * np.cos(a)) ** 2 + 4 * slider * np.sin(a) ** 2
+        return (
+            1 / 12
+            + 1 / 4
+            + 1 / 12
+            + (1.5 * np.sin(a)) ** 2
+            + (0.5 * np.cos(a)) ** 2
+            + 4 * slider * np.sin(a) ** 2
+        )
 
     momentum = np.sqrt(inertia(a_0)) * rate  # sqrt(I) a' is constant
-    found = solve_ivp(lambda t, a: momentum / np.sqrt(inertia(a)), (0.0, ts[-1]), [a_0], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=ts)
+    found = solve_ivp(
+        lambda t, a: momentum / np.sqrt(inertia(a)),
+        (0.0, ts[-1]),
+        [a_0],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+        t_eval=ts,
+    )
     return found.y[0]
 
 
 class NarrowPendulum(jj.Scene):
-    """A pendulum in Cartesian coordinates whose domain says that it hangs: the speed of z follows from that of x, but for a motion that reaches z = 0."""
+    """A pendulum in Cartesian coordinates whose domain says that it hangs: the speed of z follows from that
+    of x, but for a motion that reaches z = 0.
+    """
 
     length: Float[Array, ""] = jj.parameter(1.0, unit="m", positive=True)
     coordinates = jj.coordinates("x z")

@@ -9,7 +9,9 @@ DOCS = ROOT / "docs"
 
 def code_of(page):
     """Return the Python blocks of a page, in order."""
-    return re.findall(r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    return re.findall(
+        r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
+    )
 
 
 def run(page, **names):

@@ -1,4 +1,6 @@
-"""Scenes of bodies that roll on any ground, for the tests of contacts: free bodies with height rows, and carts on balls."""
+"""Scenes of bodies that roll on any ground, for the tests of contacts: free bodies with height rows, and
+carts on balls.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ PLACE = {"x": (-0.3, 0.3), "y": (-0.3, 0.3), "z": (-0.3, 0.3)}
 
 
 class Rolls(jj.Scene):
-    """A free body that rolls on a ground which `make_ground` gives for this scene, with a height row. `shape`: "ball", "ellipsoid", "disc" or "wheel"."""
+    """A free body that rolls on a ground which `make_ground` gives for this scene, with a height row.
+    `shape`: "ball", "ellipsoid", "disc" or "wheel".
+    """
 
     mass: object = jj.parameter(1.3)
     radius: object = jj.parameter(0.05)
@@ -26,7 +30,9 @@ class Rolls(jj.Scene):
 
     def bodies(self, t, q):
         moments = self.moments * self.mass * self.radius**2
-        return {"body": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "body": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
@@ -68,10 +74,14 @@ GROUNDS = {
 
 
 class Cart(jj.Scene):
-    """A chassis on balls that roll on a plane, kept level by its coordinates; pushed at a point of the chassis."""
+    """A chassis on balls that roll on a plane, kept level by its coordinates; pushed at a point of the
+    chassis.
+    """
 
     places: object = jj.parameter(((0.5, 0.3), (0.5, -0.3), (-0.4, 0.0)))  # m, of the balls in the chassis
-    load: object = jj.parameter((0.05, 0.02, 0.3))  # m, mass centre of the chassis above the plane of the balls' centres
+    load: object = jj.parameter(
+        (0.05, 0.02, 0.3)
+    )  # m, mass centre of the chassis above the plane of the balls' centres
     mass: object = jj.parameter(10.0)
     slope: object = jj.parameter(0.2)
     push: object = jj.parameter((3.0, -2.0, 1.0))  # N
@@ -88,23 +98,32 @@ class Cart(jj.Scene):
         made = {"chassis": jj.RigidBody(self.mass, jnp.array([0.5, 0.8, 1.0]), at + frame @ self.load, frame)}
         for i in range(self.balls):
             centre = at + frame @ jnp.append(self.places[i], 0.0)
-            made[f"ball{i}"] = jj.RigidBody.ball(1.0, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q[f"ball{i}"]))
+            made[f"ball{i}"] = jj.RigidBody.ball(
+                1.0, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q[f"ball{i}"])
+            )
         return made
 
     def loads(self, motion):
         down = jnp.stack([jnp.sin(self.slope), 0.0, -jnp.cos(self.slope)])
-        return jj.gravity(motion, GRAVITY, down), jj.point_force(motion["chassis"].point((0.1, 0.2, 0.1)), self.push)
+        return jj.gravity(motion, GRAVITY, down), jj.point_force(
+            motion["chassis"].point((0.1, 0.2, 0.1)), self.push
+        )
 
     height = "coordinates"
 
     def contacts(self, pose):
-        return {f"ball{i}": jj.ball_contact(pose[f"ball{i}"], self.radius, height=self.height) for i in range(self.balls)}
+        return {
+            f"ball{i}": jj.ball_contact(pose[f"ball{i}"], self.radius, height=self.height)
+            for i in range(self.balls)
+        }
 
 
 class CartOnRows(Cart):
     """The cart with a free chassis, its balls kept on the plane by rows."""
 
-    coordinates = jj.coordinates("x y z", jj.quaternion("frame"), *(jj.quaternion(f"ball{i}") for i in range(3)))
+    coordinates = jj.coordinates(
+        "x y z", jj.quaternion("frame"), *(jj.quaternion(f"ball{i}") for i in range(3))
+    )
     height = "row"
 
     def chassis(self, q):
@@ -124,7 +143,14 @@ class BallInBowl(jj.Scene):
 
     def bodies(self, t, q):
         z = self.bowl - jnp.sqrt((self.bowl - self.radius) ** 2 - q.x**2 - q.y**2)
-        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=[q.x, q.y, z], orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                self.mass,
+                self.radius,
+                position=[q.x, q.y, z],
+                orientation=jj.quaternion_to_matrix(q.attitude),
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)
@@ -147,13 +173,21 @@ class BallInDrum(jj.Scene):
     def bodies(self, t, q):
         arm = self.drum - self.radius
         centre = jnp.stack([arm * jnp.sin(q.angle), arm * jnp.cos(q.angle), q.along])
-        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                self.mass, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q.attitude)
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
 
     def contacts(self, pose):
-        return {"wall": jj.ball_contact(pose["ball"], self.radius, ground=jj.Cylinder(self.drum, (0.0, 0.0, 1.0), side="inside"))}
+        return {
+            "wall": jj.ball_contact(
+                pose["ball"], self.radius, ground=jj.Cylinder(self.drum, (0.0, 0.0, 1.0), side="inside")
+            )
+        }
 
 
 class RouthSphere(jj.Scene):
@@ -182,7 +216,10 @@ class RouthSphere(jj.Scene):
         ball = motion["ball"]
         r = ball.orientation.T @ (ball.position - self.contacts(motion.pose())["floor"].point)
         w, I = ball.angular_velocity_body, self.moments
-        return {"Jellett": (I * w) @ r, "Routh": w[2] * jnp.sqrt(I[0] * I[2] + self.mass * jnp.sum(I * r * r))}
+        return {
+            "Jellett": (I * w) @ r,
+            "Routh": w[2] * jnp.sqrt(I[0] * I[2] + self.mass * jnp.sum(I * r * r)),
+        }
 
 
 class TyredBicycle(jj.models.WhippleBicycle):
@@ -194,7 +231,10 @@ class TyredBicycle(jj.models.WhippleBicycle):
     def bodies(self, t, q):
         up = (jj.rot_z(q.yaw) @ jj.rot_x(q.lean))[:, 2]
         raised = self.rear_tyre * (jnp.stack([0.0, 0.0, 1.0 + 0.0 * q.x]) - up)
-        return {name: eqx.tree_at(lambda b: b.position, body, body.position + raised) for name, body in super().bodies(t, q).items()}
+        return {
+            name: eqx.tree_at(lambda b: b.position, body, body.position + raised)
+            for name, body in super().bodies(t, q).items()
+        }
 
     def contacts(self, pose):
         return {

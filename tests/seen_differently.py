@@ -1,12 +1,13 @@
-"""A scene seen differently: the same motion in other units, from another frame, in other coordinates and speeds, its bodies and rows in another order.
+"""A scene seen differently: the same motion in other units, from another frame, in other coordinates and
+speeds, its bodies and rows in another order.
 
     r' = (R r + r_0 + v_0 t)/L        t' = t/T        m' = m/M                                   frame and units
     q'_k = q_k/d_k + a_k sin(q_{k-1})                 in reversed order                          coordinates
     u_k = d_k/T (u'_k + b_k cos(q_0 + k) u'_{k-1})                                               speeds
 
-`Seen` hands the engine a scene in the primed quantities and its author the unprimed ones: what the engine works out must be the same motion.
-All of it is data, so that one program serves every way of looking, and the plainest one (`plain`) differs by the order of bodies, rows and coordinates
-alone.
+`Seen` hands the engine a scene in the primed quantities and its author the unprimed ones: what the engine
+works out must be the same motion. All of it is data, so that one program serves every way of looking, and the
+plainest one (`plain`) differs by the order of bodies, rows and coordinates alone.
 """
 
 import equinox as eqx
@@ -37,12 +38,18 @@ def views(coordinates, speeds) -> tuple[tuple[str, ...], View]:
     """Names of the ways of looking, and all of them as one batch."""
     q, u = np.zeros(coordinates), np.zeros(speeds)
     plain = View(np.eye(3), np.zeros(3), np.zeros(3), np.array(1.0), np.array(1.0), np.array(1.0), q, u)
-    moved = (np.asarray(jj.rot_x(0.7) @ jj.rot_z(-1.1) @ jj.rot_y(0.4)), np.array([0.7, -1.3, 0.4]), np.array([0.5, 0.2, -0.8]))
+    moved = (
+        np.asarray(jj.rot_x(0.7) @ jj.rot_z(-1.1) @ jj.rot_y(0.4)),
+        np.array([0.7, -1.3, 0.4]),
+        np.array([0.5, 0.2, -0.8]),
+    )
     units = (np.array(1e-3), np.array(0.45), np.array(60.0))
     made = {
         "reordering of bodies, rows and coordinates": plain,
         "a rigid motion of the frame": eqx.tree_at(lambda v: (v.rotation, v.shift, v.velocity), plain, moved),
-        "a change of coordinates": eqx.tree_at(lambda v: v.bend, plain, 0.4 * np.cos(1.0 + np.arange(coordinates))),
+        "a change of coordinates": eqx.tree_at(
+            lambda v: v.bend, plain, 0.4 * np.cos(1.0 + np.arange(coordinates))
+        ),
         "a change of speeds": eqx.tree_at(lambda v: v.mix, plain, 0.5 * np.cos(2.0 + np.arange(speeds))),
         "a change of units": eqx.tree_at(lambda v: (v.length, v.mass, v.time), plain, units),
     }
@@ -75,7 +82,7 @@ class Seen(jj.Scene):
     def inputs(self):
         return self.scene.inputs
 
-    # From what is seen to what is, and back. ----------------------------------------------------------------------
+    # From what is seen to what is, and back. ----------------------------------------------------------------
 
     def _units(self, are_lengths):
         return jnp.stack([self.view.length if is_length else jnp.ones(()) for is_length in are_lengths])
@@ -97,7 +104,11 @@ class Seen(jj.Scene):
 
     def old_speeds(self, q, new):
         """u of u'."""
-        return self._units(self.paces) / self.view.time * (new + self._mixing(q) * jnp.roll(new, 1).at[0].set(0.0))
+        return (
+            self._units(self.paces)
+            / self.view.time
+            * (new + self._mixing(q) * jnp.roll(new, 1).at[0].set(0.0))
+        )
 
     def new_speeds(self, q, u):
         """u' of u."""
@@ -110,7 +121,7 @@ class Seen(jj.Scene):
         """The unit of power."""
         return self.view.mass * self.view.length**2 / self.view.time**3
 
-    # The scene in the primed quantities. --------------------------------------------------------------------------
+    # The scene in the primed quantities. --------------------------------------------------------------------
 
     def bodies(self, t, q):
         t = t * self.view.time
@@ -122,7 +133,12 @@ class Seen(jj.Scene):
         position = (view.rotation @ body.position + view.shift + view.velocity * t) / view.length
         if isinstance(body, jj.Particle):
             return jj.Particle(body.mass / view.mass, position)
-        return jj.RigidBody(body.mass / view.mass, body.inertia / (view.mass * view.length**2), position, view.rotation @ body.orientation)
+        return jj.RigidBody(
+            body.mass / view.mass,
+            body.inertia / (view.mass * view.length**2),
+            position,
+            view.rotation @ body.orientation,
+        )
 
     def coordinate_rates(self, t, q, u):
         t, old = t * self.view.time, self.old_coordinates(q.array)
@@ -139,7 +155,12 @@ class Seen(jj.Scene):
         position = view.rotation.T @ (view.length * seen.position - view.shift - view.velocity * t)
         if isinstance(seen.body, jj.Particle):
             return jj.Particle(view.mass * seen.mass, position)
-        return jj.RigidBody(view.mass * seen.mass, view.mass * view.length**2 * seen.body.inertia, position, view.rotation.T @ seen.orientation)
+        return jj.RigidBody(
+            view.mass * seen.mass,
+            view.mass * view.length**2 * seen.body.inertia,
+            position,
+            view.rotation.T @ seen.orientation,
+        )
 
     def _motion(self, motion) -> Motion:
         """What the scene's author is shown of a motion."""
@@ -151,18 +172,34 @@ class Seen(jj.Scene):
             omega = view.rotation.T @ motion[new].angular_velocity / view.time
             moving[name] = BodyMotion(name, pose[name].body, v, omega)
         rates = jj.equations.coordinate_rates(self.scene, t, pose.q.array, u)
-        return Motion(t, pose.q, self.scene.speed_names.view(u), self.scene.coordinate_names.view(rates), motion.inputs, moving)
+        return Motion(
+            t,
+            pose.q,
+            self.scene.speed_names.view(u),
+            self.scene.coordinate_names.view(rates),
+            motion.inputs,
+            moving,
+        )
 
     def loads(self, motion):
-        names, seen, force = dict(self.names), self._motion(motion), self._power() * self.view.time / self.view.length
+        names, seen, force = (
+            dict(self.names),
+            self._motion(motion),
+            self._power() * self.view.time / self.view.length,
+        )
         made = []
         for load in self.scene.loads(seen):
             made.append(
                 jj.Load(
                     forces={names[name]: self.view.rotation @ F / force for name, F in load.forces.items()},
-                    torques={names[name]: self.view.rotation @ L / (force * self.view.length) for name, L in load.torques.items()},
+                    torques={
+                        names[name]: self.view.rotation @ L / (force * self.view.length)
+                        for name, L in load.torques.items()
+                    },
                     generalized=self._new_forces(seen, load.generalized),
-                    potential=None if load.potential is None else load.potential / (self._power() * self.view.time),
+                    potential=(
+                        None if load.potential is None else load.potential / (self._power() * self.view.time)
+                    ),
                 )
             )
         return tuple(made[::-1])
@@ -171,7 +208,9 @@ class Seen(jj.Scene):
         """Forces on the new speeds with the same virtual power."""
         if not generalized:
             return {}
-        Q = jnp.stack([jnp.asarray(generalized.get(name, 0.0), float) for name in self.scene.speed_names.entries])
+        Q = jnp.stack(
+            [jnp.asarray(generalized.get(name, 0.0), float) for name in self.scene.speed_names.entries]
+        )
         _, back = jax.vjp(lambda new: self.old_speeds(seen.q.array, new), jnp.zeros_like(Q))
         return dict(zip(self.speed_names.entries, back(Q)[0] / self._power(), strict=True))
 
@@ -180,9 +219,24 @@ class Seen(jj.Scene):
         return None if V is None else V / (self._power() * self.view.time)
 
     def geometric_constraints(self, pose):
-        return dict(reversed([(f"seen {name}", value) for name, value in position_rows(self.scene, self._pose(pose)).items()]))
+        return dict(
+            reversed(
+                [
+                    (f"seen {name}", value)
+                    for name, value in position_rows(self.scene, self._pose(pose)).items()
+                ]
+            )
+        )
 
     def velocity_constraints(self, motion):
         seen = self._motion(motion)
         held = position_rows(self.scene, seen.pose())
-        return dict(reversed([(f"seen {name}", value) for name, value in velocity_rows(self.scene, seen).items() if name not in held]))
+        return dict(
+            reversed(
+                [
+                    (f"seen {name}", value)
+                    for name, value in velocity_rows(self.scene, seen).items()
+                    if name not in held
+                ]
+            )
+        )

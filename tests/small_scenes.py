@@ -53,7 +53,11 @@ class DiscWithHeightRow(jj.Scene):
     def bodies(self, t, q):
         turned = jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin)
         centre = jnp.stack([q.x, q.y, q.z])
-        return {"disc": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=turned)}
+        return {
+            "disc": jj.RigidBody.thin_disc(
+                self.mass, self.radius, axis="y", position=centre, orientation=turned
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)
@@ -73,7 +77,9 @@ class Bead(jj.Scene):
 
 
 class BeadOnTurningWire(jj.Scene):
-    """A bead on a straight wire that is turned at a given rate about the vertical: pose given as a function of time."""
+    """A bead on a straight wire that is turned at a given rate about the vertical: pose given as a function
+    of time.
+    """
 
     mass: float = jj.parameter(0.6, unit="kg", positive=True)
     rate: float = jj.parameter(1.7, unit="rad/s")
@@ -90,7 +96,9 @@ class BeadOnTurningWire(jj.Scene):
 
 
 class DrivenPendulum(jj.Scene):
-    """A pendulum whose pivot is driven sideways as a given function of time, by a prescribed coordinate; damped and sprung."""
+    """A pendulum whose pivot is driven sideways as a given function of time, by a prescribed coordinate;
+    damped and sprung.
+    """
 
     mass: float = jj.parameter(0.8, unit="kg", positive=True)
     length: float = jj.parameter(0.9, unit="m", positive=True)
@@ -107,7 +115,9 @@ class DrivenPendulum(jj.Scene):
 
     def loads(self, motion):
         bob = motion["bob"].point()
-        moving_end = jj.fixed_point(jnp.stack([jnp.cos(motion.t), 1.0 + 0.0 * motion.t, jnp.sin(3 * motion.t)]))
+        moving_end = jj.fixed_point(
+            jnp.stack([jnp.cos(motion.t), 1.0 + 0.0 * motion.t, jnp.sin(3 * motion.t)])
+        )
         return (
             jj.spring(bob, moving_end, self.stiffness, 0.2),
             jj.damper(bob, jj.fixed_point((0.0, 1.0, 0.0)), self.damping),
@@ -121,7 +131,9 @@ class DrivenPendulum(jj.Scene):
 
 
 class Goursat(jj.Scene):
-    """Two particles with `q2dot = q3 q1dot`, `q3dot = q4 q1dot`, ...: brackets reach one new direction at a time."""
+    """Two particles with `q2dot = q3 q1dot`, `q3dot = q4 q1dot`, ...: brackets reach one new direction at a
+    time.
+    """
 
     coordinates = jj.coordinates("q1 q2 q3 q4 q5 q6")
     privileged = ("q1_rate", "q6_rate")
@@ -135,7 +147,9 @@ class Goursat(jj.Scene):
 
 
 class AffineRows(InSpace):
-    """A particle with an integrable row that is not homogeneous, and one that differs from an integrable row by `strength`."""
+    """A particle with an integrable row that is not homogeneous, and one that differs from an integrable row
+    by `strength`.
+    """
 
     strength: float = jj.parameter(0.0)
 
@@ -175,7 +189,11 @@ class Oscillator(jj.Scene):
         return {"cart": jj.Particle(self.mass, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x
+            ),
+        )
 
 
 class HoopBead(jj.Scene):
@@ -188,14 +206,20 @@ class HoopBead(jj.Scene):
 
     def bodies(self, t, q):
         x, heading = self.radius * jnp.sin(q.angle), self.turning * t
-        return {"bead": jj.Particle(0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)]))}
+        return {
+            "bead": jj.Particle(
+                0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)])
+            )
+        }
 
     def loads(self, motion):
         return jj.gravity(motion, 9.81)
 
 
 class Twice(OnLine):
-    """A particle on a spring and in a medium that both nearly give way at a place, by a closed form: twice, and 1 mm apart, or not at all."""
+    """A particle on a spring and in a medium that both nearly give way at a place, by a closed form: twice,
+    and 1 mm apart, or not at all.
+    """
 
     push: float = jj.parameter(-0.1)
     place: float = jj.parameter(0.0123)

@@ -15,9 +15,17 @@ def solved_at_random_states(scene: jj.Scene, count=20):
     """Coordinates, speeds and accelerations by name, each an array over the states, and the whole result."""
     t, q, u = jj.sample_states(scene, count)
     solved = over_states(lambda *state: jj.accelerations(scene, *state), t, q, u)
-    return scene.coordinate_names.view(q), scene.speed_names.view(u), scene.speed_names.view(solved.udot), solved
+    return (
+        scene.coordinate_names.view(q),
+        scene.speed_names.view(u),
+        scene.speed_names.view(solved.udot),
+        solved,
+    )
 
 
 def solved_by_every_reduction(scene: jj.Scene, q, u) -> dict[str, jj.Accelerations]:
     """The result of each reduction at one state, by the reduction's short name."""
-    return {name: jj.accelerations(scene, 0.0, q, u, reduction=reduction) for name, reduction in jj.reductions(scene).items()}
+    return {
+        name: jj.accelerations(scene, 0.0, q, u, reduction=reduction)
+        for name, reduction in jj.reductions(scene).items()
+    }

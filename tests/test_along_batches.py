@@ -1,4 +1,6 @@
-"""What a motion is asked for at all its times, and a batch at all its lanes, is what its single states and lanes answer."""
+"""What a motion is asked for at all its times, and a batch at all its lanes, is what its single states and
+lanes answer.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +31,9 @@ def moved(request):
 @pytest.fixture(scope="module", params=SCENES, ids=SCENES)
 def lanes(request):
     scene, start, inputs = SCENES[request.param]
-    return jj.rollout(scene, start, parameters={"mass" if inputs else "gravity": np.array([9.7, 9.9])}, ts=TS, inputs=inputs)
+    return jj.rollout(
+        scene, start, parameters={"mass" if inputs else "gravity": np.array([9.7, 9.9])}, ts=TS, inputs=inputs
+    )
 
 
 def test_points_of_bodies_along_a_motion_are_those_at_each_time(moved):
@@ -39,15 +43,21 @@ def test_points_of_bodies_along_a_motion_are_those_at_each_time(moved):
         assert body.orientation.shape == (len(TS), 3, 3)
         point = body.point(local)
         assert_allclose(point.position, moved.point(name, local), rtol=0, atol=1e-14)
-        each = jax.jit(jax.vmap(lambda body: (body.point(local).velocity, body.velocity_at(body.place(local)))))
+        each = jax.jit(
+            jax.vmap(lambda body: (body.point(local).velocity, body.velocity_at(body.place(local))))
+        )
         assert_allclose((point.velocity, body.velocity_at(point.position)), each(body), rtol=0, atol=1e-14)
 
 
 QUANTITIES = {
     "motions": lambda m: m.motions(),
     "energies": lambda m: m.energies().balance,
-    # its rank and smallest singular value are judged by typical lengths of rows, which belong to the parameters of one lane
-    "accelerations": lambda m: [getattr(m.accelerations(), name) for name in ("udot", "multipliers", "constraint_force", "residual", "applicable")],
+    # its rank and smallest singular value are judged by typical lengths of rows, which belong to the
+    # parameters of one lane
+    "accelerations": lambda m: [
+        getattr(m.accelerations(), name)
+        for name in ("udot", "multipliers", "constraint_force", "residual", "applicable")
+    ],
     "forces": lambda m: next(iter(m.constraint_forces().forces_on(next(iter(m.motions().bodies))).values())),
     "contacts": lambda m: m.contact_forces(),
     "residuals": lambda m: m.residuals(),
@@ -92,7 +102,12 @@ def test_a_name_that_would_shadow_the_time_is_refused_where_it_is_stated(kind):
 def test_a_failed_motion_gives_nan_where_it_is_asked_to_and_its_neighbours_keep_their_derivatives():
     def loss(amplitude, stiffness):
         def one(stiffness):
-            motion = jj.simulate(Oscillator(mass=1.0, damping=0.0, stiffness=stiffness), {"x": amplitude}, ts=[0.5, 1.0], max_steps=60)
+            motion = jj.simulate(
+                Oscillator(mass=1.0, damping=0.0, stiffness=stiffness),
+                {"x": amplitude},
+                ts=[0.5, 1.0],
+                max_steps=60,
+            )
             marked = motion.nan_if_failed()
             return motion.succeeded, motion.q_end, marked.q_end, marked.q, marked.u_end
 

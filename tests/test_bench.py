@@ -1,4 +1,6 @@
-"""The scripts of bench: the search for wrong motions, the atlas of hard cases, the baselines, and that each runs quickly to its end."""
+"""The scripts of bench: the search for wrong motions, the atlas of hard cases, the baselines, and that each
+runs quickly to its end.
+"""
 
 import dataclasses
 import functools
@@ -31,10 +33,12 @@ from tolerances import relative_error, tolerance
 import jourdain_jax as jj
 from jourdain_jax.equations import coordinate_rates
 
-# The search for motions that are wrong in silence: its references and its judge, and a short set of its cases.
+# The search for motions that are wrong in silence: its references and its judge, and a short set of its
+# cases.
 
 
-# Family and seeds, each wrong or flagged at some time; seeds that differ by the number of a family's ways ask alike, and share a program.
+# Family and seeds, each wrong or flagged at some time; seeds that differ by the number of a family's ways ask
+# alike, and share a program.
 SHORT = (
     ("antiparallelogram", (0, 7, 14)),
     ("rod-pendulum", (3, 10, 17, 24)),
@@ -84,10 +88,29 @@ def test_a_motion_that_ends_in_finite_time_has_no_reference_and_does_not_spoil_i
 
 def _motion(x, code=results.SUCCESS, warned=()):
     end = np.array([x])
-    return SimpleNamespace(result=code, q=end[None], q_end=end, u=end[None], u_end=end, t_end=1.0, accepted=20, event=-1, event_names=(), warnings=warned)
+    return SimpleNamespace(
+        result=code,
+        q=end[None],
+        q_end=end,
+        u=end[None],
+        u_end=end,
+        t_end=1.0,
+        accepted=20,
+        event=-1,
+        event_names=(),
+        warnings=warned,
+    )
 
 
-OSCILLATOR = Family(name="plain", what="", scene=oscillators.Oscillator, draw=dict, start=dict, truth=lambda n, ts: None, names="x")
+OSCILLATOR = Family(
+    name="plain",
+    what="",
+    scene=oscillators.Oscillator,
+    draw=dict,
+    start=dict,
+    truth=lambda n, ts: None,
+    names="x",
+)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +127,9 @@ OSCILLATOR = Family(name="plain", what="", scene=oscillators.Oscillator, draw=di
 )
 def test_a_motion_is_right_or_flagged_or_wrong(motion, truth, outcome):
     truth, growth = Truth(np.full((1, 1, 1), truth)), np.zeros((1, 2, 2))
-    assert judging._judged(OSCILLATOR, Ask("simulate"), motion, 0, [{"span": 1.0}], truth, growth)[0] == outcome
+    assert (
+        judging._judged(OSCILLATOR, Ask("simulate"), motion, 0, [{"span": 1.0}], truth, growth)[0] == outcome
+    )
 
 
 def test_an_error_of_the_engine_refuses_and_a_raw_one_crashes():
@@ -120,7 +145,16 @@ def test_an_error_of_the_engine_refuses_and_a_raw_one_crashes():
 
 def test_the_table_and_the_figures_count_what_was_found():
     made = [
-        {"family": "room", "seed": k, "dtype": "float64", "asked": "", "outcome": o, "error": None, "said": "", "seconds": 1.0}
+        {
+            "family": "room",
+            "seed": k,
+            "dtype": "float64",
+            "asked": "",
+            "outcome": o,
+            "error": None,
+            "said": "",
+            "seconds": 1.0,
+        }
         for k, o in enumerate((RIGHT, WRONG, BY_WARNING))
     ]
     table = list(as_markdown(made))
@@ -130,15 +164,28 @@ def test_the_table_and_the_figures_count_what_was_found():
     assert "--only room --seed 1" in next(iter(losses(made)))
 
 
-# The atlas of hard cases: the engine as it comes is right in those that name it, and the script writes what it documents.
+# The atlas of hard cases: the engine as it comes is right in those that name it, and the script writes what
+# it documents.
 
 
 BY_NAME = {case.name: case for case in CASES}
 DEFAULT = next(method for method in METHODS if method.name == "default")
-REQUIRED = ("E1", "E2", "E5", "E7", "E9 short", "E12", "E13", "E18", "E21", "E22")  # the ten, two of them for a shorter time
+REQUIRED = (
+    "E1",
+    "E2",
+    "E5",
+    "E7",
+    "E9 short",
+    "E12",
+    "E13",
+    "E18",
+    "E21",
+    "E22",
+)  # the ten, two of them for a shorter time
 FLAGS = ("E6", "E24")
 LONGER = [case.name for case in CASES if case.must_be_right and case.name not in REQUIRED]
-# the last: integrated again between checkpoints, the rattleback took other steps: off by 6e-4 at rtol 1e-11, in float64
+# the last: integrated again between checkpoints, the rattleback took other steps: off by 6e-4 at rtol 1e-11,
+# in float64
 LONGER += ["E17 1000", "E17 1e+06", "E17 1e+08", "E19 gradient 2 s"]
 
 
@@ -188,9 +235,13 @@ STATES = 20
 
 
 def _with_random_parameters(name) -> jj.Scene:
-    """A model whose parameters differ from the defaults by up to 20 %, angles that are zero excepted: they become 0.2."""
+    """A model whose parameters differ from the defaults by up to 20 %, angles that are zero excepted: they
+    become 0.2.
+    """
     scene, generator = jj.models.MODELS[name](), np.random.default_rng(7)
-    return scene.replace(**{key: (value or 0.2) * generator.uniform(0.8, 1.2) for key, value in _parameters(scene).items()})
+    return scene.replace(
+        **{key: (value or 0.2) * generator.uniform(0.8, 1.2) for key, value in _parameters(scene).items()}
+    )
 
 
 @functools.cache
@@ -199,7 +250,14 @@ def _solved(name):
     scene = _with_random_parameters(name)
     t, q, u = jj.sample_states(scene, STATES)
     assert len(t) == STATES
-    return scene, (t, q, u), *map(np.asarray, over_states(lambda *y: (coordinate_rates(scene, *y), jj.accelerations(scene, *y).udot), t, q, u))
+    return (
+        scene,
+        (t, q, u),
+        *map(
+            np.asarray,
+            over_states(lambda *y: (coordinate_rates(scene, *y), jj.accelerations(scene, *y).udot), t, q, u),
+        ),
+    )
 
 
 def _assert_equal(found, expected, among=None):
@@ -213,7 +271,11 @@ def _columns(states):
 
 
 def _parameters(scene: jj.Scene):
-    return {field.name: float(getattr(scene, field.name)) for field in dataclasses.fields(scene) if field.metadata.get("parameter")}
+    return {
+        field.name: float(getattr(scene, field.name))
+        for field in dataclasses.fields(scene)
+        if field.metadata.get("parameter")
+    }
 
 
 @pytest.mark.parametrize("name", hand_derived.HAND_DERIVED)
@@ -228,23 +290,35 @@ def test_equations_derived_by_hand_give_the_rates_of_the_engine(name):
     _assert_equal(np.stack(found[1], 1), udot[:, independent], among=udot)
 
 
-@pytest.mark.parametrize(("name", "rates"), [("tilting-disc", dense.disc_rates), ("whipple-bicycle", dense.bicycle_rates)])
+@pytest.mark.parametrize(
+    ("name", "rates"), [("tilting-disc", dense.disc_rates), ("whipple-bicycle", dense.bicycle_rates)]
+)
 def test_dense_equations_give_the_rates_of_the_engine(name, rates):
     scene, (t, q, u), qdot, udot = _solved(name)
-    found = jax.jit(jax.vmap(rates, in_axes=(None, 0, 0)))(_parameters(scene), t, jnp.concatenate([q, u], axis=1))
+    found = jax.jit(jax.vmap(rates, in_axes=(None, 0, 0)))(
+        _parameters(scene), t, jnp.concatenate([q, u], axis=1)
+    )
     _assert_equal(found, np.concatenate([qdot, udot], axis=1))
 
 
 def test_the_dense_scripts_have_the_parameters_of_the_models():
-    for name, parameters in (("tilting-disc", dense.DISC_PARAMETERS), ("whipple-bicycle", dense.BICYCLE_PARAMETERS)):
+    for name, parameters in (
+        ("tilting-disc", dense.DISC_PARAMETERS),
+        ("whipple-bicycle", dense.BICYCLE_PARAMETERS),
+    ):
         assert parameters == _parameters(jj.models.MODELS[name]())
 
 
 def test_dense_and_flat_equations_run_the_disc_to_the_same_end():
     starts, end = disc_run.starts(3), 0.5
-    run = jax.jit(lambda rates, y: dense.integrate(rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-11), static_argnums=0)
+    run = jax.jit(
+        lambda rates, y: dense.integrate(rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-11),
+        static_argnums=0,
+    )
     by_hand = run(flat.disc_rates, starts)
-    assert relative_error(run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand) < tolerance("closed_form")
+    assert relative_error(
+        run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand
+    ) < tolerance("closed_form")
 
 
 @pytest.mark.parametrize("width", [1, 4])
@@ -263,7 +337,10 @@ def test_operations_are_counted_after_common_subexpressions():
         gain = xp.sin(p["a"]) * p["b"] + 1  # of parameters alone: free
         shared = gain * (q[0] * v[0])  # 2
         xp.sqrt(q[0])  # needed by nothing
-        return (shared + xp.cos(t), -(gain * (v[0] * q[0]))), (q[0] * q[0] / p["b"], xp.zeros_like(t))  # 2; 1; 1 + 1
+        return (shared + xp.cos(t), -(gain * (v[0] * q[0]))), (
+            q[0] * q[0] / p["b"],
+            xp.zeros_like(t),
+        )  # 2; 1; 1 + 1
 
     counted = count.count_operations(rates, ("a", "b"), 1, 1)
     assert counted == {"mul": 3, "add": 1, "cos": 1, "neg": 1, "div": 1}
@@ -271,7 +348,14 @@ def test_operations_are_counted_after_common_subexpressions():
 
 @pytest.mark.parametrize(
     ("name", "operations"),
-    [("two-wheel-axle-coordinates", 11), ("skate", 9), ("chaplygin-sleigh", 13), ("vertical-disc", 5), ("tilting-disc", 21), ("ball-on-turntable", 34)],
+    [
+        ("two-wheel-axle-coordinates", 11),
+        ("skate", 9),
+        ("chaplygin-sleigh", 13),
+        ("vertical-disc", 5),
+        ("tilting-disc", 21),
+        ("ball-on-turntable", 34),
+    ],
 )
 def test_hand_derived_equations_need_few_operations(name, operations):
     assert hand_derived.operations(name) == operations
@@ -281,7 +365,11 @@ def test_hand_derived_equations_need_few_operations(name, operations):
 
 
 BENCH = Path(__file__).parents[1] / "bench"
-SCRIPTS = sorted(path.name for path in BENCH.glob("*.py") if 'if __name__ == "__main__"' in path.read_text(encoding="utf-8"))
+SCRIPTS = sorted(
+    path.name
+    for path in BENCH.glob("*.py")
+    if 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
+)
 
 
 def test_the_scripts_are_found():
@@ -290,13 +378,21 @@ def test_the_scripts_are_found():
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_script_runs_quickly_to_its_end(script, tmp_path):
-    """Whether requirements on time are met depends on the machine; those that are shares or errors of a sample do not, and rows without one are met."""
+    """Whether requirements on time are met depends on the machine; those that are shares or errors of a
+    sample do not, and rows without one are met.
+    """
     out = tmp_path / "figures.json"
     command = [sys.executable, script, "--quick", "--json", str(out)]
     command += ["--out", str(tmp_path)] if "--out" in (BENCH / script).read_text(encoding="utf-8") else []
-    done = subprocess.run(command, cwd=BENCH, env=os.environ | {"MPLBACKEND": "Agg"}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=BENCH, env=os.environ | {"MPLBACKEND": "Agg"}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
-    figures = [row for row in json.loads(out.read_text(encoding="utf-8")) if isinstance(row, dict) and "required" in row]
+    figures = [
+        row
+        for row in json.loads(out.read_text(encoding="utf-8"))
+        if isinstance(row, dict) and "required" in row
+    ]
     assert all(row["met"] for row in figures if row["required"] is None)
     missed = [row for row in figures if "intervals" in str(row.get("figure")) and not row["met"]]
     assert not missed

@@ -1,4 +1,6 @@
-"""Between saved times too, a motion is right or flagged: pivots keep their signs, and a projection moves a step by no more than an error."""
+"""Between saved times too, a motion is right or flagged: pivots keep their signs, and a projection moves a
+step by no more than an error.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +12,21 @@ from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
-SPEEDS = np.linspace(5.0, 10.0, 16)  # of the pendulum's x, m/s: some swing beyond the horizontal, some go round
+SPEEDS = np.linspace(
+    5.0, 10.0, 16
+)  # of the pendulum's x, m/s: some swing beyond the horizontal, some go round
 END = np.array([2.0])
 
 
 def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
     pendulum, ts = NarrowPendulum(), jnp.asarray(END)
-    lanes = jax.jit(jax.vmap(lambda v: jj.simulate(pendulum, jj.start(pendulum, x=0.3, z=-np.sqrt(0.91), x_rate=v), ts=ts, rtol=1e-6, atol=1e-6)))
+    lanes = jax.jit(
+        jax.vmap(
+            lambda v: jj.simulate(
+                pendulum, jj.start(pendulum, x=0.3, z=-np.sqrt(0.91), x_rate=v), ts=ts, rtol=1e-6, atol=1e-6
+            )
+        )
+    )
     assert np.all(np.asarray(lanes(SPEEDS).result) == results.SINGULAR_PARTITION)
     slow = lanes(np.linspace(0.1, 1.0, 4))  # these stay inside
     assert np.all(np.asarray(slow.result) == results.SUCCESS)
@@ -32,7 +42,13 @@ def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
     ids=["implicit", "constant steps", "dense"],
 )
 def test_every_way_of_integrating_watches_its_pivots(options):
-    asked = jj.rollout(NarrowPendulum(), {"x": 0.3, "z": -np.sqrt(0.91), "x_rate": SPEEDS[::5]}, ts=END, formulation=jj.Formulation("minimal"), **options)
+    asked = jj.rollout(
+        NarrowPendulum(),
+        {"x": 0.3, "z": -np.sqrt(0.91), "x_rate": SPEEDS[::5]},
+        ts=END,
+        formulation=jj.Formulation("minimal"),
+        **options,
+    )
     assert np.all(asked.result == results.SINGULAR_PARTITION)
 
 
@@ -52,17 +68,34 @@ class BladeTwice(jj.Scene):
 
 
 def test_rows_stated_twice_hide_no_singular_partition():
-    options = {"ts": [0.5, 2.0], "formulation": jj.Formulation("minimal"), "backend": "dense", "rtol": 1e-6, "atol": 1e-6}
+    options = {
+        "ts": [0.5, 2.0],
+        "formulation": jj.Formulation("minimal"),
+        "backend": "dense",
+        "rtol": 1e-6,
+        "atol": 1e-6,
+    }
     motion = jj.simulate(BladeTwice(), {"x_rate": 1.0, "heading_rate": 1.0}, **options)
-    assert_allclose(motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5)  # a circle, heading along y at pi/2
+    assert_allclose(
+        motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5
+    )  # a circle, heading along y at pi/2
     assert motion.result == results.SINGULAR_PARTITION
 
 
 def _parallelograms(count, **options):
     w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
-    starts = {"a": np.full(count, a_0), "b": np.zeros(count), "c": np.full(count, a_0), "a_rate": w, "b_rate": 0 * w, "c_rate": w}
+    starts = {
+        "a": np.full(count, a_0),
+        "b": np.zeros(count),
+        "c": np.full(count, a_0),
+        "a_rate": w,
+        "b_rate": 0 * w,
+        "c_rate": w,
+    }
     found = jj.rollout(Parallelogram(), starts, ts=ts, **options)
-    error = np.max(np.abs(np.asarray(found.lanes.q) - (a_0 + w[:, None] * ts)[..., None] * [1, 0, 1]), axis=(1, 2))
+    error = np.max(
+        np.abs(np.asarray(found.lanes.q) - (a_0 + w[:, None] * ts)[..., None] * [1, 0, 1]), axis=(1, 2)
+    )
     return found.result, error
 
 
@@ -84,7 +117,12 @@ def test_steps_of_constant_length_that_lose_their_rows_are_flagged():
 def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_flagged(options):
     count = 64 if not options else 8
     w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
-    starts = {"a": np.full(count, 0.5), "b": np.full(count, -0.5), "x": np.full(count, 2 * np.cos(0.5)), "a_rate": w}
+    starts = {
+        "a": np.full(count, 0.5),
+        "b": np.full(count, -0.5),
+        "x": np.full(count, 2 * np.cos(0.5)),
+        "a_rate": w,
+    }
     found = jj.rollout(SliderCrank(), starts, ts=ts, formulation=jj.Formulation("full"), **options)
     arrived = found.result == results.SUCCESS
     assert np.mean(arrived) > 0.6
@@ -98,7 +136,9 @@ def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_fla
 def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(backend):
     def motion(scene):
         start = {"a": 0.7, "b": 0.0, "c": 0.7, "a_rate": 1.0, "b_rate": 0.0, "c_rate": 1.0}
-        return jj.simulate(scene, start, ts=[1.0], rtol=1e-6, atol=1e-6, formulation=jj.Formulation("full"), backend=backend)
+        return jj.simulate(
+            scene, start, ts=[1.0], rtol=1e-6, atol=1e-6, formulation=jj.Formulation("full"), backend=backend
+        )
 
     motion(Parallelogram())  # of ordinary size, first
     of_size = jax.jit(lambda size: motion(Parallelogram(crank=size, coupler=2 * size, mass=size**3)))

@@ -1,4 +1,6 @@
-"""Bicycles: files of measured parameters and of raw measurements, stability speeds, and the whole job from files to tables and rides."""
+"""Bicycles: files of measured parameters and of raw measurements, stability speeds, and the whole job from
+files to tables and rides.
+"""
 
 import json
 
@@ -35,7 +37,17 @@ from jourdain_jax.cli.bicycle_verbs import prefixes
 # Measured bicycle files: what ships is read or refused as intended, and every refusal says what to do.
 
 
-SHIPPED = ["Balanceassistv1", "Benchmark", "Browser", "Browserins", "Crescendo", "Fisher", "Pista", "Rigid", "Silver"]
+SHIPPED = [
+    "Balanceassistv1",
+    "Benchmark",
+    "Browser",
+    "Browserins",
+    "Crescendo",
+    "Fisher",
+    "Pista",
+    "Rigid",
+    "Silver",
+]
 SHIPPED += ["Tms", "Yellow", "Yellowrev"]
 GOOD = shipped_bicycles()["Browser"].read_text()
 
@@ -127,7 +139,12 @@ def test_a_bad_line_is_refused_with_its_number_name_and_a_remedy(tmp_path, old, 
 
 @pytest.mark.parametrize(
     ("content", "expected"),
-    [(b"", "empty"), (b"\x89PNG\r\n\xff\xfe", "not UTF-8"), (b"w = 1\0", "binary"), (b"#" * 1_000_001, "larger")],
+    [
+        (b"", "empty"),
+        (b"\x89PNG\r\n\xff\xfe", "not UTF-8"),
+        (b"w = 1\0", "binary"),
+        (b"#" * 1_000_001, "larger"),
+    ],
 )
 def test_a_file_that_is_no_parameter_file_is_refused(tmp_path, content, expected):
     assert expected in _refusal(_written(tmp_path, content))
@@ -211,7 +228,9 @@ def test_a_measured_bicycle_is_a_scene_and_a_prior():
         measured_bicycle("Browsr")
 
 
-FLAT = "# a set of parameters\n---\n" + "".join(f"{name}: {value!r}\n" for name, value in shipped("Browser").values.items())
+FLAT = "# a set of parameters\n---\n" + "".join(
+    f"{name}: {value!r}\n" for name, value in shipped("Browser").values.items()
+)
 HEADED = "parameterization: benchmark\nrider: False\ndescription: |\n  A bicycle: with c: 3.\nvalues:\n"
 SECTION = HEADED + "".join(f"  {line}  # measured\n" for line in FLAT.splitlines()[2:]) + "note: c\n"
 
@@ -228,7 +247,11 @@ def test_a_set_in_yaml_is_read(tmp_path, text, ending):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("parameterization: benchmark", "parameterization: principal", "line 1: parameterization `principal`, expected the benchmark's"),
+        (
+            "parameterization: benchmark",
+            "parameterization: principal",
+            "line 1: parameterization `principal`, expected the benchmark's",
+        ),
         ("  c: ", "  cc: ", "unknown parameter `cc`; did you mean `c`"),
         ("  c: ", "  c = ", "expected `name: value`"),
         ("values:\n", "values:\n  c: 0.1\n", "`c` was already given in line 6"),
@@ -241,10 +264,12 @@ def test_a_bad_line_in_yaml_is_refused_with_its_number(tmp_path, old, new, expec
     assert expected in _refusal(_written(tmp_path, SECTION.replace(old, new), "set.yml"))
 
 
-# Parameters of bicycles from periods, hang angles and lengths: against the published ones, with their covariance.
+# Parameters of bicycles from periods, hang angles and lengths: against the published ones, with their
+# covariance.
 
 
-# what follows from the places of mass centres; these are least squares here, published as means over pairs of lines
+# what follows from the places of mass centres; these are least squares here, published as means over pairs of
+# lines
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")
 DELFT = ["Browser", "Browserins", "Crescendo", "Fisher", "Pista", "Yellow", "Yellowrev"]
 
@@ -253,7 +278,10 @@ def off(name, of=None):
     """Values less published ones over published sigmas, and sigmas over published ones, by parameter."""
     found, published = benchmark_from_measurements(name), measured_bicycle(name)
     sigma = published.sigmas
-    return {n: ((found.values[n] - published.values[n]) / sigma[n], found.sigmas[n] / sigma[n]) for n in (of or PARAMETER_NAMES)}
+    return {
+        n: ((found.values[n] - published.values[n]) / sigma[n], found.sigmas[n] / sigma[n])
+        for n in of or PARAMETER_NAMES
+    }
 
 
 @pytest.mark.parametrize("name", DELFT)
@@ -270,18 +298,32 @@ def test_published_parameters_and_sigmas_follow_from_the_measurements(name):
 @pytest.mark.parametrize("name", [*DELFT, "Balanceassistv1"])
 def test_centres_of_mass_differ_by_how_lines_are_averaged_only(name):
     """Means over pairs of lines give the published places, and so do the lines of this package."""
-    readings, found, published = read_readings(shipped_measurements()[name]), benchmark_from_measurements(name), measured_bicycle(name)
+    readings, found, published = (
+        read_readings(shipped_measurements()[name]),
+        benchmark_from_measurements(name),
+        measured_bicycle(name),
+    )
     for part, hung_by in (("B", (0.0, -found.values["rR"])), ("H", (found.values["w"], -found.values["rF"]))):
-        angles, beside = ([readings.means[f"{what}{part}{k}"] for k in readings.hangings[part]] for what in ("alpha", "a"))
+        angles, beside = (
+            [readings.means[f"{what}{part}{k}"] for k in readings.hangings[part]] for what in ("alpha", "a")
+        )
         x, z = mean_of_intersections(np.deg2rad(angles), np.array(beside), found.values["lam"])
         digits = 1e-3 if name == "Balanceassistv1" else 1e-9  # its file gives three of them
-        assert_allclose([hung_by[0] + x, hung_by[1] + z], [published.values[f"x{part}"], published.values[f"z{part}"]], atol=digits)
+        assert_allclose(
+            [hung_by[0] + x, hung_by[1] + z],
+            [published.values[f"x{part}"], published.values[f"z{part}"]],
+            atol=digits,
+        )
 
 
 def test_a_fork_measured_apart_from_its_handlebar_and_a_frame_on_a_table():
-    """The sigma of the trail is smaller than the published one; here the trail keeps the correlation of the radius with the tilt."""
+    """The sigma of the trail is smaller than the published one; here the trail keeps the correlation of the
+    radius with the tilt.
+    """
     of = off("Rigid")
-    of_table = {n: of[n] for n in ("w", "lam", "rR", "IRxx", "IRyy", "IFxx", "IFyy", "IBxx", "IBzz", "IBxz", "mH")}
+    of_table = {
+        n: of[n] for n in ("w", "lam", "rR", "IRxx", "IRyy", "IFxx", "IFyy", "IBxx", "IBzz", "IBxz", "mH")
+    }
     assert max(abs(apart) for apart, _ in of_table.values()) < 1e-6
     assert max(abs(ratio - 1) for _, ratio in of_table.values()) < 1e-2
     assert abs(of["c"][0]) < 1e-6
@@ -306,34 +348,60 @@ def test_bicycles_without_published_parameters_are_bicycles(name):
 def test_derivatives_by_readings_are_central_differences(tmp_path):
     text = shipped_measurements()["Browser"].read_text()
     whole = benchmark_from_measurements(write(tmp_path, text))
-    for name, sigma in (("lR", 0.001), ("alphaB2", 0.2), ("TtP1", 5.93377589066e-06), ("gamma", 0.2), ("dF", 0.01)):
+    for name, sigma in (
+        ("lR", 0.001),
+        ("alphaB2", 0.2),
+        ("TtP1", 5.93377589066e-06),
+        ("gamma", 0.2),
+        ("dF", 0.01),
+    ):
         (line,) = [line for line in text.splitlines() if line.split("=")[0].strip() == name]
         value = float(line.partition("=")[2].partition("+/-")[0])
-        ends = [benchmark_from_measurements(write(tmp_path, text.replace(line, f"{name} = {value + by!r}"))).values for by in (1e-4 * sigma, -1e-4 * sigma)]
+        ends = [
+            benchmark_from_measurements(
+                write(tmp_path, text.replace(line, f"{name} = {value + by!r}"))
+            ).values
+            for by in (1e-4 * sigma, -1e-4 * sigma)
+        ]
         slope = np.array([(ends[0][n] - ends[1][n]) / 2e-4 for n in PARAMETER_NAMES])
         # what this reading adds to the covariance: known exactly, it is gone
-        less = benchmark_from_measurements(write(tmp_path, text.replace(line, f"{name} = {value!r}+/-0.0"))).covariance
-        assert_allclose(whole.covariance - less, np.outer(slope, slope), rtol=1e-5, atol=1e-9 * np.abs(whole.covariance).max())
+        less = benchmark_from_measurements(
+            write(tmp_path, text.replace(line, f"{name} = {value!r}+/-0.0"))
+        ).covariance
+        assert_allclose(
+            whole.covariance - less,
+            np.outer(slope, slope),
+            rtol=1e-5,
+            atol=1e-9 * np.abs(whole.covariance).max(),
+        )
 
 
 def test_samples_have_the_covariance():
     found = benchmark_from_measurements("Browser")
     samples = np.asarray(sample_parameters(found, jax.random.key(0), 20000).values)
     sigma = np.array([found.sigmas[n] for n in PARAMETER_NAMES])
-    assert_allclose(np.cov(samples.T) / np.outer(sigma, sigma), found.covariance / np.outer(sigma, sigma), atol=0.03)
+    assert_allclose(
+        np.cov(samples.T) / np.outer(sigma, sigma), found.covariance / np.outer(sigma, sigma), atol=0.03
+    )
     i, j = PARAMETER_NAMES.index("IRxx"), PARAMETER_NAMES.index("IFxx")
     assert found.covariance[i, j] / (sigma[i] * sigma[j]) > 0.99  # both are gauged by one rod
 
 
 def test_a_study_takes_measurements_and_its_limits_are_narrower(tmp_path):
-    measured, published = (study(of["Crescendo"], samples=400) for of in (shipped_measurements(), shipped_bicycles()))
-    width = [one.speeds["weave_speed"]["high"] - one.speeds["weave_speed"]["low"] for one in (measured, published)]
+    measured, published = (
+        study(of["Crescendo"], samples=400) for of in (shipped_measurements(), shipped_bicycles())
+    )
+    width = [
+        one.speeds["weave_speed"]["high"] - one.speeds["weave_speed"]["low"] for one in (measured, published)
+    ]
     assert 0.5 < width[0] / width[1] < 0.75  # 0.199 and 0.331 m/s with 2,000 samples
     assert isinstance(study(write(tmp_path, "g = 9.81"), samples=10), Refused)
 
 
 def test_the_command_takes_measurements_by_name(tmp_path, capsys):
-    assert main(["bicycle", "BrowserMeasured", "--samples", "60", "--no-figures", "--out", str(tmp_path)]) == 0
+    assert (
+        main(["bicycle", "BrowserMeasured", "--samples", "60", "--no-figures", "--out", str(tmp_path)]) == 0
+    )
     assert "parameters from raw measurements, with their covariance" in capsys.readouterr().out
 
 
@@ -349,13 +417,22 @@ READINGS = shipped_measurements()["Browser"].read_text()
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (READINGS.replace("TtH3", "TtH9"), "missing `alphaH3`, `aH3`, `TtH3`, which the parameters of a bicycle need"),
+        (
+            READINGS.replace("TtH3", "TtH9"),
+            "missing `alphaH3`, `aH3`, `TtH3`, which the parameters of a bicycle need",
+        ),
         (READINGS.replace("dP =", "dQ ="), "missing `dP`"),
         (READINGS.replace("w = 1.121+/-0.002", "w"), "got `w`, expected `name = reading+/-sigma`"),
-        (READINGS.replace("w = 1.121+/-0.002", "w = 1.1, long"), "reading of `w` is `long`, expected a number"),
+        (
+            READINGS.replace("w = 1.121+/-0.002", "w = 1.1, long"),
+            "reading of `w` is `long`, expected a number",
+        ),
         (READINGS.replace("w = 1.121+/-0.002", "w = 1.1+/--0.1"), "sigma of `w` is -0.1"),
         (READINGS + "w = 1.2\n", "`w` was already given in line"),
-        (READINGS.replace("TcB1 = 1.7", "TcB1 = 0.7"), "no bicycle has these readings: `IByy` (rear frame moment of inertia about y) must not"),
+        (
+            READINGS.replace("TcB1 = 1.7", "TcB1 = 0.7"),
+            "no bicycle has these readings: `IByy` (rear frame moment of inertia about y) must not",
+        ),
     ],
 )
 def test_bad_files_are_refused_by_name(text, told, tmp_path):
@@ -430,15 +507,27 @@ def test_result_and_table_say_what_the_limits_mean(studies, tmp_path):
 
 
 def test_the_command_writes_its_table_and_figures(tmp_path, capsys):
-    assert main(["bicycle", "Rigid", "Tms", "--samples", "60", "--out", str(tmp_path / "out")]) == 1  # one file was refused
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "eigenvalues.png", "ride.png", "ride.gif"}
+    assert (
+        main(["bicycle", "Rigid", "Tms", "--samples", "60", "--out", str(tmp_path / "out")]) == 1
+    )  # one file was refused
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "result.json",
+        "eigenvalues.png",
+        "ride.png",
+        "ride.gif",
+    }
     assert "5.0084" in capsys.readouterr().out
 
 
 def test_figures_of_two_bicycles_with_one_name_have_two_names():
     assert prefixes(["Rigid"]) == [""]
     assert prefixes([]) == []
-    assert prefixes(["Rigid", "my bike", "Rigid", "my_bike"]) == ["Rigid-", "my_bike-", "Rigid-2-", "my_bike-2-"]
+    assert prefixes(["Rigid", "my bike", "Rigid", "my_bike"]) == [
+        "Rigid-",
+        "my_bike-",
+        "Rigid-2-",
+        "my_bike-2-",
+    ]
 
 
 # Stability speeds of linear bicycles: published numbers, eigenvalues on either side, and derivatives.
@@ -475,7 +564,12 @@ def test_the_appendix_formulas_give_the_published_matrices():
 def test_the_benchmark_eigenvalues_are_the_published_ones(speed):
     castering, capsize, *weave = oracle.EIGENVALUES[speed]
     (found,) = eigenvalues_of(*BENCHMARK, np.array([float(speed)]))
-    assert_allclose(found, [castering, capsize, *sorted(weave, key=lambda root: (root.real, root.imag))], rtol=1e-12, atol=1e-12)
+    assert_allclose(
+        found,
+        [castering, capsize, *sorted(weave, key=lambda root: (root.real, root.imag))],
+        rtol=1e-12,
+        atol=1e-12,
+    )
 
 
 def test_the_benchmark_speeds_are_the_published_ones():
@@ -504,9 +598,15 @@ def test_the_eigenvalues_cross_where_the_speeds_say(name):
         assert all(growth(v, False) < 0 for v in np.linspace(found.weave_speed, 50.0, 50))
         assert found.stable_to == 50.0
     else:
-        assert growth(found.capsize_speed * (1 - 1e-6), False) < 0 < growth(found.capsize_speed * (1 + 1e-6), False)
+        assert (
+            growth(found.capsize_speed * (1 - 1e-6), False)
+            < 0
+            < growth(found.capsize_speed * (1 + 1e-6), False)
+        )
 
-    below, above = (_growth_rates(matrices, found.double_root_speed * (1 + shift))[2:] for shift in (-1e-6, 1e-6))
+    below, above = (
+        _growth_rates(matrices, found.double_root_speed * (1 + shift))[2:] for shift in (-1e-6, 1e-6)
+    )
     assert (below.imag == 0).all()
     assert (above.imag != 0).all()
     assert_allclose(below.real.mean(), above.real.mean(), rtol=1e-2)

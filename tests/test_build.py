@@ -1,4 +1,6 @@
-"""The two phases: what is built once about a scene is one value, and what comes after does not depend on how often, or after what, it is called."""
+"""The two phases: what is built once about a scene is one value, and what comes after does not depend on how
+often, or after what, it is called.
+"""
 
 import pickle
 
@@ -29,7 +31,16 @@ def test_what_is_built_is_there_part_by_part(disc):
     assert disc.program.operations == jj.lower(TiltingDisc()).operations
     assert (disc.state, disc.not_lowered) == ("minimal", "")
     assert not disc.warnings
-    assert all(word in str(disc) for word in ("Model of TiltingDisc", "machine code", "privileged speeds", "27 operations", "conserved"))
+    assert all(
+        word in str(disc)
+        for word in (
+            "Model of TiltingDisc",
+            "machine code",
+            "privileged speeds",
+            "27 operations",
+            "conserved",
+        )
+    )
 
 
 def test_warnings_say_where_rank_is_lost():
@@ -53,7 +64,13 @@ def test_what_was_built_stands_wherever_its_scene_does():
     def asked(scene):
         state = jj.start(scene, **start)
         lanes = jj.rollout(scene, {"x_rate": jnp.array([0.5, 0.6])}, ts=ts).lanes
-        numbers = jj.simulate(scene, start, ts=ts).q, lanes.q, state.u, jj.linearize(scene, state).A, jj.fit(scene, data, free=["offset"]).values
+        numbers = (
+            jj.simulate(scene, start, ts=ts).q,
+            lanes.q,
+            state.u,
+            jj.linearize(scene, state).A,
+            jj.fit(scene, data, free=["offset"]).values,
+        )
         return jax.tree.map(np.asarray, numbers), str(jj.report(scene)), jj.lower(scene)
 
     of_model, of_scene = asked(jj.build(ChaplyginSleigh())), asked(ChaplyginSleigh())
@@ -89,14 +106,18 @@ def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_u
 
     offsets = np.array([0.2, 0.3])
     slopes = jax.jit(jax.vmap(jax.grad(end, argnums=1), (None, 0)))(model, offsets)
-    slope = jax.jit(jax.grad(lambda offset: jj.simulate(ChaplyginSleigh(offset=offset), start, ts=ts).q_end[0]))
+    slope = jax.jit(
+        jax.grad(lambda offset: jj.simulate(ChaplyginSleigh(offset=offset), start, ts=ts).q_end[0])
+    )
     assert_allclose(slopes, [slope(x) for x in offsets], rtol=1e-6)
     assert len(jax.tree.leaves(model)) == len(jax.tree.leaves(model.scene))
     assert_allclose(jj.start(model, **start).u, jj.start(model.scene, **start).u, rtol=0, atol=1e-14)
 
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
-    with pytest.raises(AttributeError, match=r"`Model` has no `bodies`; where a scene is expected, pass its `\.scene`"):
+    with pytest.raises(
+        AttributeError, match=r"`Model` has no `bodies`; where a scene is expected, pass its `\.scene`"
+    ):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
 
 
@@ -110,7 +131,13 @@ def crane() -> type[jj.Scene]:
 
         def velocity_constraints(self, motion):
             q, u = motion.q, motion.u
-            return {"rope": (self.arm + 0.3 * jnp.sin(q.x)) * u.y_rate - (self.rope + 0.2 * jnp.cos(q.z)) * u.z_rate - 0.1 * q.y * u.x_rate}
+            return {
+                "rope": (
+                    (self.arm + 0.3 * jnp.sin(q.x)) * u.y_rate
+                    - (self.rope + 0.2 * jnp.cos(q.z)) * u.z_rate
+                    - 0.1 * q.y * u.x_rate
+                )
+            }
 
     return Crane
 
@@ -118,7 +145,10 @@ def crane() -> type[jj.Scene]:
 def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_says_so():
     kind = crane()
     built = [jj.build(kind(*numbers)) for numbers in ((1.0, 1.0), (1.0, 10.0), (10.0, 1.0))]
-    chosen, told = [model.freedoms.privileged for model in built], ["which replace parameters traced by JAX" in str(model) for model in built]
+    chosen, told = (
+        [model.freedoms.privileged for model in built],
+        ["which replace parameters traced by JAX" in str(model) for model in built],
+    )
     assert told == [privileged != chosen[0] for privileged in chosen]
     assert any(told)
 
@@ -129,7 +159,13 @@ def batch(scene, ts, start):
 
 def alone(scene, ts, start):
     motion = jj.simulate(scene, start, ts=ts)
-    return [int(motion.result), int(motion.fallback), float(motion.smallest_pivot), *motion.q_end.tolist(), *motion.u_end.tolist()]
+    return [
+        int(motion.result),
+        int(motion.fallback),
+        float(motion.smallest_pivot),
+        *motion.q_end.tolist(),
+        *motion.u_end.tolist(),
+    ]
 
 
 def fitted(scene, ts, start):

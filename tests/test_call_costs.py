@@ -1,4 +1,6 @@
-"""What a call of `simulate` with functions of time costs: nothing is compiled twice, what is compiled is dropped again, and numbers stay numbers."""
+"""What a call of `simulate` with functions of time costs: nothing is compiled twice, what is compiled is
+dropped again, and numbers stay numbers.
+"""
 
 import functools
 import subprocess
@@ -25,7 +27,11 @@ class Pushed(OnPlane):
     inputs = jj.inputs("f g")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.f - self.stiffness * motion.q.x, y_rate=motion.inputs.g),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=motion.inputs.f - self.stiffness * motion.q.x, y_rate=motion.inputs.g
+            ),
+        )
 
 
 TS = np.array([0.0, 0.5, 1.0])
@@ -157,7 +163,9 @@ print(*sorted({file.split("jourdain_jax/")[-1] for file, *_ in stats.stats if "/
 
 
 def test_a_warm_call_from_python_is_short():
-    """Counted in calls of Python functions, which no other load on the machine changes, and in files of our own, in a process that checks no types."""
+    """Counted in calls of Python functions, which no other load on the machine changes, and in files of our
+    own, in a process that checks no types.
+    """
     done = subprocess.run([sys.executable, "-c", WARM_CALL], capture_output=True, text=True, check=True)
     of_names, of_state, *files = done.stdout.split()
     assert int(of_state) < 590  # 536 at the time of writing
@@ -196,7 +204,13 @@ def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
         return moved(lambda t: jax.jit(lambda t: k * jnp.sin(t))(t))["x"][-1]
 
     def lanes(k):
-        found = jj.rollout(Pushed(), {"x": np.array([0.1, 0.2])}, ts=TS, inputs={"f": lambda t: k * jnp.sin(t)}, progress=False)
+        found = jj.rollout(
+            Pushed(),
+            {"x": np.array([0.1, 0.2])},
+            ts=TS,
+            inputs={"f": lambda t: k * jnp.sin(t)},
+            progress=False,
+        )
         return jnp.sum(found["x"][:, -1]) / 2
 
     assert_allclose(jax.vmap(end)(jnp.array([0.0, 1.5])), [pulled(0.0), pulled(1.5)], atol=1e-7)
@@ -206,7 +220,10 @@ def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
 
 def test_motions_go_on_after_the_precision_is_switched():
     def run():
-        motions = jj.simulate(jj.models.DoublePendulumRods(), t1=0.1, rtol=1e-5, atol=1e-5), moved(lambda t: jnp.sin(t), rtol=1e-5, atol=1e-5)
+        motions = (
+            jj.simulate(jj.models.DoublePendulumRods(), t1=0.1, rtol=1e-5, atol=1e-5),
+            moved(lambda t: jnp.sin(t), rtol=1e-5, atol=1e-5),
+        )
         assert all(motion.succeeded for motion in motions), str(motions[0])
         return [np.asarray(motion.q_end) for motion in motions]
 

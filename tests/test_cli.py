@@ -1,4 +1,6 @@
-"""The command line: machine-readable answers, documented exit codes, unknown names answered with the nearest ones."""
+"""The command line: machine-readable answers, documented exit codes, unknown names answered with the nearest
+ones.
+"""
 
 import json
 import os
@@ -47,7 +49,9 @@ def test_report_has_the_documented_keys(capsys):
     assert found["rank"] == 1
     assert found["nonholonomic_rows"] == ["blade"]
     assert found["growth_vector"] == [2, 3]
-    keys = "rows redundant_rows integrable_rows cyclic_coordinates ignorable_coordinates privileged_velocities"
+    keys = (
+        "rows redundant_rows integrable_rows cyclic_coordinates ignorable_coordinates privileged_velocities"
+    )
     assert set(keys.split()) <= found.keys()
 
 
@@ -62,8 +66,30 @@ def test_verify_has_the_documented_keys_and_passes(capsys):
 
 def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
     files = [str(tmp_path / name) for name in ("run.npz", "run.png", "run.gif")]
-    arguments = ["--t1", "1", "--set", "mass=2", "--start", "x_rate=1", "heading_rate=0.5", "--samples", "5", "--json"]
-    code, out = run(capsys, "simulate", "chaplygin-sleigh", *arguments, "--out", files[0], "--plot", files[1], "--animate", files[2])
+    arguments = [
+        "--t1",
+        "1",
+        "--set",
+        "mass=2",
+        "--start",
+        "x_rate=1",
+        "heading_rate=0.5",
+        "--samples",
+        "5",
+        "--json",
+    ]
+    code, out = run(
+        capsys,
+        "simulate",
+        "chaplygin-sleigh",
+        *arguments,
+        "--out",
+        files[0],
+        "--plot",
+        files[1],
+        "--animate",
+        files[2],
+    )
     found = json.loads(out.out)
     assert code == 0
     assert found["result"] == 0
@@ -79,9 +105,22 @@ def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, t
         raise PermissionError(13, "Permission denied", str(tmp_path / "run.npz"))
 
     monkeypatch.setattr("jourdain_jax.cli.model_verbs.save", refuse)
-    code, out = run(capsys, "simulate", "chaplygin-sleigh", "--t1", "0.1", "--samples", "2", "--out", str(tmp_path / "run.npz"))
+    code, out = run(
+        capsys,
+        "simulate",
+        "chaplygin-sleigh",
+        "--t1",
+        "0.1",
+        "--samples",
+        "2",
+        "--out",
+        str(tmp_path / "run.npz"),
+    )
     assert code == 2
-    assert f"cannot read or write `{tmp_path / 'run.npz'}`: Permission denied; check the path and its permissions" in out.err
+    assert (
+        f"cannot read or write `{tmp_path / 'run.npz'}`: Permission denied; check the path and its"
+        " permissions" in out.err
+    )
 
 
 def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
@@ -93,7 +132,10 @@ def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
     assert rows["trailer-chain"]["counts"] == {"trailers": {"value": 3}}
     assert rows["skate"]["counts"] == {}
     assert rows["tilting-disc"]["events"] == ["fallen"]
-    assert set(rows["tilting-disc"]["domain"]) <= {*rows["tilting-disc"]["coordinates"], *rows["tilting-disc"]["speeds"]}
+    assert set(rows["tilting-disc"]["domain"]) <= {
+        *rows["tilting-disc"]["coordinates"],
+        *rows["tilting-disc"]["speeds"],
+    }
 
 
 def test_a_simulation_for_machines_has_all_that_the_printed_one_has(capsys):
@@ -119,5 +161,8 @@ def test_the_version_is_told(capsys):
 
 
 def test_importing_computes_nothing_so_that_compiler_flags_still_count():
-    check = "import jax, jourdain_jax.cli; jax.config.update('jax_num_cpu_devices', 2); assert jax.device_count() == 2"
+    check = (
+        "import jax, jourdain_jax.cli; jax.config.update('jax_num_cpu_devices', 2); assert jax.device_count()"
+        " == 2"
+    )
     subprocess.run([sys.executable, "-c", check], check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})

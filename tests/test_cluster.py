@@ -27,7 +27,9 @@ def run(path, outputs=None, **options):
 def client():
     """Two workers, threads of this process."""
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
         distributed.Client(cluster) as client,
     ):
         yield client
@@ -46,7 +48,9 @@ def test_a_cluster_computes_what_one_process_computes(client, tmp_path):
 
 
 def test_what_is_no_cluster_is_refused(client, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"`client` is the text 'tcp://10.0.0.1', expected a `dask.distributed.Client`"):
+    with pytest.raises(
+        ValueError, match=r"`client` is the text 'tcp://10.0.0.1', expected a `dask.distributed.Client`"
+    ):
         run(tmp_path / "discs.zarr", client="tcp://10.0.0.1")
     with pytest.raises(ValueError, match="`client` and `processes` are both given"):
         run(tmp_path / "discs.zarr", client=client, processes=2)
@@ -62,7 +66,9 @@ LANES, DEADLY, NUMBER = 10_240, 7_000, 0.5123  # lanes, in five chunks; one whos
 
 
 def deadly(motion):
-    """The lean at the end, by a function outside of JAX that no process survives where the radius is one number."""
+    """The lean at the end, by a function outside of JAX that no process survives where the radius is one
+    number.
+    """
 
     def lean(radius, angle):
         if radius == NUMBER:
@@ -70,7 +76,9 @@ def deadly(motion):
         return angle
 
     last = motion.q_end[3]
-    return jax.pure_callback(lean, jax.ShapeDtypeStruct((), last.dtype), motion.scene.radius, last, vmap_method="sequential")
+    return jax.pure_callback(
+        lean, jax.ShapeDtypeStruct((), last.dtype), motion.scene.radius, last, vmap_method="sequential"
+    )
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -78,10 +86,21 @@ def deadly(motion):
 def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path):
     radius = np.where(np.arange(LANES) == DEADLY, NUMBER, 0.5)
     study = jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
-    options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}, "chunk": 2048}
+    options = {
+        "t1": 1.0,
+        "rtol": 1e-6,
+        "atol": 1e-6,
+        "progress": False,
+        "outputs": {"lean": deadly},
+        "chunk": 2048,
+    }
     with ExitStack() as stack:
         if workers == "processes of a cluster":
-            cluster = stack.enter_context(distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50))
+            cluster = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+                )
+            )
             options["client"] = stack.enter_context(distributed.Client(cluster))
         else:
             options["processes"] = 2

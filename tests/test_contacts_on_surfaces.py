@@ -1,4 +1,6 @@
-"""Bodies that roll on planes, cylinders, spheres, surfaces and height maps; and what cannot be a contact, which is refused by name."""
+"""Bodies that roll on planes, cylinders, spheres, surfaces and height maps; and what cannot be a contact,
+which is refused by name.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,8 @@ from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations import coordinate_rates
 from jourdain_jax.program.eager import eval_numpy
 
-# Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move, and what presses them.
+# Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move,
+# and what presses them.
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -28,7 +31,9 @@ def poses(scene, count):
     elif "cylinder" in scene.shape_of_ground or "sphere" in scene.shape_of_ground:
         axis = np.array([2.0, 1.0, 2.0]) / 3 if "cylinder" in scene.shape_of_ground else np.zeros(3)
         radial = place - np.outer(place @ axis, axis)
-        radial *= (0.52 if scene.shape_of_ground.startswith("on") else 0.43) / np.linalg.norm(radial, axis=1)[:, None]
+        radial *= (0.52 if scene.shape_of_ground.startswith("on") else 0.43) / np.linalg.norm(radial, axis=1)[
+            :, None
+        ]
         place = radial + 0.2 * np.outer(random.uniform(-1, 1, count), axis)
     elif scene.shape_of_ground == "on a hill":
         place = place * np.array([0.3, 0.3, 0.02]) + np.array([0.0, 0.0, 0.13])
@@ -44,7 +49,9 @@ def rolling(ground, shape) -> Rolls:
 
 
 def outside(scene, place, R, point):
-    """A function that is zero on the body's surface and grows outwards, at a point; of a disc: off its edge, and off its plane."""
+    """A function that is zero on the body's surface and grows outwards, at a point; of a disc: off its edge,
+    and off its plane.
+    """
     x, y, z = R.T @ (point - place)
     a = scene.radius
     if scene.shape == "ball":
@@ -67,14 +74,21 @@ def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, sh
         contact, earth, body = scene.contacts(pose)["touch"], scene.make_ground(scene, pose), pose["body"]
         n, foot = contact.plane.normal, contact.point - contact.gap() * contact.plane.normal
         slope = jax.grad(earth.value)(foot)
-        of_body = lambda p: outside(scene, body.position, body.orientation, p)  # noqa: E731
+        of_body = lambda p: outside(scene, body.position, body.orientation, p)
         outward = jax.grad(of_body)(contact.point)
         outward = outward / jnp.sqrt(outward @ outward)
         if shape == "disc":  # an edge has normals all round: nothing along the edge
             arm = contact.point - body.position
             outward, off = (
                 -n,
-                jnp.stack([arm @ arm - scene.radius**2, arm @ body.orientation[:, 1], n @ jnp.cross(body.orientation[:, 1], arm), (n @ arm > 0) + 0.0]),
+                jnp.stack(
+                    [
+                        arm @ arm - scene.radius**2,
+                        arm @ body.orientation[:, 1],
+                        n @ jnp.cross(body.orientation[:, 1], arm),
+                        (n @ arm > 0) + 0.0,
+                    ]
+                ),
             )
         else:
             off = of_body(contact.point)[None]
@@ -95,14 +109,23 @@ def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, sh
     assert np.max(np.abs(gap)) > 1e-3
 
 
-MOVING = [(ground, "ball") for ground in GROUNDS if "hill" not in ground and "egg" not in ground] + [("within a sphere", "wheel"), ("plane", "ellipsoid")]
+MOVING = [(ground, "ball") for ground in GROUNDS if "hill" not in ground and "egg" not in ground] + [
+    ("within a sphere", "wheel"),
+    ("plane", "ellipsoid"),
+]
 MOVING += [("on a hill", "ball")]  # by Newton's method: its derivatives take long to compile
-MOVING += [("within a cylinder", "wheel"), ("on a hill", "disc"), ("on an egg", "ball"), ("on an egg", "ellipsoid")]
+MOVING += [
+    ("within a cylinder", "wheel"),
+    ("on a hill", "disc"),
+    ("on an egg", "ball"),
+    ("on an egg", "ellipsoid"),
+]
 
 
 @pytest.mark.parametrize(("ground", "shape"), MOVING)
 def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shape):
-    # m (v' + g z) = F,  I w' + w x I w = (p - c) x F,  no slip at p in any direction, now and an instant later; no moment about the normal
+    # m (v' + g z) = F, I w' + w x I w = (p - c) x F, no slip at p in any direction, now and an instant later;
+    # no moment about the normal
     scene = rolling(ground, shape)
     scene_moments = np.asarray(scene.moments * scene.mass * scene.radius**2)
     turning = jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)))
@@ -125,7 +148,12 @@ def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shap
         _, slip_rate = jax.jvp(slip, (q, u), (coordinate_rates(scene, 0.0, q, u), found.udot))
         F = scene.mass * (found.udot[:3] + GRAVITY * UP)
         torque = scene_moments * found.udot[3:] + jnp.cross(turning, scene_moments * turning)
-        return jnp.concatenate([slip_rate, R @ torque - jnp.cross(arm, F), slip(q, u)]), F, contact.plane, force
+        return (
+            jnp.concatenate([slip_rate, R @ torque - jnp.cross(arm, F), slip(q, u)]),
+            F,
+            contact.plane,
+            force,
+        )
 
     error, F, plane, force = look(poses(scene, 5), turning)
     assert np.max(np.abs(error)) <= tolerance("ill_conditioned")
@@ -148,12 +176,20 @@ def test_a_ball_circles_in_a_bowl_at_the_rate_of_its_slope_and_spin(spin):
     x, normal = length * np.sin(theta), np.array([-np.sin(theta), 0.0, np.cos(theta)])
     velocity = np.array([0.0, W * x, 0.0])
     turn = np.cross(normal, velocity) / a + spin * normal
-    motion = jj.simulate(bowl, {"x": x, "y_rate": velocity[1], "attitude_omega": turn}, ts=np.linspace(0.0, 2.0, 9), rtol=1e-11, atol=1e-11)
+    motion = jj.simulate(
+        bowl,
+        {"x": x, "y_rate": velocity[1], "attitude_omega": turn},
+        ts=np.linspace(0.0, 2.0, 9),
+        rtol=1e-11,
+        atol=1e-11,
+    )
     assert np.allclose(motion["x"], x * np.cos(W * motion.ts), atol=1e-8)
     assert np.allclose(motion["y"], x * np.sin(W * motion.ts), atol=1e-8)
     # N: weight and the acceleration to the middle of the circle, along n
     force = motion.contact_forces()["bowl"]
-    assert np.allclose(force.normal, bowl.mass * (GRAVITY * np.cos(theta) + W**2 * x * np.sin(theta)), rtol=1e-8)
+    assert np.allclose(
+        force.normal, bowl.mass * (GRAVITY * np.cos(theta) + W**2 * x * np.sin(theta)), rtol=1e-8
+    )
 
 
 def test_a_ball_in_an_upright_cylinder_rises_again_with_the_rate_of_the_golf_ball():
@@ -161,15 +197,27 @@ def test_a_ball_in_an_upright_cylinder_rises_again_with_the_rate_of_the_golf_bal
     W = 6.0
     drum = BallInDrum()
     turn = -W * (drum.drum - drum.radius) / drum.radius  # about the axis: the wall does not slip
-    motion = jj.simulate(drum, {"angle": 0.4, "angle_rate": W, "attitude_omega": (0.0, 0.0, float(-turn))}, ts=np.linspace(0.0, 4.0, 9), rtol=1e-11, atol=1e-11)
+    motion = jj.simulate(
+        drum,
+        {"angle": 0.4, "angle_rate": W, "attitude_omega": (0.0, 0.0, float(-turn))},
+        ts=np.linspace(0.0, 4.0, 9),
+        rtol=1e-11,
+        atol=1e-11,
+    )
     expected = -5 * GRAVITY / (2 * W**2) * (1 - np.cos(np.sqrt(2 / 7) * W * np.asarray(motion.ts)))
     assert np.allclose(motion["along"], expected, atol=1e-8)
-    assert np.allclose(motion.contact_forces()["wall"].normal, drum.mass * W**2 * (drum.drum - drum.radius), rtol=1e-8)
+    assert np.allclose(
+        motion.contact_forces()["wall"].normal, drum.mass * W**2 * (drum.drum - drum.radius), rtol=1e-8
+    )
 
 
 def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
     motion = jj.simulate(
-        RouthSphere(), {"attitude": jj.quaternion_from_axis_angle((0.6, 0.8, 0.0), 0.9), "attitude_omega": (1.0, 2.0, 9.0)}, t1=3.0, rtol=1e-11, atol=1e-11
+        RouthSphere(),
+        {"attitude": jj.quaternion_from_axis_angle((0.6, 0.8, 0.0), 0.9), "attitude_omega": (1.0, 2.0, 9.0)},
+        t1=3.0,
+        rtol=1e-11,
+        atol=1e-11,
     )
     drifts = jj.diagnose(motion).invariant_drifts
     assert max(float(drift) for drift in drifts.values()) <= tolerance("drift")
@@ -177,7 +225,8 @@ def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
 
 
 def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
-    # a tyre adds r N lean^2/2 of its wheel to the potential: K0 + N_R r_R (1, 0)(1, 0)' + N_F r_F (1, sin lam)(1, sin lam)'
+    # a tyre adds r N lean^2/2 of its wheel to the potential: K0 + N_R r_R (1, 0)(1, 0)' + N_F r_F (1, sin
+    # lam)(1, sin lam)'
     M = np.array([[80.81722, 2.319413322087091], [2.319413322087091, 0.2978418819968556]])
     C1 = np.array([[0, 33.86641391492494], [-0.8503564145697844, 1.6854039739755967]])
     K0 = 9.81 * np.array([[-80.95, -2.5995168524987164], [-2.5995168524987164, -0.8032948845861769]])
@@ -185,10 +234,19 @@ def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
     rear_load, front_load, v = 612.836470588236, 309.303529411765, 5.0
     for rear, front in ((0.0, 0.0), (0.03, 0.02), (0.1, 0.06)):
         across = np.array([1.0, np.sin(np.pi / 10)])
-        K = K0 + v**2 * K2 + rear_load * rear * np.diag([1.0, 0.0]) + front_load * front * np.outer(across, across)
-        expected = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, v * C1)]]))
+        K = (
+            K0
+            + v**2 * K2
+            + rear_load * rear * np.diag([1.0, 0.0])
+            + front_load * front * np.outer(across, across)
+        )
+        expected = np.linalg.eigvals(
+            np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, v * C1)]])
+        )
         bicycle = TyredBicycle(rear_tyre=rear, front_tyre=front)
-        found = np.asarray(jj.linearize(bicycle, bicycle.upright(v), coordinates=("lean", "steer")).eigenvalues())
+        found = np.asarray(
+            jj.linearize(bicycle, bicycle.upright(v), coordinates=("lean", "steer")).eigenvalues()
+        )
         nearest = np.min(np.abs(expected[:, None] - found[None, :]), axis=1)
         assert np.max(nearest) <= 1e-8 * np.max(np.abs(expected))
 
@@ -200,7 +258,9 @@ def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
     ("ground", "sentence"),
     [
         (
-            lambda scene, pose: jj.Plane(normal=jnp.stack([0.0 * scene.size, 0.0 * scene.size, 2.4 * scene.size])),
+            lambda scene, pose: jj.Plane(
+                normal=jnp.stack([0.0 * scene.size, 0.0 * scene.size, 2.4 * scene.size])
+            ),
             "the normal of contact `touch` of `Rolls` has a length that differs from 1 by 0.2",
         ),
         (
@@ -220,14 +280,25 @@ class BesideTheBowl(BallInBowl):
 
     def bodies(self, t, q):
         ball = super().bodies(t, q)["ball"]
-        return {"ball": jj.RigidBody.ball(ball.mass, self.radius, position=ball.position + jnp.array([0.0, 0.0, 0.01]), orientation=ball.orientation)}
+        return {
+            "ball": jj.RigidBody.ball(
+                ball.mass,
+                self.radius,
+                position=ball.position + jnp.array([0.0, 0.0, 0.01]),
+                orientation=ball.orientation,
+            )
+        }
 
 
 class TooLarge(BallInBowl):
     """A ball that is larger than its bowl."""
 
     def contacts(self, pose):
-        return {"bowl": jj.ball_contact(pose["ball"], self.radius, ground=jj.Sphere(0.9 * self.radius, side="inside"))}
+        return {
+            "bowl": jj.ball_contact(
+                pose["ball"], self.radius, ground=jj.Sphere(0.9 * self.radius, side="inside")
+            )
+        }
 
 
 class OnACusp(BallInBowl):
@@ -235,13 +306,23 @@ class OnACusp(BallInBowl):
 
     def contacts(self, pose):
         point = pose["ball"].position
-        return {"bowl": jj.Contact(pose["ball"], point, jj.Surface(lambda x, y, z: (z - point[2]) ** 3).plane_at(point))}
+        return {
+            "bowl": jj.Contact(
+                pose["ball"], point, jj.Surface(lambda x, y, z: (z - point[2]) ** 3).plane_at(point)
+            )
+        }
 
 
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; make a ball smaller"),
+        (
+            TooLarge(),
+            (
+                "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state;"
+                " make a ball smaller"
+            ),
+        ),
         (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a length that differs from 1)"),
     ],
 )
@@ -251,7 +332,13 @@ def test_a_contact_that_touches_nowhere_is_named(scene, sentence):
 
 
 def test_coordinates_that_do_not_keep_a_body_on_its_ground_are_named():
-    with pytest.raises(ValueError, match=r'contact `bowl` of `BesideTheBowl` has height="coordinates", but at a probed state its body is -?0.0.* m off'):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r'contact `bowl` of `BesideTheBowl` has height="coordinates", but at a probed state its body is'
+            r" -?0.0.* m off"
+        ),
+    ):
         jj.simulate(BesideTheBowl(), {}, t1=0.1)
 
 
@@ -259,7 +346,10 @@ def test_a_plane_turned_by_a_rotation_is_the_plane_of_its_normal():
     def parts(angle):
         for turn in (jj.rot_x, jj.rot_y, jj.rot_z):
             R = turn(angle) @ jj.rot_y(0.2)
-            yield [(plane.normal, plane.tangents, plane.axes) for plane in (jj.Plane(tilt=R), jj.Plane(normal=R[:, 2], along=R[:, 0]))]
+            yield [
+                (plane.normal, plane.tangents, plane.axes)
+                for plane in (jj.Plane(tilt=R), jj.Plane(normal=R[:, 2], along=R[:, 0]))
+            ]
 
     for turned, by_normal in eval_numpy(lambda angle: list(parts(angle)))(0.4):
         for part, expected in zip(turned, by_normal, strict=True):

@@ -1,4 +1,6 @@
-"""Noise with a memory: whitening against the dense covariance, correlation times known and estimated, and advice on bad input."""
+"""Noise with a memory: whitening against the dense covariance, correlation times known and estimated, and
+advice on bad input.
+"""
 
 import jax
 import numpy as np
@@ -26,7 +28,10 @@ def coloured(generator, ts, tau, shape=()) -> np.ndarray:
 def sleigh_run(seed, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Experiment:
     motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
     generator = np.random.default_rng(seed)
-    values = {name: motion[key] + SIGMA * coloured(generator, ts, TAU, repeats) for name, key in (("x", "x"), ("y", "y"), ("heading", "th"))}
+    values = {
+        name: motion[key] + SIGMA * coloured(generator, ts, TAU, repeats)
+        for name, key in (("x", "x"), ("y", "y"), ("heading", "th"))
+    }
     values["x"][..., list(missing)] = np.nan
     return jj.Experiment(ts, values, sigma, start=START, correlation_time=correlation_time)
 
@@ -40,7 +45,9 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     e = SIGMA * coloured(np.random.default_rng(0), UNEVEN, 0.9)
     known = np.ones(30, bool)
     known[[0, 7, 8, 20]] = False
-    data = jj.Experiment(UNEVEN, {"x": np.where(known, motion["x"] + e, np.nan)}, SIGMA, start=START, correlation_time=tau)
+    data = jj.Experiment(
+        UNEVEN, {"x": np.where(known, motion["x"] + e, np.nan)}, SIGMA, start=START, correlation_time=tau
+    )
     truth = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
     ts, r = UNEVEN[known], e[known]
     V = SIGMA**2 * np.exp(-np.abs(ts[:, None] - ts) / tau)
@@ -78,7 +85,10 @@ class Coasting(OnLine):
 def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likelihood():
     ts, start = np.linspace(0.0, 8.0, 81), {"x": 0.5, "x_rate": -0.2}
     x = 0.5 - 0.2 * ts + SIGMA * coloured(np.random.default_rng(5), ts, TAU)
-    found = jj.fit(Coasting(), jj.Experiment(ts, {"x": x}, SIGMA, start=start, unknown_start=("x", "x_rate"), correlation_time=None))
+    found = jj.fit(
+        Coasting(),
+        jj.Experiment(ts, {"x": x}, SIGMA, start=start, unknown_start=("x", "x_rate"), correlation_time=None),
+    )
     # the same by dense covariances, on a fine grid of arcsin rho
     J, logs, estimates, variances = np.stack([np.ones(81), ts], axis=1), [], [], []
     angles = np.linspace(0.01, 1.5, 600)
@@ -87,10 +97,17 @@ def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likeli
         Vi = np.linalg.inv(V)
         C = np.linalg.inv(J.T @ Vi @ J)
         theta = C @ J.T @ Vi @ x
-        logs.append(-0.5 * ((x - J @ theta) @ Vi @ (x - J @ theta) + np.linalg.slogdet(V)[1] - np.linalg.slogdet(C)[1]))
+        logs.append(
+            -0.5
+            * ((x - J @ theta) @ Vi @ (x - J @ theta) + np.linalg.slogdet(V)[1] - np.linalg.slogdet(C)[1])
+        )
         estimates.append(theta)
         variances.append(np.diag(C))
-    weight, estimates, variances = np.exp(np.array(logs) - max(logs)), np.array(estimates), np.array(variances)
+    weight, estimates, variances = (
+        np.exp(np.array(logs) - max(logs)),
+        np.array(estimates),
+        np.array(variances),
+    )
     weight /= weight.sum()
     whole = weight @ variances + weight @ estimates**2 - (weight @ estimates) ** 2
     best = int(np.argmax(logs))

@@ -1,4 +1,6 @@
-"""What acts in a part of the way is not stepped over: relations are watched over each step, and no step is longer than a part of the span."""
+"""What acts in a part of the way is not stepped over: relations are watched over each step, and no step is
+longer than a part of the span.
+"""
 
 from collections.abc import Callable
 
@@ -15,11 +17,14 @@ from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
 
-# Relations of loads, poses, inputs and rows are watched over each step: what acts in a part of the way is not stepped over.
+# Relations of loads, poses, inputs and rows are watched over each step: what acts in a part of the way is not
+# stepped over.
 
 
 class Sliding(jj.Scene):
-    """A bead that slides freely but for what acts between `a` and `a + width` of its way, or of time: `law(scene, t, x, v)` is its force."""
+    """A bead that slides freely but for what acts between `a` and `a + width` of its way, or of time:
+    `law(scene, t, x, v)` is its force.
+    """
 
     a: float = jj.parameter(0.7)
     width: float = jj.parameter(0.03)
@@ -33,7 +38,10 @@ class Sliding(jj.Scene):
         return 0 * x
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate)), jj.gravity(motion, 9.81))
+        return (
+            jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate)),
+            jj.gravity(motion, 9.81),
+        )
 
 
 class Bump(Sliding):
@@ -52,9 +60,13 @@ def rises_and_falls(step):
 STRIP = Sliding(law=lambda s, t, x, v: jnp.where((x > s.a) & (x < s.a + s.width), -3.0, 0.0))
 KINDS = {
     "Strip": STRIP,
-    "StripByDistance": Sliding(law=lambda s, t, x, v: jnp.where(jnp.abs(x - s.a - 0.5 * s.width) < 0.5 * s.width, -3.0 * v, 0.0)),
+    "StripByDistance": Sliding(
+        law=lambda s, t, x, v: jnp.where(jnp.abs(x - s.a - 0.5 * s.width) < 0.5 * s.width, -3.0 * v, 0.0)
+    ),
     "Pulse": Sliding(law=lambda s, t, x, v: jnp.where((t > s.a) & (t < s.a + s.width), 20.0, 0.0)),
-    "Hat": Sliding(law=lambda s, t, x, v: -40.0 * jnp.maximum(0.0, 1.0 - jnp.abs((x - s.a) / s.width - 0.5) * 2)),
+    "Hat": Sliding(
+        law=lambda s, t, x, v: -40.0 * jnp.maximum(0.0, 1.0 - jnp.abs((x - s.a) / s.width - 0.5) * 2)
+    ),
     "Signs": rises_and_falls(jnp.sign),
     "Floors": rises_and_falls(lambda x: jnp.floor(x + 7.0)),
     "Bump": Bump(),
@@ -83,7 +95,10 @@ def motion(scene, start=START, **options):
 
 @pytest.mark.parametrize("kind", KINDS | OTHER)
 def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(kind):
-    scene, loose = (KINDS | OTHER)[kind], {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
+    scene, loose = (
+        (KINDS | OTHER)[kind],
+        {"rtol": 1e-6, "atol": 1e-6},
+    )  # at tight ones round-off alone sets the length of steps of a free bead
     exact = motion(scene, max_step=SPAN / 2000, **loose)
     found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
     assert abs(exact.q_end[0] - SPAN) > 5e-3, "nothing acted"
@@ -97,7 +112,13 @@ def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(k
 def test_neighbours_in_lanes_are_right(kind):
     generator = np.random.default_rng(5)
     a, width = generator.uniform(0.2, 1.4, 200), 10 ** generator.uniform(-4, -0.5, 200)
-    options = {"parameters": {"a": a, "width": width}, "ts": [SPAN], "rtol": 1e-8, "atol": 1e-8, "progress": False}
+    options = {
+        "parameters": {"a": a, "width": width},
+        "ts": [SPAN],
+        "rtol": 1e-8,
+        "atol": 1e-8,
+        "progress": False,
+    }
     starts = {"x": np.zeros(200), "x_rate": 1.0}
     found = jj.rollout(KINDS[kind], starts, **options)
     exact = jj.rollout(KINDS[kind], starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
@@ -145,7 +166,9 @@ class Cart(Sliding):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_inputs_that_are_functions_of_time_are_watched(backend):
-    found = motion(Cart(), inputs={"push": lambda t: jnp.where((t > 0.9) & (t < 0.93), 20.0, 0.0)}, backend=backend)
+    found = motion(
+        Cart(), inputs={"push": lambda t: jnp.where((t > 0.9) & (t < 0.93), 20.0, 0.0)}, backend=backend
+    )
     assert_allclose(found.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
     assert found.crossings == 2
 
@@ -172,7 +195,9 @@ def test_what_is_not_watched_is_said():
     assert "not monitored: the scene keeps parts as calls" in str(hidden)
     assert hidden.crossings == -1
     dense = motion(STRIP, backend="dense")
-    with pytest.warns(UserWarning, match="Heun may step over jumps and kinks in loads or events of `Sliding`; omit `solver`"):
+    with pytest.warns(
+        UserWarning, match="Heun may step over jumps and kinks in loads or events of `Sliding`; omit `solver`"
+    ):
         by_diffrax = motion(STRIP, solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)
     assert dense.crossings == int(by_diffrax.crossings) == -1
     assert "not monitored: the scene has no scalar program" in str(dense)
@@ -180,7 +205,12 @@ def test_what_is_not_watched_is_said():
 
 
 def test_a_motion_that_sticks_names_the_load_that_jumps():
-    lanes = jj.rollout(Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)), {"x_rate": np.array([1.0, 50.0])}, t1=1.0, max_steps=2000)
+    lanes = jj.rollout(
+        Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)),
+        {"x_rate": np.array([1.0, 50.0])},
+        t1=1.0,
+        max_steps=2000,
+    )
     assert lanes.result.tolist() == [results.STICKS, results.SUCCESS]
     for text in (lanes.lane(0).message, str(lanes)):
         assert "pushes the motion back onto its jump from both sides" in text
@@ -194,12 +224,21 @@ class Ring(OnPlane):
 
 @pytest.mark.parametrize("backend", [*BACKENDS, "dense"])
 def test_a_tolerance_that_the_precision_does_not_hold_is_the_cause_that_is_told(backend):
-    lost = jj.simulate(Ring(), {"x": 1.0, "y_rate": 1.0}, ts=[1.0], rtol=1e-60, atol=1e-60, backend=backend, formulation=jj.Formulation("full"))
+    lost = jj.simulate(
+        Ring(),
+        {"x": 1.0, "y_rate": 1.0},
+        ts=[1.0],
+        rtol=1e-60,
+        atol=1e-60,
+        backend=backend,
+        formulation=jj.Formulation("full"),
+    )
     assert lost.result == results.UNRESOLVED
     assert "`rtol` is below the resolution of this precision" in lost.message
 
 
-# No step is longer than a part of the span: in machine code, in XLA's loop, by Taylor series and by diffrax; the same steps in the first two.
+# No step is longer than a part of the span: in machine code, in XLA's loop, by Taylor series and by diffrax;
+# the same steps in the first two.
 
 
 class Bead(OnLine):
@@ -213,7 +252,12 @@ class Bead(OnLine):
 
 FREE = Bead()
 BEGIN = {"x": 1.0, "x_rate": 0.5}
-WAYS = {"native": {}, "xla": {"backend": "xla"}, "dense": {"backend": "dense"}, "Taylor": {"solver": jj.Taylor()}}
+WAYS = {
+    "native": {},
+    "xla": {"backend": "xla"},
+    "dense": {"backend": "dense"},
+    "Taylor": {"solver": jj.Taylor()},
+}
 WAYS |= {"implicit": {"solver": jj.RadauIIA()}, "diffrax": {"solver": diffrax.Kvaerno3(), "work": False}}
 
 
@@ -225,7 +269,9 @@ def steps(**options):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_steps_are_no_longer_than_a_part_of_the_span(way):
-    unbound, usual, short = (steps(**WAYS[way], **more) for more in ({"max_step": np.inf}, {}, {"max_step": 0.01}))
+    unbound, usual, short = (
+        steps(**WAYS[way], **more) for more in ({"max_step": np.inf}, {}, {"max_step": 0.01})
+    )
     assert unbound < 16 <= usual < 40
     assert 300 <= short < 330
 

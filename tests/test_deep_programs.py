@@ -1,4 +1,6 @@
-"""Programs with long chains of operations run in pieces: the same values and derivatives, and no work done many times over."""
+"""Programs with long chains of operations run in pieces: the same values and derivatives, and no work done
+many times over.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +14,11 @@ LINKS = 30
 
 
 def chain(links):
-    """A recursion outwards, one back inwards over its results, and a sum over both; every link has its own length and angle.
+    """A recursion outwards, one back inwards over its results, and a sum over both; every link has its own
+    length and angle.
 
-    v_i = v_{i-1} cos(a_i - a_{i-1}) + l_i sin(v_{i-1}),   w_i = (v_i - w_{i+1})/(2 + w_{i+1}^2),   s = sum v_i w_i
+    v_i = v_{i-1} cos(a_i - a_{i-1}) + l_i sin(v_{i-1}), w_i = (v_i - w_{i+1})/(2 + w_{i+1}^2), s = sum v_i
+    w_i
     """
     graph = Graph()
     lengths = [graph.input(f"l{i}", False) for i in range(links)]
@@ -35,7 +39,9 @@ def recursed(values):
     lengths, angles = jnp.split(values, 2)
     turns = jnp.diff(angles, axis=0, prepend=jnp.zeros_like(angles[:1]))
     one = jnp.ones(values.shape[1:], values.dtype)
-    outwards = jax.lax.scan(lambda v, x: ((new := v * jnp.cos(x[1]) + x[0] * jnp.sin(v)), new), one, (lengths, turns))[1]
+    outwards = jax.lax.scan(
+        lambda v, x: ((new := v * jnp.cos(x[1]) + x[0] * jnp.sin(v)), new), one, (lengths, turns)
+    )[1]
     inwards = jax.lax.scan(lambda w, v: ((new := (v - w) / (2 + w**2)), new), one, outwards[::-1])[1]
     return jnp.concatenate([outwards, inwards, jnp.sum(outwards * inwards[::-1], axis=0)[None]])
 
@@ -59,7 +65,10 @@ def test_batches_are_those_of_single_lanes():
 
 def test_derivatives_of_a_deep_program_are_those_of_the_plain_one():
     weights = jnp.sin(jnp.arange(len(OUTPUTS)))
-    found, expected = (jax.jit(jax.vmap(jax.grad(lambda values, f=f: weights @ f(values))))(LANES) for f in (program, recursed))
+    found, expected = (
+        jax.jit(jax.vmap(jax.grad(lambda values, f=f: weights @ f(values))))(LANES)
+        for f in (program, recursed)
+    )
     assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
     forward = jax.jit(lambda x: jax.jvp(program, (x,), (x,))[1])(VALUES)
     assert_allclose(weights @ forward, jax.grad(lambda x: weights @ recursed(x))(VALUES) @ VALUES, rtol=1e-10)

@@ -1,4 +1,6 @@
-"""Derivatives of motions that failed, and what is answered inside of a derivative, jit or vmap where numbers are not known."""
+"""Derivatives of motions that failed, and what is answered inside of a derivative, jit or vmap where numbers
+are not known.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,8 @@ from small_scenes import BeadOnTurningWire, OnLine
 
 import jourdain_jax as jj
 
-# Derivatives of motions that failed: NaN for what lies after the failure, right before it, and zero where nobody
+# Derivatives of motions that failed: NaN for what lies after the failure, right before it, and zero where
+# nobody
 
 
 class Slider(OnLine):
@@ -24,7 +27,8 @@ class Slider(OnLine):
         return (jj.generalized_force(motion, x_rate=force),)
 
 
-# what the second lane has in place of (amplitude 1, stiffness p, mass 1, edge -50), and whether it takes steps
+# what the second lane has in place of (amplitude 1, stiffness p, mass 1, edge -50), and whether it takes
+# steps
 FAILURES = {
     "steps": ((1.0, 1e8, 1.0, -50.0), True),
     "domain": ((1.0, 40.0, 1.0, 0.3), True),
@@ -35,11 +39,15 @@ TIMES = [2e-4, 1.0]
 
 
 def _first(p, amplitude):
-    return jnp.where(jnp.isnan(amplitude), amplitude, 0.5 * p)  # numbers that are lost here are no product with p
+    return jnp.where(
+        jnp.isnan(amplitude), amplitude, 0.5 * p
+    )  # numbers that are lost here are no product with p
 
 
 def _lanes(kind, backend, rolled):
-    """p -> (loss over lanes that succeeded, the early state of the second lane, its end); p is shared by all lanes."""
+    """p -> (loss over lanes that succeeded, the early state of the second lane, its end); p is shared by all
+    lanes.
+    """
     factors = np.array([(1.0, 1.0, 1.0, -50.0), FAILURES[kind][0]])
 
     def found(p):
@@ -52,7 +60,9 @@ def _lanes(kind, backend, rolled):
             amplitude, stiffness, mass, edge = factors.T
             parameters = {"stiffness": stiffness * p, "mass": mass, "edge": edge}
             options = {"ts": TIMES, "max_steps": 60, "backend": backend}
-            motions = jj.rollout(Slider(), {"x": _first(p, amplitude)}, parameters=parameters, **options).lanes
+            motions = jj.rollout(
+                Slider(), {"x": _first(p, amplitude)}, parameters=parameters, **options
+            ).lanes
         else:
             motions = jax.vmap(one)(factors)
         ok = motions.succeeded
@@ -72,7 +82,9 @@ def _alone(numbers, end):
     return state
 
 
-CASES = [(kind, backend, rolled) for kind in FAILURES for backend in ("native", "xla") for rolled in (False, True)]
+CASES = [
+    (kind, backend, rolled) for kind in FAILURES for backend in ("native", "xla") for rolled in (False, True)
+]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c[0]}-{c[1]}-{c[2]}")
@@ -96,21 +108,34 @@ def test_they_are_nan_after_the_failure_right_before_it_and_zero_where_nobody_as
         assert np.isnan(twice[2:]).all()
 
 
-# What is not known inside a derivative, `jit` or `vmap` is answered by an error of our own, and a wrong parameter by NaN.
+# What is not known inside a derivative, `jit` or `vmap` is answered by an error of our own, and a wrong
+# parameter by NaN.
 
 
 @pytest.mark.parametrize("ask", [jj.report, jj.verify, jj.energy_balance, jj.sample_states])
 @pytest.mark.parametrize("inside", [jax.jit, jax.vmap, lambda f: lambda x: jax.jvp(f, (x,), (x,))])
 def test_functions_that_need_numbers_say_so_by_name(ask, inside):
-    with pytest.raises(jj.DifferentiationModeError, match=rf"`{ask.__name__}` was called inside jit, vmap or a derivative.*outside"):
-        inside(lambda radius: ask(jj.models.TiltingDisc(radius=radius)))(jnp.array([0.5]) if inside is jax.vmap else 0.5)
+    with pytest.raises(
+        jj.DifferentiationModeError,
+        match=rf"`{ask.__name__}` was called inside jit, vmap or a derivative.*outside",
+    ):
+        inside(lambda radius: ask(jj.models.TiltingDisc(radius=radius)))(
+            jnp.array([0.5]) if inside is jax.vmap else 0.5
+        )
 
 
 def test_what_a_motion_says_in_words_and_pictures_needs_its_numbers(tmp_path):
     motion = jj.simulate(BeadOnTurningWire(), {"r": 0.5}, ts=[0.1])
     written = {jj.save: "motion.npz", jj.show: "motion.html", jj.plot: "motion.png", jj.animate: "motion.gif"}
-    asks = {ask.__name__: lambda motion, ask=ask, name=name: ask(motion, path=tmp_path / name) for ask, name in written.items()}
-    asks |= {"message": lambda motion: motion.message, "warnings": lambda motion: motion.warnings, "raise_if_failed": lambda motion: motion.raise_if_failed()}
+    asks = {
+        ask.__name__: lambda motion, ask=ask, name=name: ask(motion, path=tmp_path / name)
+        for ask, name in written.items()
+    }
+    asks |= {
+        "message": lambda motion: motion.message,
+        "warnings": lambda motion: motion.warnings,
+        "raise_if_failed": lambda motion: motion.raise_if_failed(),
+    }
     for name, ask in asks.items():
         with pytest.raises(jj.DifferentiationModeError, match=f"`{name}` was called inside jit"):
             jax.jit(ask)(motion)
@@ -120,7 +145,18 @@ def test_what_a_motion_says_in_words_and_pictures_needs_its_numbers(tmp_path):
 def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
     wire, found = BeadOnTurningWire(), []
     motion = jj.simulate(wire, {"r": 0.5}, ts=[0.1])
-    jax.jit(lambda x: found.extend([jj.energy_balance(wire), motion.raise_if_failed().message, jj.sample_states(wire, 1)[1].shape]) or x)(0.5)
+    jax.jit(
+        lambda x: (
+            found.extend(
+                [
+                    jj.energy_balance(wire),
+                    motion.raise_if_failed().message,
+                    jj.sample_states(wire, 1)[1].shape,
+                ]
+            )
+            or x
+        )
+    )(0.5)
     assert found == [jj.energy_balance(wire), motion.message, (1, 1)]
 
 
@@ -131,7 +167,9 @@ def test_a_wrong_parameter_has_derivatives_that_are_nan(derivative, backend):
 
     def place(gravity_and_speed):
         mass, speed = gravity_and_speed
-        return jj.simulate(scene.replace(mass=mass), {"x_rate": speed, "heading_rate": 0.7}, ts=[0.5], backend=backend).q[0]
+        return jj.simulate(
+            scene.replace(mass=mass), {"x_rate": speed, "heading_rate": 0.7}, ts=[0.5], backend=backend
+        ).q[0]
 
     numbers = jnp.array([[1.0, 0.5], [jnp.nan, 0.5], [-1.0, 0.5]])
     lanes = jax.jit(jax.vmap(derivative(place)))

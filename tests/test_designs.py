@@ -1,4 +1,6 @@
-"""Samples of studies: the same for a seed and a number whatever else is drawn, and spread as their distributions say."""
+"""Samples of studies: the same for a seed and a number whatever else is drawn, and spread as their
+distributions say.
+"""
 
 import numpy as np
 import pytest
@@ -51,7 +53,9 @@ def test_quantiles_of_samples_are_those_of_the_distribution(distribution, quanti
 @pytest.mark.parametrize("sampler", ["random", "latin-hypercube", "sobol"])
 def test_normal_quantities_have_the_correlation_asked_for(sampler):
     names = {"a": Normal(0.0, 1.0), "b": Normal(5.0, 2.0), "c": Normal(1.0, 0.1)}
-    design = Design(names, sampler=sampler, samples=4096, seed=4, correlation={("a", "b"): 0.8, ("c", "b"): -0.3})
+    design = Design(
+        names, sampler=sampler, samples=4096, seed=4, correlation={("a", "b"): 0.8, ("c", "b"): -0.3}
+    )
     found = np.corrcoef(np.stack(list(design.values().values())))
     assert_allclose(found, [[1.0, 0.8, 0.0], [0.8, 1.0, -0.3], [0.0, -0.3, 1.0]], atol=4 / np.sqrt(4096))
     assert np.std(design.values()["b"]) == pytest.approx(2.0, rel=0.05)

@@ -1,4 +1,6 @@
-"""Motions of models against closed forms and reference runs: rolling discs, a ball on a turntable, double pendulums, chains."""
+"""Motions of models against closed forms and reference runs: rolling discs, a ball on a turntable, double
+pendulums, chains.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -60,7 +62,7 @@ def _product(p, q):
     return jnp.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ q
 
 
-# Upright. -----------------------------------------------------------------------------------------------------------
+# Upright. ---------------------------------------------------------------------------------------------------
 
 
 def _upright_accelerations(x):
@@ -82,7 +84,9 @@ def test_derivatives_of_the_upright_discs_accelerations_are_exact(name):
     reduction = jj.reductions(VerticalDisc())[name]
     weights = jnp.array([0.7, -1.1, 0.4, 0.9])
     directions = jax.random.normal(jax.random.key(2), (2, 5))
-    differentiate = jax.jit(lambda x: derivatives(lambda x: weights @ _upright_by(reduction, x), x, directions))
+    differentiate = jax.jit(
+        lambda x: derivatives(lambda x: weights @ _upright_by(reduction, x), x, directions)
+    )
     for heading in (0.0, 0.6, np.pi / 2):
         x = jnp.array([heading, 0.3, 0.2, 1.3, 0.8])
         expected = derivatives(lambda x: weights @ _upright_accelerations(x), x, directions)
@@ -106,32 +110,43 @@ def test_the_multipliers_of_the_upright_disc_are_the_ground_forces():
         assert relative_error(solved.multipliers, [expected["l1"], expected["l2"]]) <= ROUND_OFF, name
 
 
-# Tilting. -----------------------------------------------------------------------------------------------------------
+# Tilting. ---------------------------------------------------------------------------------------------------
 
 
 def test_the_tilting_disc_obeys_eulers_equations_at_random_states():
     scene = TiltingDisc(mass=1.3, radius=0.4)
     q, u, udot, _ = solved_at_random_states(scene)
-    # theta = lean + pi/2;  w1 = thetadot, w2 = psidot sin(theta), w3 = phidot + psidot cos(theta), phi = -spin
+    # theta = lean + pi/2; w1 = thetadot, w2 = psidot sin(theta), w3 = phidot + psidot cos(theta), phi = -spin
     sine, cosine = np.cos(q.lean), -np.sin(q.lean)
     w1, w2, w3 = u.lean_rate, u.yaw_rate * sine, -u.spin_rate + u.yaw_rate * cosine
     w1_rate, w2_rate = udot.lean_rate, udot.yaw_rate * sine + u.yaw_rate * cosine * w1
     w3_rate = -udot.spin_rate + udot.yaw_rate * cosine - u.yaw_rate * sine * w1
     ring = 1.3 * 0.4**2
     A, C, cot = ring / 4, ring / 2, cosine / sine
-    assert relative_error((A + ring) * w1_rate, A * w2**2 * cot - (C + ring) * w2 * w3 - 1.3 * 9.81 * 0.4 * cosine) <= ROUND_OFF
+    assert (
+        relative_error(
+            (A + ring) * w1_rate, A * w2**2 * cot - (C + ring) * w2 * w3 - 1.3 * 9.81 * 0.4 * cosine
+        )
+        <= ROUND_OFF
+    )
     assert relative_error(A * w2_rate, w1 * (C * w3 - A * w2 * cot)) <= ROUND_OFF
     assert relative_error((C + ring) * w3_rate, ring * w1 * w2) <= ROUND_OFF
 
 
 def test_the_tilting_disc_wobbles_along_its_reference_path():
-    assert end_error(TILTING, START, rolling_disc.motion_yaw_lean_spin, RUN, "x y yaw lean spin") <= CLOSED_FORM
+    assert (
+        end_error(TILTING, START, rolling_disc.motion_yaw_lean_spin, RUN, "x y yaw lean spin") <= CLOSED_FORM
+    )
 
 
 def test_the_free_disc_wobbles_along_the_same_path():
     scene = TiltingDiscQuaternion(RUN["mass"], RUN["radius"], RUN["gravity"])
-    start = _free_body(0.0, RUN["lean"], 0.0, RUN["yaw_rate"], RUN["lean_rate"], RUN["spin_rate"], RUN["radius"])
-    assert end_error(scene, start, rolling_disc.motion_yaw_lean_spin, RUN, x="cx", y="cy", z="cz") <= CLOSED_FORM
+    start = _free_body(
+        0.0, RUN["lean"], 0.0, RUN["yaw_rate"], RUN["lean_rate"], RUN["spin_rate"], RUN["radius"]
+    )
+    assert (
+        end_error(scene, start, rolling_disc.motion_yaw_lean_spin, RUN, x="cx", y="cy", z="cz") <= CLOSED_FORM
+    )
 
 
 def test_the_free_disc_nearly_falls_flat_and_rises_again():
@@ -145,7 +160,8 @@ def test_the_free_disc_nearly_falls_flat_and_rises_again():
     values = {name: run[name] for name in ("mass", "radius", "gravity")}
     expected = rolling_disc.motion(times, **values, theta=theta, w1=0.0, w2=turn, w3=0.0)
     for name in "xyz":
-        # round-off in the attitude counts 1/theta^2 = 1e7-fold in the contact's motion while the disc is near flat
+        # round-off in the attitude counts 1/theta^2 = 1e7-fold in the contact's motion while the disc is near
+        # flat
         assert abs(trajectory[name][-1] - expected[f"c{name}"][-1]) <= 1e-8
 
 
@@ -185,7 +201,9 @@ RATES = {"x_rate": "vx", "y_rate": "vy", "roll_x": "wx", "roll_y": "wy", "spin":
 
 @pytest.mark.parametrize("run", [ball_on_turntable.RUN_FLAT, ball_on_turntable.RUN], ids=["flat", "tilted"])
 def test_the_ball_follows_its_closed_form(run):
-    scene = BallOnTurntable(**{name: run[name] for name in ("radius", "inertia_ratio", "turn_rate", "tilt", "gravity")})
+    scene = BallOnTurntable(
+        **{name: run[name] for name in ("radius", "inertia_ratio", "turn_rate", "tilt", "gravity")}
+    )
     start = {"x": run["x0"], "y": run["y0"], "x_rate": run["vx0"], "y_rate": run["vy0"], "spin": run["wz"]}
     assert end_error(scene, start, ball_on_turntable.motion, run, "x y", **RATES) <= tolerance("closed_form")
 
@@ -207,20 +225,35 @@ ANGLES, RODS = DoublePendulumAngles(), DoublePendulumRods()
 CHAIN = PendulumChain(links=2, mass=np.array([1.0, 0.7]), length=np.array([1.0, 0.8]))
 TIMES = np.linspace(0.0, double_pendulum.RUN["t_end"], 6)
 EXPECTED = double_pendulum.motion(TIMES, **double_pendulum.RUN)
-CARTESIAN = {f"{axis}{k}": EXPECTED[f"{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))}
-CARTESIAN |= {f"{axis}{k}_rate": EXPECTED[f"v{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))}
+CARTESIAN = {
+    f"{axis}{k}": EXPECTED[f"{oracle_axis}{k}"][0]
+    for k in (1, 2)
+    for axis, oracle_axis in (("x", "x"), ("z", "y"))
+}
+CARTESIAN |= {
+    f"{axis}{k}_rate": EXPECTED[f"v{oracle_axis}{k}"][0]
+    for k in (1, 2)
+    for axis, oracle_axis in (("x", "x"), ("z", "y"))
+}
 SIZE = 1.8  # m, the reach
 
 
 def test_defaults_are_those_of_the_reference_run():
     for scene in (ANGLES, RODS):
         values = {"mass1": "m1", "mass2": "m2", "length1": "l1", "length2": "l2", "gravity": "gravity"}
-        assert {name: float(getattr(scene, name)) for name in values} == {name: double_pendulum.RUN[key] for name, key in values.items()}
+        assert {name: float(getattr(scene, name)) for name in values} == {
+            name: double_pendulum.RUN[key] for name, key in values.items()
+        }
 
 
 def test_in_angles_it_follows_the_reference():
     motion = jj.simulate(ANGLES, ts=jnp.asarray(TIMES), rtol=1e-12, atol=1e-12)
-    for name, key in (("theta1", "th1"), ("theta2", "th2"), ("theta1_rate", "th1_rate"), ("theta2_rate", "th2_rate")):
+    for name, key in (
+        ("theta1", "th1"),
+        ("theta2", "th2"),
+        ("theta1_rate", "th1_rate"),
+        ("theta2_rate", "th2_rate"),
+    ):
         assert relative_error(motion[name], EXPECTED[key]) <= tolerance("closed_form"), name
 
 
@@ -230,7 +263,12 @@ def test_on_rods_it_follows_the_same_reference(scene):
     # no choice of two Cartesian velocities stays independent while the rods turn round
     assert motion.state_form == "full"
     for k in (1, 2):
-        for name, key in ((f"x{k}", f"x{k}"), (f"z{k}", f"y{k}"), (f"x{k}_rate", f"vx{k}"), (f"z{k}_rate", f"vy{k}")):
+        for name, key in (
+            (f"x{k}", f"x{k}"),
+            (f"z{k}", f"y{k}"),
+            (f"x{k}_rate", f"vx{k}"),
+            (f"z{k}_rate", f"vy{k}"),
+        ):
             assert relative_error(motion[name], EXPECTED[key], SIZE) <= tolerance("closed_form"), name
     energy = motion.energies().balance
     assert relative_error(energy, EXPECTED["energy"]) <= tolerance("closed_form")
@@ -266,11 +304,15 @@ def test_on_a_circle_each_trailer_runs_inside_the_one_ahead():
     scene = TrailerChain(trailers=3, length=jnp.array(lengths), **WEIGHTLESS)
     times = np.linspace(0.0, 30.0, 4)
     motion = simulate(scene, scene.towing([0.0, 0.0, 0.0, 0.0], forward=SPEED, turn=TURN), times)
-    expected = trailers.chain(times, lengths=lengths, speed=lambda t: SPEED, yaw_rate=lambda t: TURN, headings0=[0.0, 0.0, 0.0, 0.0])
+    expected = trailers.chain(
+        times, lengths=lengths, speed=lambda t: SPEED, yaw_rate=lambda t: TURN, headings0=[0.0, 0.0, 0.0, 0.0]
+    )
     found = np.stack([motion[f"heading{i}"] for i in range(4)], axis=1)
     assert relative_error(found, expected["headings"]) <= tolerance("closed_form")
     radii = [np.hypot(motion[f"x{i}"][-1], motion[f"y{i}"][-1] - SPEED / TURN) for i in range(1, 4)]
-    assert relative_error(radii, trailers.steady_radii(SPEED / TURN, lengths)) <= 1e-7  # not quite steady after 30 s
+    assert (
+        relative_error(radii, trailers.steady_radii(SPEED / TURN, lengths)) <= 1e-7
+    )  # not quite steady after 30 s
 
 
 def test_heavy_trailers_slow_the_car_as_energy_demands():
@@ -278,7 +320,11 @@ def test_heavy_trailers_slow_the_car_as_energy_demands():
     motion = simulate(scene, scene.towing([0.3, -0.7], forward=SPEED), np.linspace(0.0, 3.0, 7))
     hitch, speed = np.asarray(motion["heading0"]) - motion["heading1"], np.asarray(motion["forward0"])
     # T = v^2 (m0 + m1 cos^2(gamma) + I1 sin^2(gamma)/L^2)/2
-    carried = scene.car_mass + scene.trailer_mass * np.cos(hitch) ** 2 + scene.trailer_inertia * (np.sin(hitch) / LENGTH) ** 2
+    carried = (
+        scene.car_mass
+        + scene.trailer_mass * np.cos(hitch) ** 2
+        + scene.trailer_inertia * (np.sin(hitch) / LENGTH) ** 2
+    )
     assert relative_error(carried * speed**2, np.full(7, carried[0] * SPEED**2)) <= tolerance("closed_form")
     assert speed[0] - speed[-1] > 0.05
     assert np.max(np.abs(motion["turn0"])) <= tolerance("round_off")
@@ -288,11 +334,15 @@ def test_a_straight_train_accelerates_as_one_mass():
     scene = TrailerChain()
     q, u, _ = scene.named(**scene.towing([0.4] * 4, forward=SPEED))
     udot = scene.speed_names.view(jj.accelerations(scene, 0.0, q, u, jnp.array([2.0, 0.3])).udot)
-    assert relative_error(udot.forward0, 2.0 / (scene.car_mass + 3 * scene.trailer_mass)) <= tolerance("round_off")
+    assert relative_error(udot.forward0, 2.0 / (scene.car_mass + 3 * scene.trailer_mass)) <= tolerance(
+        "round_off"
+    )
     assert relative_error(udot.turn0, 0.3 / scene.car_inertia) <= tolerance("round_off")
 
 
-@pytest.mark.parametrize("scene", [TrailerChain(trailers=5), PendulumChain(links=6)], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scene", [TrailerChain(trailers=5), PendulumChain(links=6)], ids=lambda s: type(s).__name__
+)
 def test_rows_far_apart_in_the_chain_do_not_meet(scene):
     ((_, q, u),) = admissible_states(scene, 1)
     A = np.asarray(constraint_rows(scene, 0.0, q, u).A)
@@ -318,4 +368,3 @@ def test_a_chain_needs_links():
         PendulumChain(links=0)
     with pytest.raises(ValueError, match="`trailers` of `TrailerChain` is -1"):
         TrailerChain(trailers=-1)
-

@@ -20,23 +20,80 @@ from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point,
 from jourdain_jax.scene.names import Named
 
 # what a user is handed without having imported it
-HANDED_OUT = (Check, ContactForce, RowReactions, Diagnostics, Energies, Contact, Coordinates, Names, Named, BodyMotion, BodyPose, Motion)
+HANDED_OUT = (
+    Check,
+    ContactForce,
+    RowReactions,
+    Diagnostics,
+    Energies,
+    Contact,
+    Coordinates,
+    Names,
+    Named,
+    BodyMotion,
+    BodyPose,
+    Motion,
+)
 HANDED_OUT += (Point, Pose)
 SPACES = (jj, jj.identification, jj.studies, jj.equations, jj.analysis)
-PUBLIC = {name: getattr(space, name) for space in SPACES for name in space.__all__ if not inspect.ismodule(getattr(space, name))}
+PUBLIC = {
+    name: getattr(space, name)
+    for space in SPACES
+    for name in space.__all__
+    if not inspect.ismodule(getattr(space, name))
+}
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}
 CLASSES = {value.__name__: value for value in (*PUBLIC.values(), *HANDED_OUT) if inspect.isclass(value)}
 SELF_EVIDENT = {"self", "scene", "t", "q", "u"}
 # functions of a state or of numbers with a unit: their text must state one
-# as `(m)`, `(N m, inertial frame)`, `(s; default: 0)`, as `in N/m`, or as a unit that is no word or symbol of another kind
+# as `(m)`, `(N m, inertial frame)`, `(s; default: 0)`, as `in N/m`, or as a unit that is no word or symbol of
+# another kind
 UNIT = r"(?:kg|rad|[mNJWs])(?:[ /](?:kg|rad|[mNJWs])\b|\^\d)*"
-UNITS = re.compile(rf"(?<!\w)\({UNIT}[,;)]|\bin {UNIT}(?=[\s,.;:)]|$)|(?<![\w'])(?:(?:rad|m|N|kg)/(?:s|m|rad)\b|N m\b|N s/m\b|kg m\^2)")
-WITH_UNITS = ("rot_x", "rod", "knife_edge", "spring", "damper", "gravity", "torque", "point_force", "generalized_force", "fixed_point")
-WITH_UNITS += ("disc_contact", "ball_contact", "start", "simulate", "kinetic_energy", "potential_energy", "virtual_power", "newton_residual")
+UNITS = re.compile(
+    rf"(?<!\w)\({UNIT}[,;)]|\bin {UNIT}(?=[\s,.;:)]|$)|(?<![\w'])(?:(?:rad|m|N|kg)/(?:s|m|rad)\b|N m\b|N"
+    r" s/m\b|kg m\^2)"
+)
+WITH_UNITS = (
+    "rot_x",
+    "rod",
+    "knife_edge",
+    "spring",
+    "damper",
+    "gravity",
+    "torque",
+    "point_force",
+    "generalized_force",
+    "fixed_point",
+)
+WITH_UNITS += (
+    "disc_contact",
+    "ball_contact",
+    "start",
+    "simulate",
+    "kinetic_energy",
+    "potential_energy",
+    "virtual_power",
+    "newton_residual",
+)
 WITH_UNITS += ("generalized_forces", "unconstrained_equations", "energy", "pose_at")
 # functions that implement an equation of the paper say which
-WITH_SOURCE = ("accelerations", "gibbs_function", "gibbs_equations", "lagrange_equations", "virtual_power", "newton_residual", "generalized_forces")
-WITH_SOURCE += ("unconstrained_equations", "partial_velocities", "constraint_rows", "velocity_residual", "position_residual", "structure_of")
+WITH_SOURCE = (
+    "accelerations",
+    "gibbs_function",
+    "gibbs_equations",
+    "lagrange_equations",
+    "virtual_power",
+    "newton_residual",
+    "generalized_forces",
+)
+WITH_SOURCE += (
+    "unconstrained_equations",
+    "partial_velocities",
+    "constraint_rows",
+    "velocity_residual",
+    "position_residual",
+    "structure_of",
+)
 
 
 def _methods(owner: type):
@@ -55,7 +112,11 @@ def _methods(owner: type):
 def _unsaid(function):
     """Parameters that a docstring does not name."""
     text = inspect.getdoc(function) or ""
-    return [name for name in inspect.signature(function).parameters if name not in SELF_EVIDENT and not re.search(rf"\b{name}\b", text)]
+    return [
+        name
+        for name in inspect.signature(function).parameters
+        if name not in SELF_EVIDENT and not re.search(rf"\b{name}\b", text)
+    ]
 
 
 @pytest.mark.parametrize("name", sorted(FUNCTIONS))
@@ -79,12 +140,30 @@ def test_what_takes_or_gives_a_quantity_states_its_unit(name):
     assert UNITS.search(inspect.getdoc(FUNCTIONS[name]))
 
 
-@pytest.mark.parametrize("text", ["The scene's row(s) of M, `m g e` at a time t.", "The rows in speeds; s, m and N.", "`strength`: g, in some way."])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "The scene's row(s) of M, `m g e` at a time t.",
+        "The rows in speeds; s, m and N.",
+        "`strength`: g, in some way.",
+    ],
+)
 def test_a_docstring_without_a_unit_would_be_seen(text):
     assert not UNITS.search(text)
 
 
-@pytest.mark.parametrize("text", ["A length (m).", "A torque (3,) (N m, here)", "c in N s/m.", "T in J", "g in m/s^2; e", "(kg m^2)", "t (s; default: 0)"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "A length (m).",
+        "A torque (3,) (N m, here)",
+        "c in N s/m.",
+        "T in J",
+        "g in m/s^2; e",
+        "(kg m^2)",
+        "t (s; default: 0)",
+    ],
+)
 def test_a_unit_is_seen_as_one(text):
     assert UNITS.search(text)
 
@@ -101,16 +180,25 @@ def test_an_undocumented_argument_would_be_seen():
     assert _unsaid(wanting) == ["stiffness"]
 
 
-@pytest.mark.parametrize(("folders", "words"), [(("src", "bench", "tests"), "The same"), (("src",), "Of|By|With|From")])
+@pytest.mark.parametrize(
+    ("folders", "words"), [(("src", "bench", "tests"), "The same"), (("src",), "Of|By|With|From")]
+)
 def test_no_docstring_leaves_its_subject_to_the_name_or_the_docstring_above(folders, words):
     root = Path(__file__).parents[1]
     begins = re.compile('""' + f'"(?:{words}) ')
-    assert [str(path) for folder in folders for path in (root / folder).rglob("*.py") if begins.search(path.read_text())] == []
+    assert [
+        str(path)
+        for folder in folders
+        for path in (root / folder).rglob("*.py")
+        if begins.search(path.read_text())
+    ] == []
 
 
 def test_the_package_lists_every_public_name_once():
     assert not [name for name, value in PUBLIC.items() if not value.__module__.startswith("jourdain_jax")]
-    assert len(PUBLIC) == sum(not inspect.ismodule(getattr(space, name)) for space in SPACES for name in space.__all__)
+    assert len(PUBLIC) == sum(
+        not inspect.ismodule(getattr(space, name)) for space in SPACES for name in space.__all__
+    )
     assert len(jj.__all__) <= 115
 
 
@@ -131,6 +219,12 @@ def test_the_examples_of_a_docstring_run(name, holds, capsys):
 
 
 def test_the_list_of_methods_is_that_of_the_base_class():
-    methods = [name for name, member in vars(jj.Scene).items() if inspect.isfunction(inspect.unwrap(member)) and not name.startswith("_")]
+    methods = [
+        name
+        for name, member in vars(jj.Scene).items()
+        if inspect.isfunction(inspect.unwrap(member)) and not name.startswith("_")
+    ]
     assert set(description.METHODS) == set(methods) - {"replace", "named"}
-    assert set(description.ATTRIBUTES) == {name for name in jj.Scene.__annotations__ if not name.startswith("_")} - {"switching"}
+    assert set(description.ATTRIBUTES) == {
+        name for name in jj.Scene.__annotations__ if not name.startswith("_")
+    } - {"switching"}

@@ -14,13 +14,21 @@ from pages import DOCS, ROOT, code_of, run
 import jourdain_jax as jj
 from jourdain_jax.equations import unconstrained_equations
 
-PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "pages", "notebooks"} & set(page.relative_to(DOCS).parts))
+PAGES = sorted(
+    page
+    for page in DOCS.rglob("*.md")
+    if not {"_build", "pages", "notebooks"} & set(page.relative_to(DOCS).parts)
+)
 SEARCHED = DOCS / "_build" / "html" / "searchindex.js"
 WRITTEN_BY_THE_BUILD = ("gallery/pages/", "tutorials/notebooks/", "notebooks/")
 
 
 SPACES = ("identification", "studies", "equations", "analysis")
-PUBLIC = {*jj.__all__, *(f"{space}.{name}" for space in SPACES for name in getattr(jj, space).__all__)} - {*SPACES, "models", "bicycle"}
+PUBLIC = {*jj.__all__, *(f"{space}.{name}" for space in SPACES for name in getattr(jj, space).__all__)} - {
+    *SPACES,
+    "models",
+    "bicycle",
+}
 
 
 def test_every_public_name_stands_once_in_the_reference():
@@ -41,19 +49,30 @@ def test_the_search_of_the_built_site_finds_every_public_name():
 _CODE = re.compile(r"```.*?```", re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page",
+    [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
 def test_links_lead_to_pages_that_exist(page):
     for target, anchor in links(page.read_text(encoding="utf-8")):
-        if target.startswith(("http", "mailto")) or any(target.removeprefix("../").startswith(part) for part in WRITTEN_BY_THE_BUILD):
+        if target.startswith(("http", "mailto")) or any(
+            target.removeprefix("../").startswith(part) for part in WRITTEN_BY_THE_BUILD
+        ):
             continue
         found = page.parent / target if target else page
         found = found if found.exists() else found.with_suffix(".md")
         assert found.exists(), f"{page.name}: {target}"
-        assert not anchor or anchor in anchors(found.read_text(encoding="utf-8")), f"{page.name}: {target}#{anchor}"
+        assert not anchor or anchor in anchors(found.read_text(encoding="utf-8")), (
+            f"{page.name}: {target}#{anchor}"
+        )
 
 
 def test_anchors_of_links_are_seen():
-    text = "[a](page.md#some-heading) and [b](#here) and [c](page.md)\n```\n[d](no.md)\n# no heading\n```\n## Some `heading`: *two*"
+    text = (
+        "[a](page.md#some-heading) and [b](#here) and [c](page.md)\n```\n[d](no.md)\n# no heading\n```\n##"
+        " Some `heading`: *two*"
+    )
     assert links(text) == [("page.md", "some-heading"), ("", "here"), ("page.md", "")]
     assert anchors(text) == {"some-heading-two"}
 
@@ -105,7 +124,9 @@ def test_the_results_of_the_paper_hold_where_they_are_shown():
     assert [f"S{number}" for number in range(1, 13)] == re.findall(r"^## (S\d+)\.", text, re.M)
     assert_allclose(page["force"][:2] @ page["blade"], 0.0, atol=1e-12)
     assert_allclose(page["force"][:2] @ page["across"], page["solved"].multipliers[0], rtol=1e-12)
-    assert_allclose(page["lagrange"].h, unconstrained_equations(page["pendulum"], *page["here"]).h, atol=1e-12)
+    assert_allclose(
+        page["lagrange"].h, unconstrained_equations(page["pendulum"], *page["here"]).h, atol=1e-12
+    )
     assert_allclose(page["by_minimum"], page["solved"].udot, atol=1e-12)
     assert_allclose(page["psi"], page["closed"], atol=1e-10)  # (64), by quasi-velocities
     assert_allclose(page["length"], page["scene"].rod_length, atol=1e-12)
@@ -114,11 +135,16 @@ def test_the_results_of_the_paper_hold_where_they_are_shown():
 def test_large_scenes_have_as_many_operations_as_their_page_says():
     page = run(DOCS / "howto" / "large_scenes.md", jj=jj, jnp=jnp, eqx=eqx)
     text = (DOCS / "howto" / "large_scenes.md").read_text(encoding="utf-8")
-    rows = [[cell.strip().replace(",", "") for cell in row.split("|")[1:-1]] for row in re.findall(r"^\| \d+ .*$", text, re.M)]
+    rows = [
+        [cell.strip().replace(",", "") for cell in row.split("|")[1:-1]]
+        for row in re.findall(r"^\| \d+ .*$", text, re.M)
+    ]
     assert [row[0] for row in rows] == ["4", "16", "32", "64", "200"]
     for row in rows[:2]:
         scenes = jj.models.TrailerChain(trailers=int(row[0])), page["RelativeTrailers"](trailers=int(row[0]))
-        found = [x for scene in scenes for x in (len(scene.coordinate_names.entries), jj.lower(scene).operations)]
+        found = [
+            x for scene in scenes for x in (len(scene.coordinate_names.entries), jj.lower(scene).operations)
+        ]
         assert found == [int(row[i]) for i in (1, 2, 4, 5)]
 
 
@@ -149,7 +175,9 @@ def test_the_code_of_the_page_on_events_runs(capsys):
 
 def test_a_design_is_made_stable_as_its_page_says(capsys):
     run(DOCS / "howto" / "stable_design.md")
-    shown = re.findall(r"```text\n(.*?)```", (DOCS / "howto" / "stable_design.md").read_text(encoding="utf-8"), re.S)
+    shown = re.findall(
+        r"```text\n(.*?)```", (DOCS / "howto" / "stable_design.md").read_text(encoding="utf-8"), re.S
+    )
     assert capsys.readouterr().out == "".join(shown)
 
 
@@ -163,7 +191,10 @@ def test_the_readme_has_at_most_five_hundred_words():
 
 
 def test_dips_that_may_be_missed_are_named_in_the_same_words():
-    said = "smooth dip of an event narrower than the longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less"
+    said = (
+        "smooth dip of an event narrower than the longest step may be missed, as may a condition such as"
+        " `jnp.linalg.norm(x) < r` that holds for less"
+    )
     pages = [(ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("limits.md", "howto/events.md")]
     for text in (*pages, jj.Scene.events.__doc__, jj.Event.__doc__):
         assert said in " ".join(text.split())
@@ -182,6 +213,17 @@ def _docstrings():
 
 
 def test_docstrings_are_read_as_they_are_meant():
-    lines = ["Shape (times, *lanes), |x| of `a *b`.", "", "    x = 1", "", "    y = 2", "", "**Items**", "- `t`: **s**", "  and on", "- u"]
+    lines = [
+        "Shape (times, *lanes), |x| of `a *b`.",
+        "",
+        "    x = 1",
+        "",
+        "    y = 2",
+        "",
+        "**Items**",
+        "- `t`: **s**",
+        "  and on",
+        "- u",
+    ]
     expected = ["Shape (times, \\*lanes), \\|x\\| of `a *b`.", "", "::", "", *lines[2:7], "", *lines[7:]]
     assert _docstrings().as_rest(lines) == expected

@@ -1,4 +1,6 @@
-"""The scalar program divides by nothing that vanishes where rows determine the speeds, and keeps rows by multipliers elsewhere."""
+"""The scalar program divides by nothing that vanishes where rows determine the speeds, and keeps rows by
+multipliers elsewhere.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,8 @@ import jourdain_jax as jj
 from jourdain_jax import structure_of
 from jourdain_jax.models import MODELS, TrailerChain
 
-# The scalar program divides by nothing that vanishes where the rows themselves determine the speeds: at any heading, with no mass, with dependent
+# The scalar program divides by nothing that vanishes where the rows themselves determine the speeds: at any
+# heading, with no mass, with dependent
 
 
 WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}
@@ -30,7 +33,9 @@ def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
     for every_speed in (None, True):
         program = jj.lower(anywhere, every_speed)
         independent = list(program.independent)
-        _, ydot, _, pivots, *_ = program.rates_and_pivots(program.fixed_values(anywhere), t, tuple(q.T), tuple(u.T[independent]), jnp.zeros(0))
+        _, ydot, _, pivots, *_ = program.rates_and_pivots(
+            program.fixed_values(anywhere), t, tuple(q.T), tuple(u.T[independent]), jnp.zeros(0)
+        )
         assert np.max(np.abs(np.stack(ydot) - expected.T[independent]) / size) <= 1e-9
         if structure_of(anywhere).well_conditioned:
             assert np.all(np.abs(np.array(pivots)) > 0.02)
@@ -40,15 +45,34 @@ def motion_and_reference(scene, start, t1, *, traced=(), **options):
     """Under `jit`, `traced` parameters traced as well, and by dense matrices."""
 
     def run(values, start):
-        return jj.simulate(scene.replace(**values) if values else scene, start, ts=jnp.linspace(0.0, t1, 9), rtol=1e-10, atol=1e-10, work=False, **options)
+        return jj.simulate(
+            scene.replace(**values) if values else scene,
+            start,
+            ts=jnp.linspace(0.0, t1, 9),
+            rtol=1e-10,
+            atol=1e-10,
+            work=False,
+            **options,
+        )
 
     values = {name: getattr(scene, name) for name in traced}
-    reference = jj.simulate(scene, start, ts=[t1], formulation=jj.Formulation("full"), backend="dense", rtol=1e-11, atol=1e-11, work=False)
+    reference = jj.simulate(
+        scene,
+        start,
+        ts=[t1],
+        formulation=jj.Formulation("full"),
+        backend="dense",
+        rtol=1e-11,
+        atol=1e-11,
+        work=False,
+    )
     return jax.jit(run)(values, jj.start(scene, **start)), reference
 
 
 class LightKnee(jj.Scene):
-    """A pendulum with a knee of no mass half-way, in Cartesian coordinates: at right angles no two speeds determine the others, and M is singular."""
+    """A pendulum with a knee of no mass half-way, in Cartesian coordinates: at right angles no two speeds
+    determine the others, and M is singular.
+    """
 
     knee: object = jj.parameter(0.0, unit="kg", non_negative=True)
     coordinates = jj.coordinates("x z x_end z_end")
@@ -78,9 +102,21 @@ KNEE = {"x": 0.6, "z": -0.8, "x_end": 1.2, "z_end": -1.6, "x_rate": 4.0}
 # scene, start, parameters that are traced
 SERVED = {
     "full turns of a bead": (BeadOnCurve(), BeadOnCurve().start(), ()),
-    "full turns of a robot with a trailer": (PlanarRobot(trailers=1, turned=0.4), PlanarRobot(trailers=1).start(**ROBOT), ()),
-    "massless trailer of a robot": (PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT), WEIGHTLESS),
-    "massless trailer of a car": (TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8), WEIGHTLESS),
+    "full turns of a robot with a trailer": (
+        PlanarRobot(trailers=1, turned=0.4),
+        PlanarRobot(trailers=1).start(**ROBOT),
+        (),
+    ),
+    "massless trailer of a robot": (
+        PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS),
+        PlanarRobot(trailers=1, maximal=True).start(**ROBOT),
+        WEIGHTLESS,
+    ),
+    "massless trailer of a car": (
+        TrailerChain(trailers=1, **WEIGHTLESS),
+        TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8),
+        WEIGHTLESS,
+    ),
     "a massless body that rows hold": (LightKnee(), KNEE, ("knee",)),
     "its mass": (LightKnee(knee=0.7), KNEE, ("knee",)),
     "dependent rows": (Twice(turned=0.3), PlanarRobot().start(**ROBOT), ("turned",)),
@@ -91,7 +127,9 @@ SERVED = {
 @pytest.mark.parametrize("case", SERVED)
 def test_motions_are_served_by_one_program_in_both_forms_of_the_state(case, state):
     scene, start, traced = SERVED[case]
-    motion, reference = motion_and_reference(scene, start, 3.0, traced=traced, formulation=jj.Formulation(state))
+    motion, reference = motion_and_reference(
+        scene, start, 3.0, traced=traced, formulation=jj.Formulation(state)
+    )
     assert motion.result == results.SUCCESS
     assert "lowered" in motion.reduction
     assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
@@ -102,7 +140,13 @@ def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
     scene = PlanarRobot(trailers=1)
     start = jj.start(scene, **scene.start(**ROBOT))
     angles = jnp.array([0.0, 0.4, np.pi / 2, -2.0])
-    ends = jax.jit(jax.vmap(lambda a: jj.simulate(scene.replace(turned=a), start, ts=[2.0], rtol=1e-10, atol=1e-10, work=False)))(angles)
+    ends = jax.jit(
+        jax.vmap(
+            lambda a: jj.simulate(
+                scene.replace(turned=a), start, ts=[2.0], rtol=1e-10, atol=1e-10, work=False
+            )
+        )
+    )(angles)
     assert np.all(np.asarray(ends.result) == results.SUCCESS)
     assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
 
@@ -130,7 +174,9 @@ def test_rates_may_be_differentiated_where_rows_were_combined():
 
     @jax.jit
     def at(x):
-        ydot = program.rates(program.fixed_values(scene.replace(track=x[0])), t, tuple(x[1:]), y, jnp.zeros(0))[1]
+        ydot = program.rates(
+            program.fixed_values(scene.replace(track=x[0])), t, tuple(x[1:]), y, jnp.zeros(0)
+        )[1]
         return weights @ jnp.stack(ydot)
 
     x = np.append(float(scene.track), q)
@@ -138,7 +184,8 @@ def test_rates_may_be_differentiated_where_rows_were_combined():
     assert_allclose(jax.jit(jax.grad(at))(x), differences, atol=1e-7)
 
 
-# Scenes whose speeds all stay in the state: rows kept by multipliers on the graph, states put back onto rows by the program.
+# Scenes whose speeds all stay in the state: rows kept by multipliers on the graph, states put back onto rows
+# by the program.
 
 
 @pytest.mark.parametrize("name", ["snakeboard", "pendulum-chain", "isokinetic-particle"])
@@ -150,7 +197,9 @@ def test_the_program_puts_states_where_dense_matrices_put_them(name):
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
     q, u = (x + 1e-4 * generator.normal(size=x.shape) for x in (q, u))
     fixed, nothing = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
-    found_q, found_u = map(jnp.stack, program.projected(fixed, t, tuple(q), tuple(u), nothing, structure_of(scene).affine))
+    found_q, found_u = map(
+        jnp.stack, program.projected(fixed, t, tuple(q), tuple(u), nothing, structure_of(scene).affine)
+    )
     expected = jj.consistent(scene, t, q, u)
     assert_allclose(found_q, expected.q, atol=tolerance("round_off"))
     assert_allclose(found_u, expected.u, atol=tolerance("round_off") * (1 + np.max(np.abs(u))))
@@ -180,9 +229,12 @@ def test_a_motion_through_a_loss_of_rank_is_right():
 def test_which_scenes_keep_all_speeds(name):
     scene = MODELS[name]()
     motion = jj.simulate(scene, t1=1.0, rtol=1e-11, atol=1e-11)
-    full = jj.simulate(scene, formulation=jj.Formulation("full"), t1=1.0, rtol=1e-11, atol=1e-11)  # on request, also where speeds could be eliminated
+    full = jj.simulate(
+        scene, formulation=jj.Formulation("full"), t1=1.0, rtol=1e-11, atol=1e-11
+    )  # on request, also where speeds could be eliminated
     by_multipliers = "multipliers (KKT), lowered to machine code"
     assert full.reduction == by_multipliers
-    assert motion.reduction == ("privileged, lowered to machine code" if name == "chaplygin-sleigh" else by_multipliers)
+    assert motion.reduction == (
+        "privileged, lowered to machine code" if name == "chaplygin-sleigh" else by_multipliers
+    )
     assert_allclose(full.u_end, motion.u_end, atol=1e-9)
-

@@ -1,4 +1,6 @@
-"""Stop events: found in their step to round-off, the first of several, in short windows, and again from where they stopped; with derivatives."""
+"""Stop events: found in their step to round-off, the first of several, in short windows, and again from where
+they stopped; with derivatives.
+"""
 
 import itertools
 from functools import cache
@@ -17,7 +19,8 @@ from small_scenes import OnLine, Upright
 import jourdain_jax as jj
 from jourdain_jax.integrate.explicit_steps import DOPRI5, DOPRI8, TSIT5, method_of
 
-# Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in.
+# Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never
+# outside of the step they lie in.
 
 
 GRAVITY = 9.81
@@ -40,7 +43,11 @@ class Falling(OnLine):
 
 
 def fallen(height, scene=None, **options):
-    return jj.simulate(scene or Falling(), {"x": height}, **({"t1": 2.0, "backend": "xla", "rtol": 1e-9, "atol": 1e-9} | options))
+    return jj.simulate(
+        scene or Falling(),
+        {"x": height},
+        **({"t1": 2.0, "backend": "xla", "rtol": 1e-9, "atol": 1e-9} | options),
+    )
 
 
 def test_lanes_have_saved_times_of_their_own():
@@ -75,11 +82,13 @@ def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
         return fallen(height, scene, solver=diffrax.Tsit5()).u_end[0]
 
     # v^2/2 + g z - k (z + d)^10.5/10.5 is constant
-    work = lambda z: GRAVITY * z - scene.stiffness * (z + scene.depth) ** 10.5 / 10.5  # noqa: E731
+    work = lambda z: GRAVITY * z - scene.stiffness * (z + scene.depth) ** 10.5 / 10.5
     speed = np.sqrt(2 * (work(height) - work(0.0)))
     assert np.isnan(jax.grad(scene.push)(-scene.depth))
     assert_allclose(landing_speed(height), -speed, rtol=1e-9)
-    assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - scene.push(height + scene.depth)) / speed, rtol=1e-7)
+    assert_allclose(
+        jax.grad(landing_speed)(height), -(GRAVITY - scene.push(height + scene.depth)) / speed, rtol=1e-7
+    )
 
 
 SHAPES = ("flat", "jump", "kinked", "saturated", "steep", "straight")
@@ -112,7 +121,9 @@ def test_an_event_is_found_in_its_step_whatever_its_shape():
 
 
 class Flat(OnLine):
-    """A particle that meets a wall; the value of the event has a root of three fold there, or one of one fold."""
+    """A particle that meets a wall; the value of the event has a root of three fold there, or one of one
+    fold.
+    """
 
     wall: object = jj.parameter(1.5)
     order: int = eqx.field(static=True, default=3)
@@ -121,16 +132,24 @@ class Flat(OnLine):
         return {"wall": (self.wall - motion.q.x) ** self.order}
 
 
-@pytest.mark.parametrize("options", [{"backend": "native"}, {"backend": "xla"}, {"backend": "dense"}, {"solver": jj.RadauIIA()}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{"backend": "native"}, {"backend": "xla"}, {"backend": "dense"}, {"solver": jj.RadauIIA()}],
+    ids=str,
+)
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_the_time_of_an_event_whose_value_has_no_slope_has_no_derivative(options, derivative):
     def met(wall, order):
-        motion = jj.simulate(Flat(wall=wall, order=order), {"x": 0.0, "x_rate": 1.0}, t1=4.0, ts=[0.5], **options)
+        motion = jj.simulate(
+            Flat(wall=wall, order=order), {"x": 0.0, "x_rate": 1.0}, t1=4.0, ts=[0.5], **options
+        )
         return jnp.stack([motion.t_end, motion.q_end[0], motion.q[0, 0] * wall])
 
     assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
     assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
-    assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)  # what was saved on the way is none of the event's
+    assert_allclose(
+        derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9
+    )  # what was saved on the way is none of the event's
 
 
 # Solvers of our own. --------------------------------------------------------------------------------
@@ -158,7 +177,8 @@ def test_only_a_solver_itself_has_its_tableau():
     assert method_of(diffrax.Bosh3()) is None
 
 
-# Stop events whose values are negative in a short part of the way are met: the relations in them are watched over each step.
+# Stop events whose values are negative in a short part of the way are met: the relations in them are watched
+# over each step.
 
 
 A, W = 0.9, 0.006  # where a bead of 1 m/s that begins at 0 meets them; 0.3 % of the span
@@ -220,20 +240,26 @@ def test_values_with_a_peak_where_a_relation_changes_are_not_watched():
 
     class Leaning(scene_of("distance")):
         def events(self, motion):
-            return {"low": 1.5 - jnp.abs(motion.q.x), "walls": jnp.minimum(2.0 - motion.q.x, motion.q.x + 2.0)}
+            return {
+                "low": 1.5 - jnp.abs(motion.q.x),
+                "walls": jnp.minimum(2.0 - motion.q.x, motion.q.x + 2.0),
+            }
 
     assert jj.lower(Leaning()).event_relations == ()
     assert jj.lower(jj.models.TiltingDisc()).event_relations == ()
 
 
-# Of several stop events in one step the first in time ends the motion, whatever its name; one whose value ends at its boundary is found there.
+# Of several stop events in one step the first in time ends the motion, whatever its name; one whose value
+# ends at its boundary is found there.
 
 
 LOOPS = {"lean": {}, "diffrax": {"solver": diffrax.Bosh3()}}
 
 
 class Thrown(Upright):
-    """A particle under gravity between a floor, a wall and two more planes: all its coordinates are polynomials in time, which steps follow at any length."""
+    """A particle under gravity between a floor, a wall and two more planes: all its coordinates are
+    polynomials in time, which steps follow at any length.
+    """
 
     floor: object = jj.parameter(0.0)
     wall: object = jj.parameter(2.0)
@@ -246,7 +272,12 @@ class Thrown(Upright):
 
     def events(self, motion):
         q = motion.q
-        return {"a floor": q.z - self.floor, "b wall": self.wall - q.x, "c roof": self.roof - q.z, "d slope": self.slope - q.x - q.z}
+        return {
+            "a floor": q.z - self.floor,
+            "b wall": self.wall - q.x,
+            "c roof": self.roof - q.z,
+            "d slope": self.slope - q.x - q.z,
+        }
 
 
 def first_crossing(x_rate, z_rate, floor, wall, roof, slope):
@@ -257,19 +288,33 @@ def first_crossing(x_rate, z_rate, floor, wall, roof, slope):
         return min((r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0), default=np.inf)
 
     fall = [-GRAVITY / 2, z_rate, 1.0]
-    times = least(*np.subtract(fall, [0, 0, floor])), wall / x_rate, least(*np.subtract(fall, [0, 0, roof])), least(*np.subtract(fall, [0, -x_rate, slope]))
+    times = (
+        least(*np.subtract(fall, [0, 0, floor])),
+        wall / x_rate,
+        least(*np.subtract(fall, [0, 0, roof])),
+        least(*np.subtract(fall, [0, -x_rate, slope])),
+    )
     return int(np.argmin(times)), min(times)
 
 
 def generated_throws(count=48):
     random = np.random.default_rng(13)
     throws = [
-        (random.uniform(2, 6), random.uniform(-2, 3), random.uniform(-1, 0.9), random.uniform(0.3, 3), random.uniform(1.05, 3), random.uniform(1.3, 6))
+        (
+            random.uniform(2, 6),
+            random.uniform(-2, 3),
+            random.uniform(-1, 0.9),
+            random.uniform(0.3, 3),
+            random.uniform(1.05, 3),
+            random.uniform(1.3, 6),
+        )
         for _ in range(count)
     ]
     # one shortly after the other, in every order
     for floor, wall, slope in itertools.permutations([0.20, 0.21, 0.22]):
-        throws.append((4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2))
+        throws.append(
+            (4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2)
+        )
     return np.array(throws)
 
 
@@ -277,10 +322,21 @@ def generated_throws(count=48):
 def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     throws = generated_throws()
     if options:
-        throws[:, 4] = 100.0  # a hump over the roof is found by our explicit Runge-Kutta loop; by diffrax not where it is over at the end of a step
-    starts = {"x": np.zeros(len(throws)), "z": np.ones(len(throws)), "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
+        throws[:, 4] = (
+            # a hump over the roof is found by our explicit Runge-Kutta loop; by diffrax not where it is over
+            # at the end of a step
+            100.0
+        )
+    starts = {
+        "x": np.zeros(len(throws)),
+        "z": np.ones(len(throws)),
+        "x_rate": throws[:, 0],
+        "z_rate": throws[:, 1],
+    }
     walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
-    lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, **options).lanes  # some step is beyond all of them
+    lanes = jj.rollout(
+        Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, **options
+    ).lanes  # some step is beyond all of them
     expected = [first_crossing(*throw) for throw in throws]
     assert_array_equal(lanes.event, [event for event, _ in expected])
     assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
@@ -289,7 +345,8 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
 
 
-# where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t + c
+# where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t +
+# c
 MEETS = {
     "floor": (0.6, lambda place: (-GRAVITY / 2, 2.0, 1.0 - place)),
     "wall": (0.8, lambda place: (0.0, -4.5, place)),
@@ -338,7 +395,9 @@ class Bounded(OnLine):
 
 def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there():
     edges, kinds = (x.ravel() for x in np.meshgrid([0.3, 1.0, 1.7], [0, 1, 2, 3]))
-    own = {name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))}
+    own = {
+        name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))
+    }
     lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0]).lanes
     assert np.all(np.asarray(lanes.result) == results.EVENT)
     assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
@@ -374,7 +433,9 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
 
 
 def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_there():
-    """A roof that a stone passes by some nm, and a value that decays to next to nothing; both are flat where the first step of the search ends."""
+    """A roof that a stone passes by some nm, and a value that decays to next to nothing; both are flat where
+    the first step of the search ends.
+    """
 
     class Decaying(Bounded):
         def events(self, motion):
@@ -385,7 +446,11 @@ def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_the
     by, top = 3e-9, 1.0 + 5.0**2 / (2 * GRAVITY)
 
     def end(roof):
-        motion = jj.simulate(Thrown(floor=-100.0, wall=100.0, roof=roof, slope=100.0), {"z": 1.0, "x_rate": 0.0, "z_rate": 5.0}, ts=[2.0])
+        motion = jj.simulate(
+            Thrown(floor=-100.0, wall=100.0, roof=roof, slope=100.0),
+            {"z": 1.0, "x_rate": 0.0, "z_rate": 5.0},
+            ts=[2.0],
+        )
         return motion.t_end
 
     assert_allclose(end(top - by), 5.0 / GRAVITY - np.sqrt(2 * by / GRAVITY), rtol=1e-9)
@@ -411,7 +476,9 @@ WITH_MARKS = {
     "a point": lambda motion, path: motion.point("mass", jnp.zeros(3)),
     "a rollout": lambda motion, path: jj.rollout(Thrown(), {"x_rate": jnp.array([0.5, 1.0])}, t1=5.0).lanes.q,
     "a file": lambda motion, path: (jj.save(motion, path), jj.load_trajectory(path, Thrown).q)[1],
-    "a derivative": lambda motion, path: jax.grad(lambda z: jj.simulate(Thrown(), {"z": z}, t1=5.0).t_end)(1.5),
+    "a derivative": lambda motion, path: jax.grad(lambda z: jj.simulate(Thrown(), {"z": z}, t1=5.0).t_end)(
+        1.5
+    ),
 }
 
 
@@ -423,7 +490,8 @@ def test_times_that_were_not_reached_are_no_mistake_to_a_search_for_nan(what, tm
     assert np.isnan(found).any() == (what != "a derivative")
 
 
-# A motion that starts at a stop event goes on where the value of the event rises there, as after a bounce; it stops where that falls through zero.
+# A motion that starts at a stop event goes on where the value of the event rises there, as after a bounce; it
+# stops where that falls through zero.
 
 
 class Ball(Upright):
@@ -441,7 +509,9 @@ class Ball(Upright):
 
 def thrown_back(scene, motion, restitution):
     end = motion.end
-    return jj.start(scene, t0=end.t, x=end["x"], z=end["z"], x_rate=end["x_rate"], z_rate=-restitution * end["z_rate"])
+    return jj.start(
+        scene, t0=end.t, x=end["x"], z=end["z"], x_rate=end["x_rate"], z_rate=-restitution * end["z_rate"]
+    )
 
 
 @pytest.mark.parametrize(("backend", "level"), [(BACKENDS[-1], 0.0), (BACKENDS[-1], 1e3), ("xla", 0.3)])
@@ -534,14 +604,22 @@ WAYS_FROM_LEVEL += [{"solver": jj.RadauIIA()}, {"solver": diffrax.Bosh3(), "work
 @pytest.mark.parametrize("options", WAYS_FROM_LEVEL, ids=str)
 @pytest.mark.parametrize("kind", [AtLevel, OffLevel])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_a_value_of_zero_at_the_start_falls_by_the_first_derivative_that_is_not_zero(options, kind, direction):
+def test_a_value_of_zero_at_the_start_falls_by_the_first_derivative_that_is_not_zero(
+    options, kind, direction
+):
     if kind is OffLevel and isinstance(options.get("solver"), diffrax.Bosh3):
         pytest.skip("diffrax does not go on after events")
     level, push, growth, x, rate = np.array([numbers for numbers, _ in AT_LEVEL.values()]).T
     expected = [np.inf if time is None else time for _, time in AT_LEVEL.values()]
     parameters = {"level": level, "push": push, "growth": direction * growth}
-    lanes = jj.rollout(kind(), {"x": x, "x_rate": direction * rate}, parameters=parameters, t1=2.0 * direction, **options).lanes
-    times, happened = (lanes.phases.ts[:, 0], lanes.phases.events[:, 0] >= 0) if kind is OffLevel else (lanes.t_end, lanes.event >= 0)
+    lanes = jj.rollout(
+        kind(), {"x": x, "x_rate": direction * rate}, parameters=parameters, t1=2.0 * direction, **options
+    ).lanes
+    times, happened = (
+        (lanes.phases.ts[:, 0], lanes.phases.events[:, 0] >= 0)
+        if kind is OffLevel
+        else (lanes.t_end, lanes.event >= 0)
+    )
     assert_allclose(np.where(happened, np.abs(times), np.inf), expected, atol=1e-6)
 
 

@@ -1,4 +1,5 @@
-"""What holds of every model: its equations agree with each other, also for other parameters; derivatives through its simulation are right.
+"""What holds of every model: its equations agree with each other, also for other parameters; derivatives
+through its simulation are right.
 
 The whole set takes minutes; by default a part of it runs, all of it with `-m ''`.
 """
@@ -32,10 +33,18 @@ natively = machine_code.needed
 
 
 def other_parameters(name, seed) -> jj.Scene:
-    """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1, unless they must not be negative."""
+    """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1, unless they
+    must not be negative.
+    """
     scene, generator = MODELS[name](), np.random.default_rng(seed)
-    shift = lambda x: generator.uniform(-0.1, 0.1, x.shape) * np.where(np.asarray(x) == 0, 1.0, np.asarray(x))  # noqa: E731
-    return scene.replace(**{key: value + shift(value) for key, value, metadata in parameters_of(scene) if not metadata["non_negative"] or np.all(value > 0)})
+    shift = lambda x: generator.uniform(-0.1, 0.1, x.shape) * np.where(np.asarray(x) == 0, 1.0, np.asarray(x))
+    return scene.replace(
+        **{
+            key: value + shift(value)
+            for key, value, metadata in parameters_of(scene)
+            if not metadata["non_negative"] or np.all(value > 0)
+        }
+    )
 
 
 @eval_numpy  # each program runs once, so that compiling it would take longer than running it
@@ -44,7 +53,9 @@ def other_parameters(name, seed) -> jj.Scene:
 def _solved(scene, t, q, u):
     equations = unconstrained_equations(scene, t, q, u)
     found = {name: jj.accelerations(scene, t, q, u, reduction=name) for name in jj.reductions(scene)}
-    return equations.Q - equations.h, {name: (x.udot, x.constraint_force, x.applicable) for name, x in found.items()}
+    return equations.Q - equations.h, {
+        name: (x.udot, x.constraint_force, x.applicable) for name, x in found.items()
+    }
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
@@ -54,10 +65,12 @@ def test_all_reductions_agree_at_100_random_states_with_random_parameters(name):
     assert min(len(t) for t, _, _ in states) == STATES  # every draw was assembled
     arrays, rest = zip(*(eqx.partition(scene, eqx.is_array) for scene in scenes), strict=True)
     stacked = eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *arrays), rest[0])
-    impressed, found = _solved(stacked, *(jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(3)))
+    impressed, found = _solved(
+        stacked, *(jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(3))
+    )
     udot, force, applies = found["qr"]
     assert np.all(applies)
-    size = lambda *x: jnp.sum(jnp.stack([jnp.max(jnp.abs(y), axis=-1, keepdims=True) for y in x]), axis=0)  # noqa: E731
+    size = lambda *x: jnp.sum(jnp.stack([jnp.max(jnp.abs(y), axis=-1, keepdims=True) for y in x]), axis=0)
     sizes = (size(udot), size(force, impressed))
     if name == "heisenberg-particle":  # no acceleration, no force: nothing to be relative to
         sizes = (1.0, 1.0)
@@ -67,7 +80,9 @@ def test_all_reductions_agree_at_100_random_states_with_random_parameters(name):
         works = np.asarray(applicable)
         assert works.mean() >= needed, f"`{way}` applies at {works.sum()} of {works.size} states"
         for value, reference, relative_to in zip(values, (udot, force), sizes, strict=True):
-            assert np.max(np.asarray(jnp.abs(value - reference) / relative_to)[works]) <= tolerance("round_off"), way
+            assert np.max(np.asarray(jnp.abs(value - reference) / relative_to)[works]) <= tolerance(
+                "round_off"
+            ), way
 
     _check_lowered(name, scenes, states, udot, sizes[0])
 
@@ -76,18 +91,28 @@ def _check_lowered(name, scenes, states, udot, size):
     """The scalar program, at the same states and parameters, on NumPy: nothing is compiled."""
     program = lowered(scenes[0])
     assert isinstance(program, Lowered), str(program)
-    for scene, (t, q, u), dense, relative_to in zip(scenes, states, np.asarray(udot), np.broadcast_to(size, (DRAWS, STATES, 1)), strict=True):
+    for scene, (t, q, u), dense, relative_to in zip(
+        scenes, states, np.asarray(udot), np.broadcast_to(size, (DRAWS, STATES, 1)), strict=True
+    ):
         assert lowered(scene) is program  # parameters are inputs of the program
         probes = Probes(program.graph, named_values(scene, t, q, u, np.zeros((STATES, len(scene.inputs)))))
         ydot, qdot, z = probes(program.ydot).T, probes(program.qdot).T, probes(program.z).T
         rates = np.asarray(jax.vmap(lambda t, q, u, scene=scene: coordinate_rates(scene, t, q, u))(t, q, u))
-        assert np.max(np.abs(ydot - dense[:, list(program.independent)]) / relative_to, initial=0.0) <= tolerance("round_off"), "accelerations"
-        assert np.max(np.abs(z - u[:, list(program.dependent)]), initial=0.0) <= tolerance("round_off") * np.max(np.abs(u)), "dependent speeds"
-        assert np.max(np.abs(qdot - rates), initial=0.0) <= tolerance("round_off") * (1 + np.max(np.abs(rates))), "rates of coordinates"
+        assert np.max(
+            np.abs(ydot - dense[:, list(program.independent)]) / relative_to, initial=0.0
+        ) <= tolerance("round_off"), "accelerations"
+        assert np.max(np.abs(z - u[:, list(program.dependent)]), initial=0.0) <= tolerance(
+            "round_off"
+        ) * np.max(np.abs(u)), "dependent speeds"
+        assert np.max(np.abs(qdot - rates), initial=0.0) <= tolerance("round_off") * (
+            1 + np.max(np.abs(rates))
+        ), "rates of coordinates"
 
 
 class OfAMotion(NamedTuple):
-    """Derivatives of the end of two steps, at one point along one random direction, and what they are compared with."""
+    """Derivatives of the end of two steps, at one point along one random direction, and what they are
+    compared with.
+    """
 
     forwards: np.ndarray  # J d
     differences: np.ndarray  # the same by central differences, of steps h and 2h, the leading error removed
@@ -100,14 +125,22 @@ class OfAMotion(NamedTuple):
 def end_of_two_steps(name, *, with_start):
     """`x -> q, u at the end of two steps`, where x holds all parameters and the state at the start; and x.
 
-    Every step is accepted, whatever its error, and the first is shorter than half of the span: so the derivatives are those of the steps to round-off.
-    `with_start`: all that `simulate` does; otherwise what it does once the start is on the rows.
+    Every step is accepted, whatever its error, and the first is shorter than half of the span: so the
+    derivatives are those of the steps to round-off. `with_start`: all that `simulate` does; otherwise what it
+    does once the start is on the rows.
     """
     scene = MODELS[name]()
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
     start = jj.State(t, q, u, *jnp.zeros(3), (scene.coordinate_names, scene.speed_names))
     flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, q, u))
-    options = {"ts": t + jnp.array([0.02]), "rtol": 1e3, "atol": 1e3, "max_step": 0.008, "work": False, "events": False}
+    options = {
+        "ts": t + jnp.array([0.02]),
+        "rtol": 1e3,
+        "atol": 1e3,
+        "max_step": 0.008,
+        "work": False,
+        "events": False,
+    }
 
     known = None if with_start else set_up(scene, start, **options)
     assert known is None or not known.reason_against_machine_code
@@ -125,7 +158,9 @@ def end_of_two_steps(name, *, with_start):
 
 
 def derivatives_of(name, *, with_start=False) -> OfAMotion:
-    """Both modes, by the machine code that a user gets; the operations around it run on NumPy, in a third of the time that XLA takes to compile them."""
+    """Both modes, by the machine code that a user gets; the operations around it run on NumPy, in a third of
+    the time that XLA takes to compile them.
+    """
     end, x = end_of_two_steps(name, with_start=with_start)
     generator = np.random.default_rng(0)
     direction = generator.normal(size=x.shape) * np.abs(x)
@@ -134,7 +169,10 @@ def derivatives_of(name, *, with_start=False) -> OfAMotion:
     weights = generator.normal(size=value.shape)
     (gradient,) = eval_numpy(lambda x: jax.vjp(end, x)[1](jnp.asarray(weights)))(x)
     h = 3e-4
-    by_step = [(forward(x + k * h * direction)[0] - forward(x - k * h * direction)[0]) / (2 * k * h) for k in (1, 2, 4)]
+    by_step = [
+        (forward(x + k * h * direction)[0] - forward(x - k * h * direction)[0]) / (2 * k * h)
+        for k in (1, 2, 4)
+    ]
     better, worse = ((4 * by_step[i] - by_step[i + 1]) / 3 for i in (0, 1))
     left = np.abs(better - worse) + 10 * np.finfo(float).eps / h * np.max(np.abs(value))
     return OfAMotion(along, better, left, gradient, weights, direction)

@@ -1,4 +1,6 @@
-"""Programs that run elsewhere, exported ones and those for other devices, hold no machine code of this process: they are made with `backend="xla"`."""
+"""Programs that run elsewhere, exported ones and those for other devices, hold no machine code of this
+process: they are made with `backend="xla"`.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,9 @@ def _total(speed, **options):
 
 
 def _exported(function, *arguments, **options):
-    found = jax.export.export(jax.jit(function), **options)(*(jax.ShapeDtypeStruct(jnp.shape(x), jnp.float64) for x in arguments))
+    found = jax.export.export(jax.jit(function), **options)(
+        *(jax.ShapeDtypeStruct(jnp.shape(x), jnp.float64) for x in arguments)
+    )
     assert MACHINE_CODE not in found.mlir_module()
     return found
 

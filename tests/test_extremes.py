@@ -48,7 +48,9 @@ def test_the_integral_is_found_to_the_fourth_order(waves):
 
 
 def test_values_that_were_not_reached_do_not_count():
-    """A particle that falls from g T^2 / 2 lands at T, after 1 to 5 saved times and after 16; few of them give no more than finite derivatives."""
+    """A particle that falls from g T^2 / 2 lands at T, after 1 to 5 saved times and after 16; few of them
+    give no more than finite derivatives.
+    """
     landed = np.array([0.02, 0.065, 0.12, 0.17, 0.22, 1.54])
 
     def of(height):
@@ -80,16 +82,25 @@ def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
     assert Largest("z").of(motion) == pytest.approx(top, abs=1e-9)
     assert Smallest("z").of(motion) == pytest.approx(0.0, abs=1e-9)
     assert LargestMagnitude("z_rate").of(motion) == pytest.approx(np.sqrt(4.0 + 18.0), rel=1e-8)
-    assert Largest(lambda motion: motion["z"] - motion.ts).of(motion) == pytest.approx(1.0 + 1.0 / 18.0, abs=1e-9)
+    assert Largest(lambda motion: motion["z"] - motion.ts).of(motion) == pytest.approx(
+        1.0 + 1.0 / 18.0, abs=1e-9
+    )
     height = landed + landed**2 - 1.5 * landed**3
     assert Integral("z", "m s").of(motion) == pytest.approx(height, rel=1e-9)
-    assert Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion) == pytest.approx(landed, rel=1e-9)
-    with pytest.raises(ValueError, match=r"the quantity of an output is .*, expected its real values at all 11 times of the motion"):
+    assert Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion) == pytest.approx(
+        landed, rel=1e-9
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"the quantity of an output is .*, expected its real values at all 11 times of the motion",
+    ):
         Integral(lambda motion: motion.t_end).of(motion)
 
 
 def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
-    """A particle that falls from g T^2 / 2 lands at T: 1e-3 to 1e-15 s after a saved time, and at one. A polynomial through both times would swing."""
+    """A particle that falls from g T^2 / 2 lands at T: 1e-3 to 1e-15 s after a saved time, and at one. A
+    polynomial through both times would swing.
+    """
     after = 1.0 + np.array([1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15, 0.0])
     options = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 21), "rtol": 1e-8, "atol": 1e-8}
     lanes = jj.rollout(Thrown(), {"z": 4.5 * after**2, "z_rate": 0.0}, **options).lanes

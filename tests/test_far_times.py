@@ -1,4 +1,6 @@
-"""What does not depend on time is as right far from t = 0 as near it, in both loops (and in single precision: `test_float32.py`)."""
+"""What does not depend on time is as right far from t = 0 as near it, in both loops (and in single precision:
+`test_float32.py`).
+"""
 
 import diffrax
 import jax
@@ -27,7 +29,11 @@ class Oscillator(OnLine):
     example = {"x": 1.0}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.driven * jnp.cos(2.0 * motion.t) - self.stiffness * motion.q.x),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=self.driven * jnp.cos(2.0 * motion.t) - self.stiffness * motion.q.x
+            ),
+        )
 
     def events(self, motion):
         return {"passed": motion.q.x + self.stops}
@@ -60,7 +66,13 @@ def test_an_event_far_in_time_is_the_one_at_zero_and_so_is_its_derivative():
 
 def test_the_state_and_the_time_advance_together():
     """xdot = 1 in steps that do not divide the span: x is the time, to the last digit of the clock."""
-    motion = jj.simulate(Oscillator(stiffness=0.0), {"x": 0.0, "x_rate": 1.0}, t0=1e9, ts=1e9 + np.linspace(0.0, 3.0, 7), t1=1e9 + 3.0)
+    motion = jj.simulate(
+        Oscillator(stiffness=0.0),
+        {"x": 0.0, "x_rate": 1.0},
+        t0=1e9,
+        ts=1e9 + np.linspace(0.0, 3.0, 7),
+        t1=1e9 + 3.0,
+    )
     assert_allclose(motion["x"], np.asarray(motion.ts) - 1e9, rtol=1e-14, atol=1e-14)
 
 
@@ -71,7 +83,10 @@ def test_a_driven_oscillator_gets_the_time_of_the_clock():
 
 
 def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
-    near, far = (jj.simulate(Oscillator(stiffness=1e8, driven=1.0), t0=t0, ts=[t0, t0 + 2.0**-7]) for t0 in (0.0, 1.7e9))
+    near, far = (
+        jj.simulate(Oscillator(stiffness=1e8, driven=1.0), t0=t0, ts=[t0, t0 + 2.0**-7])
+        for t0 in (0.0, 1.7e9)
+    )
     assert near.warnings == ()
     (text,) = far.warnings
     assert text.startswith("times are resolved to 2e-07 s, steps are ")

@@ -20,7 +20,8 @@ import jourdain_jax as jj
 from jourdain_jax import structure_of
 from jourdain_jax.program.eager import eval_numpy
 
-# Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so
+# Values that some state on the rows has are a start: what was not given is found, and where it was not found
+# near the reference, the state says so
 
 
 SCENES = {
@@ -78,6 +79,7 @@ class Hanging(InSpace):
     """A pendulum in Cartesian coordinates, of which the lower half is stated as the domain."""
 
     domain = {"x": (-0.9, 0.9), "y": (-0.9, 0.9), "z": (-1.0, -0.1)}
+
     def geometric_constraints(self, pose):
         return {"rod": pose.q.array @ pose.q.array - 1.0}
 
@@ -126,7 +128,7 @@ def test_lanes_are_put_together_in_the_domain_or_end_with_a_code():
     scene, places = Hanging(), np.array([0.1, 0.6, 1.0])
     lanes = jj.rollout(scene, {"x": places, "y": 0.0}, ts=[0.1], progress=False)
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.INCONSISTENT_START]
-    height = lambda x: jj.start(scene, x=x, y=0.0).q[2]  # noqa: E731
+    height = lambda x: jj.start(scene, x=x, y=0.0).q[2]
     values, slopes = eval_numpy(jax.vmap(jax.value_and_grad(height)))(places[:2])
     assert_allclose(values, -np.sqrt(1 - places[:2] ** 2), rtol=1e-12)
     assert_allclose(slopes, -places[:2] / values, rtol=1e-9)
@@ -134,11 +136,22 @@ def test_lanes_are_put_together_in_the_domain_or_end_with_a_code():
     assert np.isinf(jax.jit(lambda x: jj.start(scene, x=x, y=0.0).residual)(1.0))
 
 
-@pytest.mark.parametrize("given", [{"attitude_w": 0.0}, {"attitude_x": 0.2}, {"attitude_x": 0.2, "z": 0.4}, {"attitude_x": 0.5, "attitude_z": 0.5}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"attitude_w": 0.0},
+        {"attitude_x": 0.2},
+        {"attitude_x": 0.2, "z": 0.4},
+        {"attitude_x": 0.5, "attitude_z": 0.5},
+    ],
+)
 def test_an_attitude_of_which_a_part_is_named_is_refused_where_many_have_it(given):
     disc = SCENES["disc with quaternion"]
     for look in (jj.start, lambda scene, values: jj.simulate(scene, values, t1=0.1)):
-        with pytest.raises(ValueError, match=r"of the quaternion `attitude` is given, .*; give all four parts, attitude=\(w, x, y, z\)"):
+        with pytest.raises(
+            ValueError,
+            match=r"of the quaternion `attitude` is given, .*; give all four parts, attitude=\(w, x, y, z\)",
+        ):
             look(disc, given)
     if len(given) == 1:
         lanes = jj.rollout(disc, {"attitude_w": np.array([0.0, 0.3])}, ts=[0.1], progress=False)
@@ -193,13 +206,17 @@ def test_states_near_the_example_serve_where_none_was_found_at_random():
 
 
 def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
-    found = jj.steady(jj.models.VerticalDisc(), {"x": 5.0, "heading": 0.7, "heading_rate": 0.2, "roll_rate": 3.0})
+    found = jj.steady(
+        jj.models.VerticalDisc(), {"x": 5.0, "heading": 0.7, "heading_rate": 0.2, "roll_rate": 3.0}
+    )
     assert found.converged
     assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)
 
 
 class Bowl(InSpace):
-    """A particle in a round bowl, which rolls along grooves: a geometric row that the reference is on, and a row of speeds."""
+    """A particle in a round bowl, which rolls along grooves: a geometric row that the reference is on, and a
+    row of speeds.
+    """
 
     radius: float = jj.parameter(1.2, positive=True)
     slope: float = jj.parameter(0.4)
@@ -216,8 +233,13 @@ class Bowl(InSpace):
 
 @pytest.mark.parametrize("scene", [jj.models.ChaplyginSleigh(), Bowl()], ids=["sleigh", "bowl"])
 def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_nearest_one(scene):
-    """Speeds that rows determine are solved for without a metric; where a scene has none to spare, the nearest state is that one, to second order."""
-    first, privileged = scene.coordinate_names.entries[-1], [scene.speed_names.entries[i] for i in structure_of(scene).independent]
+    """Speeds that rows determine are solved for without a metric; where a scene has none to spare, the
+    nearest state is that one, to second order.
+    """
+    first, privileged = (
+        scene.coordinate_names.entries[-1],
+        [scene.speed_names.entries[i] for i in structure_of(scene).independent],
+    )
     given = {first: jnp.asarray(0.3)} | {name: jnp.asarray(0.5 + k) for k, name in enumerate(privileged)}
     numbers, restored = ravel_pytree((jax.tree.map(jnp.asarray, scene), given))
 
@@ -246,12 +268,15 @@ def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_fo
     start = eqx.tree_at(lambda s: s.q, jj.start(scene, **scene.example), jnp.zeros(4))
     motion = jj.simulate(scene, start, t1=0.1)
     assert motion.result == results.INCONSISTENT_START
-    sound = jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, jnp.array([0.6, -0.8, 0.6, -1.7])), t1=0.1)  # the lower rod is too long
+    sound = jj.simulate(
+        scene, eqx.tree_at(lambda s: s.q, start, jnp.array([0.6, -0.8, 0.6, -1.7])), t1=0.1
+    )  # the lower rod is too long
     assert sound.result == results.SUCCESS
     assert 0.01 < float(sound.moved_q) < 0.1
 
 
-# Derivatives of what is put onto the rows, of a start off them by some finite amount, against differences of what is computed.
+# Derivatives of what is put onto the rows, of a start off them by some finite amount, against differences of
+# what is computed.
 
 
 STEP = 2e-3
@@ -259,16 +284,23 @@ STEP = 2e-3
 
 def _slope(function, s=0.0) -> np.ndarray:
     """The derivative by Richardson's extrapolation of central differences, of order 6."""
-    D = [(np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h) for h in (STEP, STEP / 2, STEP / 4)]
+    D = [
+        (np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h)
+        for h in (STEP, STEP / 2, STEP / 4)
+    ]
     D = [(4 * b - a) / 3 for a, b in pairwise(D)]
     return (16 * D[1] - D[0]) / 15
 
 
 def _along(scene: jj.Scene, held, off):
-    """What is put onto the rows as a function of one number, on which parameters, time, coordinates and speeds depend."""
+    """What is put onto the rows as a function of one number, on which parameters, time, coordinates and
+    speeds depend.
+    """
     generator = np.random.default_rng(2)
     _, q, u = jj.sample_states(scene, 1)
-    numbers, restored = ravel_pytree((jax.tree.map(jnp.asarray, scene), jnp.asarray(0.2), jnp.asarray(q[0]), jnp.asarray(u[0])))
+    numbers, restored = ravel_pytree(
+        (jax.tree.map(jnp.asarray, scene), jnp.asarray(0.2), jnp.asarray(q[0]), jnp.asarray(u[0]))
+    )
     moved = jnp.asarray(off * generator.normal(size=len(q[0]) + len(u[0])))
     numbers = numbers.at[-moved.size :].add(moved)
     direction = jnp.asarray(generator.normal(size=numbers.size)) * (0.1 + 0.1 * jnp.abs(numbers))
@@ -300,7 +332,9 @@ def test_derivatives_are_those_of_what_is_computed(scene, held, off):
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative):
-    """A longer rod moves the bob outwards, a rate along the rod is taken away: x = l sin a, z = -l cos a, also where x, z and both rates are given."""
+    """A longer rod moves the bob outwards, a rate along the rod is taken away: x = l sin a, z = -l cos a,
+    also where x, z and both rates are given.
+    """
     sin, cos = 0.28, 0.96
 
     def begins(length, along):

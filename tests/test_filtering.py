@@ -1,4 +1,6 @@
-"""The likelihood of disturbed motions by an extended Kalman filter: against Kalman's filter for a linear scene, and where nothing disturbs."""
+"""The likelihood of disturbed motions by an extended Kalman filter: against Kalman's filter for a linear
+scene, and where nothing disturbs.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,9 @@ NOISE = 0.04  # (m/s)^2 / s
 
 
 def kalman(damping, stiffness, noise, run, spread, mass=2.0):
-    """The textbook filter of x' = A x + w, discretised by C. F. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395."""
+    """The textbook filter of x' = A x + w, discretised by C. F. Van Loan, IEEE Trans. Automatic Control 23
+    (1978) 395.
+    """
     A = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
     W = np.diag([0.0, noise])
     x, P, t, total = np.array([0.3, -0.1]), np.diag(spread) ** 2, 0.0, 0.0
@@ -26,9 +30,16 @@ def kalman(damping, stiffness, noise, run, spread, mass=2.0):
         block = scipy.linalg.expm(np.block([[-A, W], [np.zeros((2, 2)), A.T]]) * (t1 - t))
         F = block[2:, 2:].T
         x, P, t = F @ x, F @ P @ F.T + F @ block[:2, 2:], t1
-        rows = [(np.array([1.0, 0.0]), run["x"][k], 0.02), (2.0 * np.array([0.0, 1.0]), run["speedometer"][k] - 0.1, 0.05)]
+        rows = [
+            (np.array([1.0, 0.0]), run["x"][k], 0.02),
+            (2.0 * np.array([0.0, 1.0]), run["speedometer"][k] - 0.1, 0.05),
+        ]
         rows = [row for row in rows if np.isfinite(row[1])]
-        H, z, R = np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.diag([r[2] ** 2 for r in rows])
+        H, z, R = (
+            np.array([r[0] for r in rows]),
+            np.array([r[1] for r in rows]),
+            np.diag([r[2] ** 2 for r in rows]),
+        )
         S = H @ P @ H.T + R
         K = P @ H.T @ np.linalg.inv(S)
         r = z - H @ x
@@ -48,15 +59,28 @@ def samples():
 def measured(unknown=(), values=None):
     values = samples() if values is None else values
     sensors = {"speedometer": Sensor("x_rate", gain=2.0, bias=0.1)}
-    return jj.Experiment(TS, values, {"x": 0.02, "speedometer": 0.05}, start={"x": 0.3, "x_rate": -0.1}, unknown_start=unknown, sensors=sensors)
+    return jj.Experiment(
+        TS,
+        values,
+        {"x": 0.02, "speedometer": 0.05},
+        start={"x": 0.3, "x_rate": -0.1},
+        unknown_start=unknown,
+        sensors=sensors,
+    )
 
 
 @pytest.mark.parametrize("spread", [(0.0, 0.0), (0.1, 0.3)])
 @pytest.mark.parametrize("noise", [0.0, NOISE])
 def test_linear_scene_has_the_likelihood_of_kalmans_filter(spread, noise):
-    unknown = {n: jj.Estimate(prior=Normal(m, s)) for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True) if s}
+    unknown = {
+        n: jj.Estimate(prior=Normal(m, s))
+        for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True)
+        if s
+    }
     data = measured(unknown)
-    found = jax.jit(lambda scene: filtered_log_likelihood(scene, data, process_noise={"x_rate": noise}, **TIGHT))
+    found = jax.jit(
+        lambda scene: filtered_log_likelihood(scene, data, process_noise={"x_rate": noise}, **TIGHT)
+    )
     assert_allclose(found(Oscillator()), kalman(0.3, 5.0, noise, samples(), spread), rtol=1e-9)
 
 
@@ -64,7 +88,9 @@ def test_derivatives_are_those_of_kalmans_filter():
     run = measured()
 
     def of(theta):
-        return filtered_log_likelihood(Oscillator(damping=theta[0], stiffness=theta[1]), run, process_noise={"x_rate": theta[2]}, **TIGHT)
+        return filtered_log_likelihood(
+            Oscillator(damping=theta[0], stiffness=theta[1]), run, process_noise={"x_rate": theta[2]}, **TIGHT
+        )
 
     theta = jnp.array([0.3, 5.0, NOISE])
     found = jax.jit(jax.jacfwd(of))(theta)
@@ -77,19 +103,38 @@ def test_derivatives_are_those_of_kalmans_filter():
 
 
 def undisturbed():
-    """Scenes with their runs: a sleigh with a sensor that is a vector, and two particles and a rod between them, some of whose coordinates follow."""
+    """Scenes with their runs: a sleigh with a sensor that is a vector, and two particles and a rod between
+    them, some of whose coordinates follow.
+    """
     ts = np.linspace(0.1, 1.6, 7)
     values = {"x": -0.5 * ts, "nose": np.stack([-0.5 * ts, 0.1 * ts, 0.0 * ts], axis=1)}
-    asked = {"start": {"x_rate": -0.6, "heading_rate": 0.9}, "sensors": {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}}
-    yield jj.models.ChaplyginSleigh(), [jj.Experiment(ts + t0, values, 0.05, t0=t0, **asked) for t0 in (0.0, 1.0)]
+    asked = {
+        "start": {"x_rate": -0.6, "heading_rate": 0.9},
+        "sensors": {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))},
+    }
+    yield (
+        jj.models.ChaplyginSleigh(),
+        [jj.Experiment(ts + t0, values, 0.05, t0=t0, **asked) for t0 in (0.0, 1.0)],
+    )
     rods, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
     motion = jj.simulate(rods, rods.example, t0=0.0, ts=ts)
-    yield rods, jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=rods.example, t0=0.0)
+    yield (
+        rods,
+        jj.Experiment(
+            ts,
+            {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")},
+            0.02,
+            start=rods.example,
+            t0=0.0,
+        ),
+    )
 
 
 def test_undisturbed_motions_have_the_plain_likelihood():
     for scene, runs in undisturbed():
-        assert_allclose(filtered_log_likelihood(scene, runs, process_noise={}), log_likelihood(scene, runs), rtol=1e-6)
+        assert_allclose(
+            filtered_log_likelihood(scene, runs, process_noise={}), log_likelihood(scene, runs), rtol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -112,7 +157,11 @@ def test_what_a_filter_does_not_know_is_said_by_name(noise, change, message):
 
 def test_quaternions_and_accelerometers_are_refused():
     with pytest.raises(ValueError, match="has quaternions"):
-        filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={})
+        filtered_log_likelihood(
+            jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={}
+        )
     run = jj.Experiment(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": Accelerometer("cart")})
-    with pytest.raises(ValueError, match="measures accelerations, which contain the white disturbance itself"):
+    with pytest.raises(
+        ValueError, match="measures accelerations, which contain the white disturbance itself"
+    ):
         filtered_log_likelihood(Oscillator(), run, process_noise={})

@@ -1,4 +1,6 @@
-"""What a fit tells beyond its estimates: profiles, what informs which unknown, predictions of other runs, and its HTML report."""
+"""What a fit tells beyond its estimates: profiles, what informs which unknown, predictions of other runs, and
+its HTML report.
+"""
 
 import pickle
 import re
@@ -15,7 +17,8 @@ import jourdain_jax as jj
 from jourdain_jax.identification import Sensor, log_likelihood
 from jourdain_jax.studies import Normal
 
-# The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing.
+# The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and
+# it loads nothing.
 
 
 START, OTHER = {"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.4, "heading_rate": 0.6}
@@ -48,22 +51,38 @@ def test_measurements_that_count_twice_are_named(fitted):
     assert not jj.fit(TRUTH, data, free=("offset",)).warnings
     twice = jj.fit(TRUTH, [data, data], free=("offset",))
     assert "`x` of run 0 and `x` of run 1 hold equal numbers" in str(twice.warnings)
-    both = jj.Experiment(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
-    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold equal numbers")
+    both = jj.Experiment(
+        data.ts,
+        {"x": data.values["x"], "odometer": data.values["x"]},
+        0.01,
+        start=data.start,
+        sensors={"odometer": "x"},
+    )
+    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith(
+        "`odometer` of run 0 and `x` of run 0 hold equal numbers"
+    )
 
 
 def page(path) -> ElementTree.Element:
-    return ElementTree.fromstring(path.read_text(encoding="utf-8").removeprefix("<!DOCTYPE html>").replace('<meta charset="utf-8">', ""))
+    return ElementTree.fromstring(
+        path.read_text(encoding="utf-8").removeprefix("<!DOCTYPE html>").replace('<meta charset="utf-8">', "")
+    )
 
 
 def sections(path):
-    """Title -> first cell -> the other cells of lines; cells stand two blanks apart. The text of the fit itself comes first, without a title."""
+    """Title -> first cell -> the other cells of lines; cells stand two blanks apart. The text of the fit
+    itself comes first, without a title.
+    """
     found, title = {}, ""
     for part in page(path).iter():
         if part.tag == "h2":
             title = part.text
         elif part.tag == "pre":
-            found[title] = {cells[0]: cells[1:] for line in part.text.split("\n") if (cells := re.split(r"\s{2,}", line.strip()))}
+            found[title] = {
+                cells[0]: cells[1:]
+                for line in part.text.split("\n")
+                if (cells := re.split(r"\s{2,}", line.strip()))
+            }
     return found
 
 
@@ -76,9 +95,18 @@ def captions(path):
 def written(fitted, tmp_path_factory):
     """A report with a run held out and profiles: its file, the run, and what was drawn."""
     fit, data = fitted
-    path, held_out, figures, save = tmp_path_factory.mktemp("report") / "fit.html", measured(1, OTHER), [], Figure.savefig
+    path, held_out, figures, save = (
+        tmp_path_factory.mktemp("report") / "fit.html",
+        measured(1, OTHER),
+        [],
+        Figure.savefig,
+    )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda self, *given, **named: figures.append(self) or save(self, *given, **named))
+        patch.setattr(
+            Figure,
+            "savefig",
+            lambda self, *given, **named: figures.append(self) or save(self, *given, **named),
+        )
         fit.report(path, data, held_out=held_out, profiles=True, units={"x": "m"})
     return path, held_out, figures
 
@@ -87,13 +115,17 @@ def test_report_holds_the_numbers_of_the_fit(fitted, written):
     (fit, data), (path, _, _) = fitted, written
     found = sections(path)
     assert page(path).find(".//pre").text == str(fit)
-    assert float(found["Correlations"]["offset"][1]) == pytest.approx(float(fit.correlation[0, 1]), abs=0.0051)
+    assert float(found["Correlations"]["offset"][1]) == pytest.approx(
+        float(fit.correlation[0, 1]), abs=0.0051
+    )
     value = np.asarray(data.values["heading"])
     error = np.asarray(jj.simulate(fit.scene, START, ts=TS)["heading"]) - value
     (told,) = (line for line in found["Data (dots) and prediction (line)"] if "`heading`" in line)
     samples, rms, r_squared = re.search(r": (\d+) samples .* rms of (\S+); R\^2 (\S+)", told).groups()
     assert samples == "41"
-    assert float(r_squared) == pytest.approx(1 - np.sum(error**2) / np.sum((value - value.mean()) ** 2), abs=2e-6)
+    assert float(r_squared) == pytest.approx(
+        1 - np.sum(error**2) / np.sum((value - value.mean()) ** 2), abs=2e-6
+    )
     assert float(rms) == pytest.approx(np.sqrt(np.mean(error**2)), rel=5e-3)
     for name, (rho, _) in fit.autocorrelation.items():
         cells = found["Are the residuals white?"][name]
@@ -106,15 +138,22 @@ def test_what_is_drawn_are_the_data_and_a_simulation(fitted, written):
     panels, motion = {}, jj.simulate(fit.scene, START, ts=TS)
     for figure in figures:
         panels.setdefault(figure.axes[0].get_ylabel(), figure)
-    assert {f"{run}: {name}" for run in ("run 0", "held out, run 0") for name in ("x", "heading")} <= set(captions(path))
-    for name, label, sigma in (("x", "x in m", 0.01), ("heading", "heading in SI units", float(fit.sigma["heading"]))):
+    assert {f"{run}: {name}" for run in ("run 0", "held out, run 0") for name in ("x", "heading")} <= set(
+        captions(path)
+    )
+    for name, label, sigma in (
+        ("x", "x in m", 0.01),
+        ("heading", "heading in SI units", float(fit.sigma["heading"])),
+    ):
         above, below = panels[label].axes
         dots, line = (of.get_xydata() for of in above.lines)
         assert_array_equal(dots, np.stack([TS, data.values[name]], axis=1))  # a missing sample has no dot
         assert np.isfinite(dots).all() == (name == "heading")
         assert_allclose(line[:, 1], np.asarray(motion[name])[np.isin(TS, line[:, 0])], rtol=0, atol=1e-7)
         assert len(line) >= np.isfinite(data.values[name]).sum()
-        assert_allclose(below.lines[-1].get_ydata(), (np.asarray(motion[name]) - data.values[name]) / sigma, atol=1e-3)
+        assert_allclose(
+            below.lines[-1].get_ydata(), (np.asarray(motion[name]) - data.values[name]) / sigma, atol=1e-3
+        )
 
 
 def test_report_loads_nothing_and_is_small(written):
@@ -131,7 +170,9 @@ def test_runs_held_out_are_predicted(fitted, written):
     for name, line in zip(("heading", "x"), lines, strict=True):
         error = np.asarray(motion[name]) - np.asarray(other.values[name])
         assert line.startswith(f"`{name}` of held out, run 0")
-        assert float(re.search(r"rms of (\S+);", line)[1]) == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=6e-3)
+        assert float(re.search(r"rms of (\S+);", line)[1]) == pytest.approx(
+            np.sqrt(np.nanmean(error**2)), rel=6e-3
+        )
 
 
 def test_a_report_without_matplotlib_has_all_words_and_says_what_to_install(fitted, tmp_path, monkeypatch):
@@ -146,7 +187,10 @@ def test_a_report_without_matplotlib_has_all_words_and_says_what_to_install(fitt
 
 
 def test_many_long_runs_stay_below_two_megabytes(tmp_path):
-    runs = [measured(seed, {"x_rate": -0.5 - 0.01 * seed, "heading_rate": 0.9}, jnp.linspace(0.0, 4.0, 3001)) for seed in range(30)]
+    runs = [
+        measured(seed, {"x_rate": -0.5 - 0.01 * seed, "heading_rate": 0.9}, jnp.linspace(0.0, 4.0, 3001))
+        for seed in range(30)
+    ]
     fit = jj.fit(TRUTH.replace(offset=0.26), runs, free=("offset",))
     fit.report(tmp_path / "fit.html", runs[:30], held_out=measured(40))
     assert (tmp_path / "fit.html").stat().st_size < 2e6
@@ -230,7 +274,8 @@ def test_report_answers_what_it_cannot_write(fitted, tmp_path):
         fit.report(tmp_path / "fit.html", profiles=True)
 
 
-# Profiles of unknowns against fits with the unknown held; shares of information against variances with changed sigmas; predictions of other runs.
+# Profiles of unknowns against fits with the unknown held; shares of information against variances with
+# changed sigmas; predictions of other runs.
 
 
 RISE = 3.841458820694124  # 95 % quantile of chi-square with one degree of freedom
@@ -238,14 +283,23 @@ RISE = 3.841458820694124  # 95 % quantile of chi-square with one degree of freed
 
 def run(start=START, sigma=0.01, noise: int | None = 0, unknown=("heading_rate",), **more) -> jj.Experiment:
     motion, generator = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(noise or 0)
-    values = {name: np.asarray(motion[name]) + (0 if noise is None else 0.01 * generator.normal(size=41)) for name in ("x", "heading")}
+    values = {
+        name: np.asarray(motion[name]) + (0 if noise is None else 0.01 * generator.normal(size=41))
+        for name in ("x", "heading")
+    }
     return jj.Experiment(TS, values, sigma, start=start, unknown_start=unknown, **more)
 
 
 def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error():
     sensor = Sensor("heading", gain=jj.Estimate(1.1), bias=jj.Estimate(0.1))
     motion, noise = jj.simulate(TRUTH, START, ts=TS), np.random.default_rng(2)
-    data = jj.Experiment(TS, {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)}, 0.05, start=START, sensors={"shown": sensor})
+    data = jj.Experiment(
+        TS,
+        {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)},
+        0.05,
+        start=START,
+        sensors={"shown": sensor},
+    )
     fit = jj.fit(TRUTH, data)
     for one in fit.profiles(data).values():
         e = fit[one.name]
@@ -257,7 +311,8 @@ def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error()
 
 @pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
 def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(sigma):
-    # few and noisy samples, so that the profile is no parabola; more of them where they are to tell the sigmas, too
+    # few and noisy samples, so that the profile is no parabola; more of them where they are to tell the
+    # sigmas, too
     ts, names, skew = (TS[::10], ("x",), 0.1) if sigma else (TS[::5], ("x", "heading"), 0.04)
     motion, noise = jj.simulate(TRUTH, START, ts=ts), np.random.default_rng(4)
     values = {name: np.asarray(motion[name]) + (sigma or 0.05) * noise.normal(size=len(ts)) for name in names}
@@ -272,8 +327,14 @@ def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(
         if sigma:
             rise = float(held.chi_square - fit.chi_square)
         else:  # 2 F = 2 sum n log sigma, of sigmas that allow for no unknowns
-            likeliest = [{e.channel: e.rms * float(found.sigma[e.channel]) for e in found.residual_summary()} for found in (held, fit)]
-            rise = sum(2 * len(ts) * np.log(likeliest[0][name] / likeliest[1][name]) for name in names) / fit.statistics.of_rise[0]
+            likeliest = [
+                {e.channel: e.rms * float(found.sigma[e.channel]) for e in found.residual_summary()}
+                for found in (held, fit)
+            ]
+            rise = (
+                sum(2 * len(ts) * np.log(likeliest[0][name] / likeliest[1][name]) for name in names)
+                / fit.statistics.of_rise[0]
+            )
         assert rise == pytest.approx(RISE, rel=0.02)
     assert any(one.is_closed)
 
@@ -297,7 +358,7 @@ def test_profiles_answer_wrong_names_and_other_data():
         fit.profiles(run(unknown=()))
 
 
-# What informs which unknown. --------------------------------------------------------------------------------------------
+# What informs which unknown. --------------------------------------------------------------------------------
 
 
 def shares(fit, runs):
@@ -321,13 +382,20 @@ def test_a_share_is_by_how_much_the_variance_falls_with_the_weight_of_the_sample
                 of_run["heading"] *= slower
         elif where == "a sample":
             sigma[0]["x"][25] *= slower
-        runs = [run(start, s, None, correlation_time=memory) for start, s in zip((START, other), sigma, strict=True)]
+        runs = [
+            run(start, s, None, correlation_time=memory)
+            for start, s in zip((START, other), sigma, strict=True)
+        ]
         return jj.fit(TRUTH, runs, ("offset", "inertia")), runs
 
     fit, runs = fitted(0.0, "")
     found = shares(fit, runs)
     assert_allclose(found.of_runs.sum(axis=1), 1.0, rtol=1e-9)
-    told = {"run 1": found.of_runs[:, 1], "heading": found.of_channels["heading"], "a sample": found.of_samples[0]["x"][:, 25]}
+    told = {
+        "run 1": found.of_runs[:, 1],
+        "heading": found.of_channels["heading"],
+        "a sample": found.of_samples[0]["x"][:, 25],
+    }
     for where, share in told.items():
         if memory and where == "a sample":
             continue  # with a memory, the sample after it is whitened with the sigma of this one
@@ -349,13 +417,13 @@ def test_the_span_that_holds_half_of_the_information_is_the_shortest_one():
     found = shares(fit, data)
     told = sum(of[0] for of in found.of_samples[0].values())
     _, begin, end = found.half(0)
-    inside = lambda a, b: told[(a - 1e-9 <= TS) & (b + 1e-9 >= TS)].sum()  # noqa: E731
+    inside = lambda a, b: told[(a - 1e-9 <= TS) & (b + 1e-9 >= TS)].sum()
     assert inside(begin, end) >= 0.5 * told.sum() * (1 - 1e-8)
     shorter = end - begin - 0.1
     assert max(inside(a, a + shorter) for a in TS) < 0.5 * told.sum()
 
 
-# Runs held out. ---------------------------------------------------------------------------------------------------------
+# Runs held out. ---------------------------------------------------------------------------------------------
 
 
 def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
@@ -366,15 +434,34 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
         values = {"x": np.asarray(motion["x"]) + 0.01 * noise.normal(size=41)}
         values["gyro"] = 1.1 * np.asarray(motion["heading_rate"]) + bias + 0.01 * noise.normal(size=41)
         begin = start | {"heading_rate": start["heading_rate"] + 0.05}
-        return jj.Experiment(TS, values, {"x": 0.01, "gyro": None}, start=begin, unknown_start=("heading_rate",), sensors={"gyro": gyro})
+        return jj.Experiment(
+            TS,
+            values,
+            {"x": 0.01, "gyro": None},
+            start=begin,
+            unknown_start=("heading_rate",),
+            sensors={"gyro": gyro},
+        )
 
-    fit = jj.fit(TRUTH.replace(offset=0.3), [with_gyro(START, 0.02, 0), with_gyro({"x_rate": -0.8, "heading_rate": 0.4}, -0.03, 1)], ("offset",))
+    fit = jj.fit(
+        TRUTH.replace(offset=0.3),
+        [with_gyro(START, 0.02, 0), with_gyro({"x_rate": -0.8, "heading_rate": 0.4}, -0.03, 1)],
+        ("offset",),
+    )
     other = with_gyro({"x_rate": -0.5, "heading_rate": 0.6}, 0.05, 2)
     (found,) = fit.predict(other)
     # the same by a fit whose shared unknowns are known
     known = Sensor("heading_rate", gain=float(fit["gyro.gain"].value), bias=jj.Estimate(0.0))
     by_hand = jj.fit(
-        fit.scene, jj.Experiment(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
+        fit.scene,
+        jj.Experiment(
+            TS,
+            other.values,
+            other.sigma | {"gyro": None},
+            start=other.start,
+            unknown_start=("heading_rate",),
+            sensors={"gyro": known},
+        ),
     )
     for name, sigma in (("x", 0.01), ("gyro", float(by_hand.sigma["gyro"]))):
         assert_allclose(found[name].error, sigma * by_hand.residuals[0][name], atol=2e-5)
@@ -386,7 +473,12 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
 
 def test_runs_held_out_that_cannot_be_predicted_are_answered():
     fit = jj.fit(TRUTH, run(unknown=()), ("offset",))
-    scaled = jj.Experiment(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": Sensor("heading_rate", gain=jj.Estimate(1.0))})
+    scaled = jj.Experiment(
+        TS,
+        {"gyro": np.zeros(41)},
+        0.01,
+        start=START,
+        sensors={"gyro": Sensor("heading_rate", gain=jj.Estimate(1.0))},
+    )
     with pytest.raises(ValueError, match=r"runs held out share `gyro\.gain`, which was not estimated"):
         fit.predict(scaled)
-

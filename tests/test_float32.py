@@ -1,8 +1,10 @@
-"""In single precision: motions, accelerations and gradients are right to what float32 holds, and nothing turns into float64 on the way.
+"""In single precision: motions, accelerations and gradients are right to what float32 holds, and nothing
+turns into float64 on the way.
 
-The precision is chosen before JAX starts, so that all of it runs in one process of its own; its findings come back as JSON. By default it looks at the skate;
-at other models, reductions, a verification and a motion that nothing continues where slow tests run. Motions are integrated by machine code, which
-works in double precision and rounds what it returns, and by XLA, which works in single precision.
+The precision is chosen before JAX starts, so that all of it runs in one process of its own; its findings come
+back as JSON. By default it looks at the skate; at other models, reductions, a verification and a motion that
+nothing continues where slow tests run. Motions are integrated by machine code, which works in double
+precision and rounds what it returns, and by XLA, which works in single precision.
 """
 
 import json
@@ -162,7 +164,9 @@ print(json.dumps(found))
 @pytest.fixture(scope="module")
 def single(request):
     """What the program above found in a process with 32-bit floats."""
-    slow = any(item.path == request.path and item.get_closest_marker("slow") for item in request.session.items)
+    slow = any(
+        item.path == request.path and item.get_closest_marker("slow") for item in request.session.items
+    )
     source = Path(jj.__file__).parents[1]
     environment = os.environ | {
         "JAX_ENABLE_X64": "0",
@@ -171,7 +175,9 @@ def single(request):
         "PYTHONPATH": os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")]),
     }
     text = json.dumps([NAMES if slow else NAMES[:1], TS.tolist(), slow])
-    run = subprocess.run([sys.executable, "-c", PROGRAM], input=text, env=environment, capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-c", PROGRAM], input=text, env=environment, capture_output=True, text=True
+    )
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout.splitlines()[-1])
 
@@ -180,7 +186,12 @@ def single(request):
 def compared(request, single):
     """The model's name, what 32-bit floats gave, and the scene and its motion with 64-bit floats."""
     scene = MODELS[request.param]()
-    return request.param, single[request.param], scene, jj.simulate(scene, scene.example, ts=TS, rtol=1e-10, atol=1e-10)
+    return (
+        request.param,
+        single[request.param],
+        scene,
+        jj.simulate(scene, scene.example, ts=TS, rtol=1e-10, atol=1e-10),
+    )
 
 
 def test_single_precision_gives_nothing_but_single_precision(compared):
@@ -204,16 +215,23 @@ def test_motions_in_single_precision_follow_those_in_double_precision(compared):
     assert found["drift"] <= SINGLE
 
 
-@pytest.mark.parametrize(("name", "oracle"), [("skate", skate), ("chaplygin-sleigh", chaplygin_sleigh)], ids=["skate", "chaplygin-sleigh"])
+@pytest.mark.parametrize(
+    ("name", "oracle"),
+    [("skate", skate), ("chaplygin-sleigh", chaplygin_sleigh)],
+    ids=["skate", "chaplygin-sleigh"],
+)
 def test_skate_and_sleigh_follow_their_closed_forms_in_single_precision(name, oracle, single):
-    motion = oracle.motion(np.concatenate([[0.0], TS]), **oracle.RUN)  # both models' defaults and examples are the runs of the oracles
+    motion = oracle.motion(
+        np.concatenate([[0.0], TS]), **oracle.RUN
+    )  # both models' defaults and examples are the runs of the oracles
     expected = np.stack([motion["x"], motion["y"], motion["th"]], axis=-1)[1:]
     for q in single[name]["q"]:
         assert relative_error(q, expected) <= SINGLE
 
 
 def test_batches_events_and_records_are_right_in_single_precision(single):
-    # of a force that grows to F within 1 s: x = F t^3/12 up to then, and x = F (1/12 + (t - 1)/4 + (t - 1)^2/4) after it
+    # of a force that grows to F within 1 s: x = F t^3/12 up to then, and x = F (1/12 + (t - 1)/4 + (t -
+    # 1)^2/4) after it
     F, found = np.array([2.0, 4.0, 8.0]), single["arrivals"]
     s = (-1 + np.sqrt(1 + 4 * (4 / F - 1 / 3))) / 2
     slopes = 2 / F / (1 + 2 * s)  # with respect to the mass of 2 kg
@@ -243,7 +261,9 @@ def test_result_codes_hold_in_single_precision(single):
 
 
 def test_values_that_contradict_each_other_are_refused_in_single_precision(single):
-    assert single["contradiction"].startswith("the start of `Skate` violates constraint `edge`: residual 0.1 remains")  # not moved, as if it were round-off
+    assert single["contradiction"].startswith(
+        "the start of `Skate` violates constraint `edge`: residual 0.1 remains"
+    )  # not moved, as if it were round-off
 
 
 def test_increments_below_the_last_digit_of_a_state_add_up(single):
@@ -265,7 +285,8 @@ def test_rows_that_depend_on_each_other_do_so_at_rounded_coordinates(single):
 
 
 def test_a_motion_that_nothing_continues_ends_soon_in_single_precision(single):
-    # once a coordinate stood still just before the rows that stop the motion, while time went on in 100,000 short steps
+    # once a coordinate stood still just before the rows that stop the motion, while time went on in 100,000
+    # short steps
     code, steps = single["no motion continues"]
     assert code == results.STEP_TOO_SMALL
     assert steps < 1000

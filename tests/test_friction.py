@@ -1,4 +1,6 @@
-"""Contacts with friction: slip, sticking, flight and impacts, against closed forms and independent integrations."""
+"""Contacts with friction: slip, sticking, flight and impacts, against closed forms and independent
+integrations.
+"""
 
 import equinox as eqx
 import jax
@@ -24,13 +26,24 @@ class Ball(jj.Scene):
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                self.mass,
+                self.radius,
+                position=[q.x, q.y, q.z],
+                orientation=jj.quaternion_to_matrix(q.attitude),
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, self.g),)
 
     def contacts(self, pose):
-        return {"cloth": jj.ball_contact(pose["ball"], self.radius, height="row", friction=self.friction, restitution=self.bounce)}
+        return {
+            "cloth": jj.ball_contact(
+                pose["ball"], self.radius, height="row", friction=self.friction, restitution=self.bounce
+            )
+        }
 
 
 SLIDING = {"z": 0.0285, "x_rate": 3.0, "y_rate": 0.4, "attitude_omega": (5.0, -12.0, 20.0)}
@@ -64,21 +77,33 @@ def test_derivatives_of_slip():
 
 
 def test_derivatives_across_slip():
-    """A ball thrown aside of its slip: place, speed and end of slip by the closed form; derivatives of both orders by friction."""
+    """A ball thrown aside of its slip: place, speed and end of slip by the closed form; derivatives of both
+    orders by friction.
+    """
     speed, spin, radius, T = jnp.array([8.0, -0.4]), 15.0, 0.108, 3.0
 
     def right(friction):
         slip = speed + jnp.array([0.0, radius * spin])
         end = 2 * jnp.linalg.norm(slip) / (7 * friction * G)
         rolling = speed - 2 / 7 * slip
-        return jnp.concatenate([speed * end - friction * G * slip / jnp.linalg.norm(slip) * end**2 / 2 + rolling * (T - end), rolling, end[None]])
+        return jnp.concatenate(
+            [
+                speed * end - friction * G * slip / jnp.linalg.norm(slip) * end**2 / 2 + rolling * (T - end),
+                rolling,
+                end[None],
+            ]
+        )
 
     def found(friction):
         start = {"z": radius, "x_rate": speed[0], "y_rate": speed[1], "attitude_omega_x": spin}
         motion = jj.simulate(Ball(mass=6.8, radius=radius, friction=friction), start, ts=[T], **FINE)
-        return jnp.stack([*(motion[name][-1] for name in ("x", "y", "x_rate", "y_rate")), motion.phases.ts[1]])
+        return jnp.stack(
+            [*(motion[name][-1] for name in ("x", "y", "x_rate", "y_rate")), motion.phases.ts[1]]
+        )
 
-    (second, first), (second_right, first_right) = (with_value(jax.jacfwd, jax.jacfwd(f))(0.12) for f in (found, right))
+    (second, first), (second_right, first_right) = (
+        with_value(jax.jacfwd, jax.jacfwd(f))(0.12) for f in (found, right)
+    )
     assert_allclose(first, first_right, rtol=1e-9, atol=5e-9)
     assert_allclose(second, second_right, rtol=1e-8, atol=5e-6)  # of up to 312
 
@@ -102,7 +127,11 @@ def test_slip_that_begins_under_a_force_that_turns():
     scene = PulledBlock(mass=1.0, friction=0.3, g=10.0)
     motion = jj.simulate(scene, {"z": 0.0285}, t0=-0.1, ts=[0.5], rtol=1e-10, atol=1e-10)
     x, y, vx, vy = (motion[name][0] for name in ("x", "y", "x_rate", "y_rate"))
-    assert_allclose([x, y, jnp.hypot(vx, vy), jnp.arctan2(vy, vx)], [0.04826763, 0.03778878, 0.37065575, 0.86840719], atol=6e-9)
+    assert_allclose(
+        [x, y, jnp.hypot(vx, vy), jnp.arctan2(vy, vx)],
+        [0.04826763, 0.03778878, 0.37065575, 0.86840719],
+        atol=6e-9,
+    )
     assert motion.accepted + motion.rejected <= 600
 
 
@@ -111,7 +140,9 @@ def test_bounces_and_rest():
 
     def tenth(numbers):
         bounce, height = numbers
-        return jj.simulate(Ball(bounce=bounce), {"z": 0.0285 + height, "x_rate": 0.1}, t1=2.6, rtol=1e-10, atol=1e-10).phases.ts[9]
+        return jj.simulate(
+            Ball(bounce=bounce), {"z": 0.0285 + height, "x_rate": 0.1}, t1=2.6, rtol=1e-10, atol=1e-10
+        ).phases.ts[9]
 
     numbers = jnp.array([0.7, 1.0])
     slopes, time = with_value(jax.jacfwd, tenth)(numbers)
@@ -119,7 +150,9 @@ def test_bounces_and_rest():
     assert_allclose(slopes, [8.53571984478680, 1.23680223182063], rtol=1e-10)
     motion = jj.simulate(Ball(bounce=0.7), {"z": 1.0285}, ts=[2.5, 3.0], rtol=1e-10, atol=1e-10)
     last = np.flatnonzero(np.isfinite(motion.phases.ts))[-1]
-    assert_allclose(motion.phases.ts[last], 2.55863396558581, atol=1e-6)  # closed where the rebound is below 1e-6 m/s
+    assert_allclose(
+        motion.phases.ts[last], 2.55863396558581, atol=1e-6
+    )  # closed where the rebound is below 1e-6 m/s
     assert motion.phase("cloth").tolist() == [0, 1]
     assert_allclose(motion["z"][-1], 0.0285, rtol=1e-14)
 
@@ -139,7 +172,11 @@ class OnSphere(Ball):
 
     def contacts(self, pose):
         ground = jj.Sphere(1 - self.radius, side="outside")
-        return {"ground": jj.ball_contact(pose["ball"], self.radius, ground=ground, height="row", friction=self.friction)}
+        return {
+            "ground": jj.ball_contact(
+                pose["ball"], self.radius, ground=ground, height="row", friction=self.friction
+            )
+        }
 
 
 def test_a_ball_slips_and_lifts_off_a_sphere():
@@ -171,7 +208,17 @@ class DoublePendulum(jj.Scene):
     def contacts(self, pose):
         lower = pose["lower"]
         floor = jj.Plane(origin=(0.0, 0.0, -np.cos(0.95) - np.cos(0.64)))
-        return {"floor": jj.Contact(lower, lower.place((0.0, 0.0, -0.5)), floor, "row", friction=0.5, restitution=0.7, impact=self.impact)}
+        return {
+            "floor": jj.Contact(
+                lower,
+                lower.place((0.0, 0.0, -0.5)),
+                floor,
+                "row",
+                friction=0.5,
+                restitution=0.7,
+                impact=self.impact,
+            )
+        }
 
 
 @pytest.mark.parametrize(
@@ -184,13 +231,17 @@ class DoublePendulum(jj.Scene):
 )
 def test_impacts_along_the_impulse(law, rates, gained):
     scene = type("Law", (DoublePendulum,), {"impact": law})()
-    motion = jj.simulate(scene, {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}, ts=[1e-9, 1e-2], **FINE)
+    motion = jj.simulate(
+        scene, {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}, ts=[1e-9, 1e-2], **FINE
+    )
     assert_allclose(motion.u[0], rates, rtol=1e-7)
     assert_allclose(motion.energies().kinetic - 1.3488015753419331, gained, rtol=1e-10)
 
 
 def test_an_impact_that_would_gain_energy_has_a_code():
-    """By Newton's restitution and Coulomb's law on the slip afterwards the pendulum would gain 2.13 J (Kane's paradox)."""
+    """By Newton's restitution and Coulomb's law on the slip afterwards the pendulum would gain 2.13 J (Kane's
+    paradox).
+    """
     start = {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}
     back = {"a": 0.95 + 0.26e-3, "b": 0.64 + 2.45e-3}
     struck = jj.simulate(DoublePendulum(), start | back, t1=0.1)
@@ -206,7 +257,9 @@ class Energetic(Ball):
 
     def bodies(self, t, q):
         moments = jnp.asarray(self.moments) * self.mass * self.radius**2
-        return {"ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))
+        }
 
     def contacts(self, pose):
         law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
@@ -218,14 +271,22 @@ def test_a_ball_bounces_with_spin(kind):
     """v (2, -3) m/s, spin -10 rad/s: it grips where mu = 0.5."""
     for friction, speed, spin in ((0.05, 1.73, 3.5), (0.5, 1.28571428571428571, 25.7142857142857143)):
         scene = kind(mass=1.0, radius=0.05, friction=friction, bounce=0.8, g=0.0)
-        motion = jj.simulate(scene, {"z": 0.05, "x_rate": 2.0, "z_rate": -3.0, "attitude_omega_y": -10.0}, ts=[0.1])
-        assert_allclose([motion[name][0] for name in ("x_rate", "z_rate", "attitude_omega_y")], [speed, 2.4, spin], rtol=1e-12)
+        motion = jj.simulate(
+            scene, {"z": 0.05, "x_rate": 2.0, "z_rate": -3.0, "attitude_omega_y": -10.0}, ts=[0.1]
+        )
+        assert_allclose(
+            [motion[name][0] for name in ("x_rate", "z_rate", "attitude_omega_y")],
+            [speed, 2.4, spin],
+            rtol=1e-12,
+        )
 
 
 def test_impacts_where_slip_turns_have_a_code_along_the_impulse():
     """Of a body whose moments differ, by an impulse across its axes."""
     scene = Energetic(moments=(0.2, 0.4, 0.5), radius=0.05, bounce=0.8)
-    motion = jj.simulate(scene, {"z": 0.1, "x_rate": 2.0, "z_rate": -3.0, "attitude_omega": (8.0, -10.0, 3.0)}, ts=[0.1])
+    motion = jj.simulate(
+        scene, {"z": 0.1, "x_rate": 2.0, "z_rate": -3.0, "attitude_omega": (8.0, -10.0, 3.0)}, ts=[0.1]
+    )
     assert "slip reverses during an impact" in str(motion)
 
 
@@ -242,7 +303,11 @@ class Rod(jj.Scene):
         return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
-        return {"end": jj.Contact(pose["rod"], pose["rod"].place((-0.5, 0.0, 0.0)), height="row", friction=self.friction)}
+        return {
+            "end": jj.Contact(
+                pose["rod"], pose["rod"].place((-0.5, 0.0, 0.0)), height="row", friction=self.friction
+            )
+        }
 
 
 def test_coulombs_law_has_no_answer_for_a_rod():
@@ -250,7 +315,11 @@ def test_coulombs_law_has_no_answer_for_a_rod():
     most = (1 + 3 * np.cos(1.0) ** 2) / (3 * np.sin(1.0) * np.cos(1.0))
     assert_allclose(most, 1.375259396131)
     start = {"a": 1.0, "z": 0.5 * np.sin(1.0)}
-    for speed, friction, right in ((-1.0, 0.9995 * most, True), (-1.0, 1.0005 * most, False), (1.0, 2 * most, True)):
+    for speed, friction, right in (
+        (-1.0, 0.9995 * most, True),
+        (-1.0, 1.0005 * most, False),
+        (1.0, 2 * most, True),
+    ):
         motion = jj.simulate(Rod(friction), start | {"x_rate": speed}, ts=[1e-3])
         assert (motion.result == 0) == right
 
@@ -295,7 +364,11 @@ class Coin(jj.Scene):
         return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
-        return {"rim": jj.disc_contact(pose["coin"], 0.012, height="row", friction=self.friction, restitution=self.bounce)}
+        return {
+            "rim": jj.disc_contact(
+                pose["coin"], 0.012, height="row", friction=self.friction, restitution=self.bounce
+            )
+        }
 
 
 class RollingCoin(Coin):
@@ -307,10 +380,17 @@ class RollingCoin(Coin):
 
 def test_a_coin_with_much_friction_rolls_as_one_that_cannot_slip():
     rolling, lean = RollingCoin(), 0.3
-    start = jj.start(rolling, attitude=(np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0), attitude_omega_y=30.0, near={"z": 0.0115})
+    start = jj.start(
+        rolling,
+        attitude=(np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0),
+        attitude_omega_y=30.0,
+        near={"z": 0.0115},
+    )
     kept = jj.simulate(rolling, start, ts=[0.5], **FINE)
     names = (*rolling.coordinate_names.entries, *rolling.speed_names.entries)
-    free = jj.simulate(Coin(friction=1e6), dict(zip(names, [*start.q, *start.u], strict=True)), ts=[0.5], **FINE)
+    free = jj.simulate(
+        Coin(friction=1e6), dict(zip(names, [*start.q, *start.u], strict=True)), ts=[0.5], **FINE
+    )
     assert not np.isfinite(free.phases.ts).any()
     assert_allclose(free.q[0][:7], kept.q[0], atol=1e-9)
     assert_allclose(free.u[0], kept.u[0], atol=1e-8)
@@ -320,7 +400,12 @@ def test_dropped_coins():
     """Energy is lost where an impact or friction takes it; lanes give what each motion gives alone."""
     attitude = np.random.default_rng(0).normal(size=(4, 4))
     attitude /= np.linalg.norm(attitude, axis=1)[:, None]
-    starts = {"z": np.full(4, 0.03), "attitude": attitude, "x_rate": np.array([0.2, -0.1, 0.3, 0.0]), "attitude_omega_y": np.full(4, 10.0)}
+    starts = {
+        "z": np.full(4, 0.03),
+        "attitude": attitude,
+        "x_rate": np.array([0.2, -0.1, 0.3, 0.0]),
+        "attitude_omega_y": np.full(4, 10.0),
+    }
     how = {"ts": [0.1, 0.15], "rtol": 1e-10, "atol": 1e-10}
     together = jj.rollout(Coin(), starts, **how)
     for i in range(4):
@@ -340,15 +425,34 @@ class Kept(Ball):
 
 
 def test_bad_contacts():
-    with pytest.raises(ValueError, match="cannot leave the ground; give the body a coordinate for its height, and write height="):
+    with pytest.raises(
+        ValueError,
+        match="cannot leave the ground; give the body a coordinate for its height, and write height=",
+    ):
         Kept()
-    with pytest.raises(ValueError, match=r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative"
+        ),
+    ):
         jj.simulate(Ball(friction=-0.1), SLIDING, t1=0.1)
-    with pytest.raises(ValueError, match=r"the restitution of contact `cloth` of `Ball` is 1\.2, expected a number from 0 to 1"):
+    with pytest.raises(
+        ValueError,
+        match=r"the restitution of contact `cloth` of `Ball` is 1\.2, expected a number from 0 to 1",
+    ):
         jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
-    with pytest.raises(ValueError, match=r"contacts with friction, which cannot run back in time from t0 = 0\.0 to t1 = -1\.0 s"):
+    with pytest.raises(
+        ValueError,
+        match=r"contacts with friction, which cannot run back in time from t0 = 0\.0 to t1 = -1\.0 s",
+    ):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
-    with pytest.raises(ValueError, match="`linearize` needs contacts that roll and constraints that hold, but `cloth` of `Ball` may slip"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            "`linearize` needs contacts that roll and constraints that hold, but `cloth` of `Ball` may slip"
+        ),
+    ):
         jj.linearize(Ball(), {"z": 0.0285})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body starts below the ground" in below.message
@@ -360,16 +464,25 @@ def test_bad_contacts():
 
 
 def test_a_start_in_contact():
-    """A body that strikes at its start rebounds; one at rest on a slope slips at once where friction cannot hold it."""
+    """A body that strikes at its start rebounds; one at rest on a slope slips at once where friction cannot
+    hold it.
+    """
     struck = jj.simulate(Ball(bounce=0.5), {"z": 0.0285, "z_rate": -1.0}, ts=[0.01])
     assert_allclose(struck["z_rate"], [0.5 - G * 0.01], rtol=1e-12)
 
     class OnSlope(Ball):
         def contacts(self, pose):
-            return {"slope": jj.ball_contact(pose["ball"], self.radius, ground=jj.Plane(tilt=0.5), height="row", friction=self.friction)}
+            return {
+                "slope": jj.ball_contact(
+                    pose["ball"], self.radius, ground=jj.Plane(tilt=0.5), height="row", friction=self.friction
+                )
+            }
 
     height = 0.0285 / np.cos(0.5)
-    for friction, phase in ((0.9 * 2 / 7 * np.tan(0.5), 2), (1.1 * 2 / 7 * np.tan(0.5), 1)):  # mu = (2/7) tan beta divides
+    for friction, phase in (
+        (0.9 * 2 / 7 * np.tan(0.5), 2),
+        (1.1 * 2 / 7 * np.tan(0.5), 1),
+    ):  # mu = (2/7) tan beta divides
         motion = jj.simulate(OnSlope(friction=friction), {"z": height}, ts=[0.3], **FINE)
         assert motion.phase("slope").tolist() == [phase]
         along = G * (np.sin(0.5) - friction * np.cos(0.5)) if phase == 2 else 5 / 7 * G * np.sin(0.5)
@@ -398,9 +511,19 @@ class Cart(jj.Scene):
 
 
 def test_carts_fall_as_they_may():
-    """Runners strike, open, slip, turn round and stick together; without loss of energy but by friction and impacts, whatever the start."""
+    """Runners strike, open, slip, turn round and stick together; without loss of energy but by friction and
+    impacts, whatever the start.
+    """
     draw, count = np.random.default_rng(0), 100
-    start = {name: draw.uniform(*reach, count) for name, reach in {"z": (0.85, 1), "pitch": (-0.5, 0.5), "x_rate": (-2, 2), "pitch_rate": (-2, 2)}.items()}
+    start = {
+        name: draw.uniform(*reach, count)
+        for name, reach in {
+            "z": (0.85, 1),
+            "pitch": (-0.5, 0.5),
+            "x_rate": (-2, 2),
+            "pitch_rate": (-2, 2),
+        }.items()
+    }
     found = jj.rollout(Cart(bounce=0.5), start, ts=[0.5, 1.0], rtol=1e-8, atol=1e-8, max_transitions=400)
     assert np.all(found.lanes.result == 0)
     balance = jax.jit(jax.vmap(lambda lane: lane.energies().balance))(found.lanes)
@@ -412,13 +535,17 @@ def test_a_cart_brakes_on_two_runners():
     motion = jj.simulate(Cart(), {"z": 0.5, "x_rate": 0.6}, ts=[0.1, 0.3], **FINE)
     forces = motion.contact_forces()
     weight = 10 * G
-    assert_allclose([forces["front"].normal[0], forces["rear"].normal[0]], [0.55 * weight, 0.45 * weight], rtol=1e-10)
+    assert_allclose(
+        [forces["front"].normal[0], forces["rear"].normal[0]], [0.55 * weight, 0.45 * weight], rtol=1e-10
+    )
     assert_allclose(motion["x"][-1], 0.6**2 / (2 * 0.3 * G), rtol=1e-9)
     assert [motion.phase(name).tolist() for name in ("front", "rear")] == [[2, 1], [2, 1]]
 
 
 def test_a_cart_falls_onto_two_runners():
-    """The front strikes and slips; as the rear strikes, both stick, whatever round-off says of the slip that is left."""
+    """The front strikes and slips; as the rear strikes, both stick, whatever round-off says of the slip that
+    is left.
+    """
     for ts in ([1.0], [0.1, 0.2, 1.0]):
         motion = jj.simulate(Cart(), {"z": 0.6, "pitch": 0.1, "x_rate": 0.3}, ts=ts, rtol=1e-9, atol=1e-9)
         assert [motion.phase(name)[-1] for name in ("front", "rear")] == [1, 1]
@@ -453,7 +580,13 @@ def test_a_block_sticks_and_slips_on_a_belt():
     slope, value = with_value(jax.jacfwd, period)(0.4)
     assert_allclose(value, 1.360846391399, rtol=1e-10)
     assert_allclose(slope, 4.14018082448, rtol=1e-7)
-    with pytest.raises(ValueError, match=r"static friction of contact `belt` of `Belt` is 0\.2, expected at least the coefficient of sliding, 0\.25"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"static friction of contact `belt` of `Belt` is 0\.2, expected at least the coefficient of"
+            r" sliding, 0\.25"
+        ),
+    ):
         jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)
 
 
@@ -472,13 +605,18 @@ class Kerb(jj.Scene):
     def contacts(self, pose):
         edge = jj.Cylinder(1e-7, axis=(0.0, 1.0, 0.0), origin=(0.0, 0.0, 0.02), side="outside")
         law = {"height": "row", "friction": 5.0}
-        return {"floor": jj.ball_contact(pose["ball"], 0.1, **law), "edge": jj.ball_contact(pose["ball"], 0.1, ground=edge, **law)}
+        return {
+            "floor": jj.ball_contact(pose["ball"], 0.1, **law),
+            "edge": jj.ball_contact(pose["ball"], 0.1, ground=edge, **law),
+        }
 
 
 @pytest.mark.parametrize(("speed", "climbs"), [(0.617, False), (0.618, True)])
 def test_a_kerb(speed, climbs):
     """The floor lets go as the edge is struck; speed after/before 6/7; 0.617656862667 m/s climb."""
-    motion = jj.simulate(Kerb(), {"x": -0.3, "z": 0.1, "x_rate": speed, "turn_rate": 10 * speed}, ts=[3.0], max_transitions=200)
+    motion = jj.simulate(
+        Kerb(), {"x": -0.3, "z": 0.1, "x_rate": speed, "turn_rate": 10 * speed}, ts=[3.0], max_transitions=200
+    )
     assert_allclose(motion.phases.lost[0] / (0.7 * speed**2), 1 - (6 / 7) ** 2, rtol=1e-5)
     assert motion.phases.modes[:, 1].tolist() == [0, 1]
     assert bool(motion["x"][0] > 0) == climbs
@@ -488,7 +626,9 @@ def test_an_elastic_bounce_runs_backwards():
     """From the end with reversed speeds the ball comes back to where it began."""
     smooth = Ball(bounce=1.0, friction=0.0)
     there = jj.simulate(smooth, {"z": 0.3, "x_rate": 0.5, "z_rate": -0.2}, ts=[0.6], **FINE)
-    back = {name: there[name][0] for name in "xyz"} | {f"{name}_rate": -there[f"{name}_rate"][0] for name in "xyz"}
+    back = {name: there[name][0] for name in "xyz"} | {
+        f"{name}_rate": -there[f"{name}_rate"][0] for name in "xyz"
+    }
     begun = jj.simulate(smooth, back, ts=[0.6], **FINE)
     assert np.isfinite(there.phases.ts).sum() == 1
     ends = [begun[name][0] for name in ("x", "z", "x_rate", "z_rate")]
@@ -503,12 +643,17 @@ class Scooter(Ball):
 
     def bodies(self, t, q):
         moments = jnp.array([0.02, 0.05, 0.06]) * self.mass
-        return {"ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))
+        }
 
     def contacts(self, pose):
         law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
         centres = {"front": jnp.array([0.4, 0.0, 0.0]), "rear": jnp.array([-0.4, 0.0, 0.0])}
-        return {name: jj.ball_contact(pose["ball"], self.radius, centre=centres[name], **law) for name in self.order}
+        return {
+            name: jj.ball_contact(pose["ball"], self.radius, centre=centres[name], **law)
+            for name in self.order
+        }
 
 
 SCOOTER = {"mass": 1.0, "radius": 0.1, "friction": 0.4, "bounce": 0.3}
@@ -543,7 +688,9 @@ def test_contacts_that_close_together_strike_together():
     for order in (("front", "rear"), ("rear", "front")):
         motion = jj.simulate(Scooter(**SCOOTER, order=order), start, ts=[0.21], **FINE)
         assert motion.phase("front")[0] == motion.phase("rear")[0] == 0
-        ends.append([motion[name][0] for name in ("z", "z_rate", "y_rate", "attitude_omega_x", "attitude_omega_y")])
+        ends.append(
+            [motion[name][0] for name in ("z", "z_rate", "y_rate", "attitude_omega_x", "attitude_omega_y")]
+        )
     fall = np.sqrt(2 * 0.2 / G)
     rebound = 0.3 * G * fall
     after = 0.21 - fall
@@ -560,18 +707,26 @@ class TippeTop(Ball):
 
     def bodies(self, t, q):
         moments = jnp.array([4.0, 4.0, 3.6]) * self.mass * self.radius**2 / 10
-        return {"ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))
+        }
 
     def contacts(self, pose):
         law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
-        return {"cloth": jj.ball_contact(pose["ball"], self.radius, centre=jnp.array([0.0, 0.0, 0.004]), **law)}
+        return {
+            "cloth": jj.ball_contact(pose["ball"], self.radius, centre=jnp.array([0.0, 0.0, 0.004]), **law)
+        }
 
 
 def test_jelletts_integral_of_a_tippe_top():
     """L.(point of contact - mass centre) is constant while it flies, slips and rolls, and in impacts."""
     top = TippeTop(mass=0.02, radius=0.02, friction=0.25, bounce=0.4)
     attitude = np.array([np.cos(0.1), np.sin(0.1), 0.0, 0.0])
-    start = {"z": 0.02 - 0.004 * np.cos(0.2) + 0.001, "attitude": attitude, "attitude_omega": (0.0, 3.0, 150.0)}
+    start = {
+        "z": 0.02 - 0.004 * np.cos(0.2) + 0.001,
+        "attitude": attitude,
+        "attitude_omega": (0.0, 3.0, 150.0),
+    }
     motion = jj.simulate(top, start, ts=np.linspace(0.0, 1.0, 41), max_transitions=300, **FINE)
     integral = []
     for q, u in zip(motion.q, motion.u, strict=True):
@@ -591,7 +746,9 @@ def test_a_disc_that_falls_flat_has_a_code(bounce):
 
 
 class Braked(jj.Scene):
-    """A ball in a plane that slides over a strip which brakes it, and is stopped at a line; `at`, `width`: of strip or line."""
+    """A ball in a plane that slides over a strip which brakes it, and is stopped at a line; `at`, `width`: of
+    strip or line.
+    """
 
     friction: float = jj.parameter(0.3)
     at: float = jj.parameter(0.5)
@@ -609,7 +766,10 @@ class Braked(jj.Scene):
 
     def loads(self, motion):
         there = (motion.q.x > self.at) & (motion.q.x < self.at + self.width)
-        return (jj.gravity(motion, G), jj.generalized_force(motion, x_rate=self.push - self.brake * jnp.where(there, 1.0, 0.0)))
+        return (
+            jj.gravity(motion, G),
+            jj.generalized_force(motion, x_rate=self.push - self.brake * jnp.where(there, 1.0, 0.0)),
+        )
 
     def events(self, motion):
         far = motion.q.x - self.at
@@ -629,7 +789,9 @@ def _braked(friction, at, brake, width=0.02, v=4.0, T=0.3):
 def test_a_strip_is_met_by_a_body_that_slips():
     def end(numbers):
         friction, at = numbers
-        return jj.simulate(Braked(friction=friction, at=at, brake=20.0), {"z": 0.5, "x_rate": 4.0}, ts=[0.3])["x"][-1]
+        return jj.simulate(Braked(friction=friction, at=at, brake=20.0), {"z": 0.5, "x_rate": 4.0}, ts=[0.3])[
+            "x"
+        ][-1]
 
     numbers = jnp.array([0.3, 0.5])
     expected = with_value(jax.jacfwd, lambda x: _braked(x[0], x[1], 20.0))(numbers)
@@ -637,7 +799,14 @@ def test_a_strip_is_met_by_a_body_that_slips():
         for found, right in zip(with_value(derivative, end)(numbers), expected, strict=True):
             assert_allclose(found, right, atol=1e-12)
     places = jnp.linspace(0.3, 0.7, 16)
-    lanes = jj.rollout(Braked(brake=20.0), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, ts=[0.3], rtol=1e-6, atol=1e-6).lanes
+    lanes = jj.rollout(
+        Braked(brake=20.0),
+        {"z": 0.5, "x_rate": 4.0},
+        parameters={"at": places},
+        ts=[0.3],
+        rtol=1e-6,
+        atol=1e-6,
+    ).lanes
     assert_allclose(lanes.q_end[:, 0], _braked(0.3, places, 20.0), atol=1e-12)
     assert_array_equal(lanes.crossings, 2)
 
@@ -645,14 +814,18 @@ def test_a_strip_is_met_by_a_body_that_slips():
 @pytest.mark.parametrize("line", ["wall", "window"])
 def test_an_event_ends_a_motion_that_slips(line):
     places, width = jnp.linspace(0.3, 1.1, 16), 1e-4
-    lanes = jj.rollout(Braked(line=line, width=width), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, t1=1.5).lanes
+    lanes = jj.rollout(
+        Braked(line=line, width=width), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, t1=1.5
+    ).lanes
     assert_allclose(lanes.q_end[:, 0], places - (width if line == "window" else 0.0), atol=1e-9)
 
 
 def test_a_body_with_friction_sets_off_from_its_event():
     """Sliding, and pushed from rest."""
     start = {"z": 0.5, "x_rate": jnp.array([1.0, 0.0, 0.0, -1.0])}
-    lanes = jj.rollout(Braked(line="away", at=0.0), start, parameters={"push": jnp.array([0.0, 1.0, -1.0, 0.0])}, t1=0.5).lanes
+    lanes = jj.rollout(
+        Braked(line="away", at=0.0), start, parameters={"push": jnp.array([0.0, 1.0, -1.0, 0.0])}, t1=0.5
+    ).lanes
     assert lanes.event.tolist() == [-1, -1, 0, 0]
     assert_allclose(lanes.t_end, [0.5, 0.5, 0.0, 0.0], atol=1e-9)
     assert_allclose(lanes.q_end[1, 0], 0.125 / 1.4, atol=1e-9)

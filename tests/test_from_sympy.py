@@ -1,4 +1,6 @@
-"""Scenes from SymPy's mechanics: their accelerations are those of SymPy's own equations; and the page on scenes from other tools."""
+"""Scenes from SymPy's mechanics: their accelerations are those of SymPy's own equations; and the page on
+scenes from other tools.
+"""
 
 import functools
 import inspect
@@ -29,17 +31,31 @@ INPUTS = {"torque": 0.7}
 def accelerations_of(kane, values, t, q, u, inputs):
     """udot by SymPy's unconstrained equations and the rates of its velocity rows.
 
-    SymPy eliminates its rows by a symbolic LU, whose pivots may vanish unseen; here its matrices are solved together,
+    SymPy eliminates its rows by a symbolic LU, whose pivots may vanish unseen; here its matrices are solved
+    together,
 
         M udot - A' lambda = f,   A udot = -b.
     """
-    free = mechanics.KanesMethod(kane._inertial, list(kane.q), list(kane.u), _kinematic(kane), bodies=kane.bodies, forcelist=kane.forcelist)
+    free = mechanics.KanesMethod(
+        kane._inertial,
+        list(kane.q),
+        list(kane.u),
+        _kinematic(kane),
+        bodies=kane.bodies,
+        forcelist=kane.forcelist,
+    )
     free.kanes_equations()
     A, b = (kane._k_dnh, kane._f_dnh) if kane._f_dnh else (sympy.zeros(0, len(u)), sympy.zeros(0, 1))
-    functions = {x.func.__name__: x for x in mechanics.find_dynamicsymbols(free.forcing) if not isinstance(x, sympy.Derivative)}
+    functions = {
+        x.func.__name__: x
+        for x in mechanics.find_dynamicsymbols(free.forcing)
+        if not isinstance(x, sympy.Derivative)
+    }
     known = dict(zip([*kane.q, *kane.u], [*q, *u], strict=True)) | values | {mechanics.dynamicsymbols._t: t}
     known |= {functions[name]: value for name, value in inputs.items() if name in functions}
-    matrices = [mechanics.msubs(matrix, kane.kindiffdict()) for matrix in (free.mass_matrix, free.forcing, A, b)]
+    matrices = [
+        mechanics.msubs(matrix, kane.kindiffdict()) for matrix in (free.mass_matrix, free.forcing, A, b)
+    ]
     M, f, A, b = sympy.lambdify(list(known), matrices, cse=True)(*map(float, known.values()))
     count = len(b)
     A = np.reshape(A, (count, len(u)))
@@ -49,7 +65,9 @@ def accelerations_of(kane, values, t, q, u, inputs):
 
 @pytest.fixture
 def system():
-    """A cart on rails with a rod hinged to it, as SymPy's `System`: a push as an input, an actuator, a row; and the values of its constants."""
+    """A cart on rails with a rod hinged to it, as SymPy's `System`: a push as an input, an actuator, a row;
+    and the values of its constants.
+    """
     if not hasattr(mechanics, "System"):
         pytest.skip("this SymPy has no `System`")
     q1, q2, u1, u2, push = mechanics.dynamicsymbols("q1 q2 u1 u2 push")
@@ -104,7 +122,10 @@ def errors(kane, scene, values, count=3, inputs=None):
     found = []
     for t, q, u in zip(*jj.sample_states(scene, count), strict=True):
         expected = accelerations_of(kane, values, t, q[: len(kane.q)], u, inputs)
-        found.append(np.max(np.abs(np.asarray(jj.accelerations(scene, t, q, u, inputs).udot) - expected)) / np.max(np.abs(expected)))
+        found.append(
+            np.max(np.abs(np.asarray(jj.accelerations(scene, t, q, u, inputs).udot) - expected))
+            / np.max(np.abs(expected))
+        )
     assert len(found) == count
     return max(found)
 
@@ -125,7 +146,9 @@ def test_constants_are_parameters_that_can_be_replaced_and_differentiated():
     longer = scene.replace(l=0.9)
     assert errors(kane, longer, values | {systems.length: 0.9}) < tolerance("closed_form")
     # udot = -g sin(q)/l at rest, without damping and torque at t = 0
-    slope = jax.jit(jax.grad(lambda length: jj.accelerations(scene.replace(l=length), 0.0, [0.4], [0.0]).udot[0]))(0.6)
+    slope = jax.jit(
+        jax.grad(lambda length: jj.accelerations(scene.replace(l=length), 0.0, [0.4], [0.0]).udot[0])
+    )(0.6)
     assert slope == pytest.approx(9.81 * np.sin(0.4) / 0.6**2, rel=1e-12)
     with pytest.raises(ValueError, match="`m`"):
         scene.replace(m=-1.0)  # SymPy's symbol is positive
@@ -135,7 +158,9 @@ def test_a_function_of_time_that_is_no_coordinate_is_an_input():
     kane, origin, values = systems.pendulum()
     scene = jj.from_sympy(kane, origin, values)()
     assert scene.inputs.entries == ("torque",)
-    without, with_torque = (jj.accelerations(scene, 0.0, [0.4], [0.3], {"torque": x}).udot[0] for x in (0.0, 0.5))
+    without, with_torque = (
+        jj.accelerations(scene, 0.0, [0.4], [0.3], {"torque": x}).udot[0] for x in (0.0, 0.5)
+    )
     assert with_torque - without == pytest.approx(0.5 / (1.3 * 0.6**2), rel=1e-12)
 
 
@@ -171,8 +196,15 @@ def test_velocities_that_agree_where_rows_are_met_need_no_coordinates():
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of SymPy 1.13
 def test_joints_of_sympy_become_a_scene_when_their_equations_are_formed():
     m, length, loads = sympy.symbols("m l loads", positive=True)
-    ceiling, first, second = mechanics.Body("ceiling"), mechanics.Body("first", mass=m), mechanics.Body("second", mass=2 * m)
-    joints = mechanics.PinJoint("J1", ceiling, first, child_point=length * first.y), mechanics.PinJoint("J2", first, second, child_point=length * second.y)
+    ceiling, first, second = (
+        mechanics.Body("ceiling"),
+        mechanics.Body("first", mass=m),
+        mechanics.Body("second", mass=2 * m),
+    )
+    joints = (
+        mechanics.PinJoint("J1", ceiling, first, child_point=length * first.y),
+        mechanics.PinJoint("J2", first, second, child_point=length * second.y),
+    )
     for body in (first, second):
         body.apply_force(-loads * ceiling.y)
     method = mechanics.JointsMethod(ceiling, *joints)
@@ -203,10 +235,45 @@ def test_functions_of_many_kinds_have_values_on_jax():
     from jourdain_jax.importers.formulas import Formulas
 
     x, y = sympy.symbols("x y")
-    one = [sympy.sin(x), sympy.cos(x), sympy.tan(x), sympy.asin(x), sympy.acos(x), sympy.atan(x), sympy.sinh(x), sympy.cosh(x), sympy.tanh(x)]
-    one += [sympy.asinh(x), sympy.acosh(1 + x), sympy.atanh(x), sympy.exp(x), sympy.log(x), sympy.sqrt(x), 1 / sympy.sqrt(x), x**-3, x**y, sympy.Abs(-x * y)]
-    one += [sympy.atan2(y, x), sympy.sign(-x), sympy.Heaviside(x), sympy.Min(x, y), sympy.Max(x, y), sympy.floor(7 * y), sympy.ceiling(7 * y), sympy.erf(x)]
-    one += [sympy.Piecewise((x, x > y), (y**2, sympy.Or(y > 5, sympy.Ne(x, y))), (0, True)), sympy.sinc(x), sympy.pi * x + sympy.E, sympy.Rational(1, 3) * y]
+    one = [
+        sympy.sin(x),
+        sympy.cos(x),
+        sympy.tan(x),
+        sympy.asin(x),
+        sympy.acos(x),
+        sympy.atan(x),
+        sympy.sinh(x),
+        sympy.cosh(x),
+        sympy.tanh(x),
+    ]
+    one += [
+        sympy.asinh(x),
+        sympy.acosh(1 + x),
+        sympy.atanh(x),
+        sympy.exp(x),
+        sympy.log(x),
+        sympy.sqrt(x),
+        1 / sympy.sqrt(x),
+        x**-3,
+        x**y,
+        sympy.Abs(-x * y),
+    ]
+    one += [
+        sympy.atan2(y, x),
+        sympy.sign(-x),
+        sympy.Heaviside(x),
+        sympy.Min(x, y),
+        sympy.Max(x, y),
+        sympy.floor(7 * y),
+        sympy.ceiling(7 * y),
+        sympy.erf(x),
+    ]
+    one += [
+        sympy.Piecewise((x, x > y), (y**2, sympy.Or(y > 5, sympy.Ne(x, y))), (0, True)),
+        sympy.sinc(x),
+        sympy.pi * x + sympy.E,
+        sympy.Rational(1, 3) * y,
+    ]
     values = Formulas({"all": one}, [x, y]).values({x: 0.3, y: 0.8})["all"]
     expected = [float(expression.subs({x: 0.3, y: 0.8})) for expression in one]
     assert_allclose(np.array(values, float), expected, rtol=1e-12)
@@ -229,37 +296,88 @@ def _with(kane, origin, values, **changes):
 
 t, y = (mechanics.dynamicsymbols._t, mechanics.dynamicsymbols("y"))
 BAD = {
-    "input-in-a-position": (lambda: systems.moved_pivot(), r"`pivot\(t\)` occurs in a position.*neither a coordinate nor a speed"),
+    "input-in-a-position": (
+        lambda: systems.moved_pivot(),
+        r"`pivot\(t\)` occurs in a position.*neither a coordinate nor a speed",
+    ),
     "no-value": (lambda: (*systems.pendulum()[:2], {systems.m: 1.0}), r"no value for `c`, `g`, `l`"),
-    "value-of-nothing": (lambda: _with(*systems.pendulum(), gg=1.0), r"`values` names `gg`.*did you mean `g`"),
-    "value-is-no-number": (lambda: _with(*systems.pendulum(), m="heavy"), r"value of `m` is the text 'heavy'"),
+    "value-of-nothing": (
+        lambda: _with(*systems.pendulum(), gg=1.0),
+        r"`values` names `gg`.*did you mean `g`",
+    ),
+    "value-is-no-number": (
+        lambda: _with(*systems.pendulum(), m="heavy"),
+        r"value of `m` is the text 'heavy'",
+    ),
     "values-are-a-list": (lambda: (*systems.pendulum()[:2], [1.0]), r"`values` is a list"),
     "no-origin": (lambda: (systems.pendulum()[0], None, {}), r"`origin` is `None`"),
-    "another-object": (lambda: (3.0, None, {}), r"`system` is a float, expected a `KanesMethod` or a `System`"),
+    "another-object": (
+        lambda: (3.0, None, {}),
+        r"`system` is a float, expected a `KanesMethod` or a `System`",
+    ),
     "no-bodies": (lambda: systems.pendulum(bodies=None), r"does not know its bodies"),
     "empty-bodies": (lambda: systems.pendulum(bodies=[]), r"no body with a mass that moves"),
     "no-kinematic-equations": (lambda: systems.pendulum(kd_eqs=None), r"no kinematic equations"),
-    "mass-in-time": (lambda: systems.pendulum(mass=2 + sympy.sin(t)), r"mass of body `bob` is `sin\(t\) \+ 2`"),
-    "unknown-function": (lambda: systems.pendulum_with(systems.given_function), r"function `f` in `.*` has no counterpart in JAX"),
-    "function-not-in-jax": (lambda: systems.pendulum_with(lambda q, N: sympy.besselj(0, q) * N.x), r"function `besselj`"),
-    "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is not a real number"),
-    "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not their rates"),
-    "rate-of-an-input": (lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x), r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate"),
+    "mass-in-time": (
+        lambda: systems.pendulum(mass=2 + sympy.sin(t)),
+        r"mass of body `bob` is `sin\(t\) \+ 2`",
+    ),
+    "unknown-function": (
+        lambda: systems.pendulum_with(systems.given_function),
+        r"function `f` in `.*` has no counterpart in JAX",
+    ),
+    "function-not-in-jax": (
+        lambda: systems.pendulum_with(lambda q, N: sympy.besselj(0, q) * N.x),
+        r"function `besselj`",
+    ),
+    "imaginary-load": (
+        lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x),
+        r"`I` is not a real number",
+    ),
+    "acceleration-in-a-load": (
+        lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x),
+        r"not their rates",
+    ),
+    "rate-of-an-input": (
+        lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x),
+        r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate",
+    ),
 }
 
 LOOSE = mechanics.ReferenceFrame("loose")
 CHANGED = {
-    "no-orientation": (systems.slipping_disc, lambda kane: setattr(kane.bodies[0], "frame", LOOSE), r"frame `loose` has no orientation in `N`"),
+    "no-orientation": (
+        systems.slipping_disc,
+        lambda kane: setattr(kane.bodies[0], "frame", LOOSE),
+        r"frame `loose` has no orientation in `N`",
+    ),
     "two-angular-velocities": (
         systems.double_pendulum,
-        lambda kane: kane.bodies[1].frame.set_ang_vel(kane.bodies[0].frame, 3 * kane.u[0] * kane.bodies[0].frame.z),
+        lambda kane: kane.bodies[1].frame.set_ang_vel(
+            kane.bodies[0].frame, 3 * kane.u[0] * kane.bodies[0].frame.z
+        ),
         r"an angular velocity that disagrees with its orientation",
     ),
-    "inertia-that-changes": (systems.double_pendulum, lambda kane: _inertia_in(kane, kane._inertial), r"body `rod 2` in its own frame `B` changes in time"),
-    "inertia-in-a-loose-frame": (systems.double_pendulum, lambda kane: _inertia_in(kane, LOOSE), r"body `rod 2` is stated in a frame without orientation"),
-    "two-bodies-of-a-name": (systems.double_pendulum, lambda kane: setattr(kane, "_bodylist", [kane.bodies[0]] * 2), r"two bodies are called `rod 1`"),
+    "inertia-that-changes": (
+        systems.double_pendulum,
+        lambda kane: _inertia_in(kane, kane._inertial),
+        r"body `rod 2` in its own frame `B` changes in time",
+    ),
+    "inertia-in-a-loose-frame": (
+        systems.double_pendulum,
+        lambda kane: _inertia_in(kane, LOOSE),
+        r"body `rod 2` is stated in a frame without orientation",
+    ),
+    "two-bodies-of-a-name": (
+        systems.double_pendulum,
+        lambda kane: setattr(kane, "_bodylist", [kane.bodies[0]] * 2),
+        r"two bodies are called `rod 1`",
+    ),
 }
-BAD |= {name: (functools.partial(_changed, system, change), message) for name, (system, change, message) in CHANGED.items()}
+BAD |= {
+    name: (functools.partial(_changed, system, change), message)
+    for name, (system, change, message) in CHANGED.items()
+}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -289,5 +407,8 @@ def test_the_code_of_the_page_runs(tmp_path, monkeypatch, capsys):
     scope = run(PAGE)
     printed = capsys.readouterr().out
     assert printed.count("reached the end of its span") == text.count("print(motion)")
-    assert [scope[name]().coordinate_names.entries[0] for name in ("Disc", "Robot", "Arm")] == ["yaw", "x", "shoulder"]
-
+    assert [scope[name]().coordinate_names.entries[0] for name in ("Disc", "Robot", "Arm")] == [
+        "yaw",
+        "x",
+        "shoulder",
+    ]

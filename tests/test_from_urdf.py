@@ -1,4 +1,6 @@
-"""Scenes from URDF files: equations of closed forms and of scenes written by hand, shapes, and what is refused."""
+"""Scenes from URDF files: equations of closed forms and of scenes written by hand, shapes, and what is
+refused.
+"""
 
 from pathlib import Path
 
@@ -13,7 +15,10 @@ import jourdain_jax as jj
 from jourdain_jax.equations import unconstrained_equations
 
 ROBOT = (Path(__file__).parents[1] / "docs" / "howto" / "robot.urdf").read_text(encoding="utf-8")
-LINK = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+LINK = (
+    '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0"'
+    ' izz="1"/></inertial></link>'
+)
 ARM = """
 <robot name="arm">
   <link name="ground"><visual><geometry><box size="1 1 0.1"/></geometry></visual></link>
@@ -61,9 +66,15 @@ class ByHand(jj.Scene):
         middle = start + first @ jnp.array([0.0, 0.0, 0.4]) + second @ jnp.stack([0.0, 0.0, q.slide])
         third = second @ jj.rot_x(q.follow)
         return {
-            "first": jj.RigidBody(2.0, own @ matrix @ own.T, start + first @ jnp.array([0.1, 0.2, 0.3]), first),
-            "second": jj.RigidBody(1.5, jnp.array([0.02, 0.03, 0.04]), middle + second @ jnp.array([0.0, 0.1, 0.0]), second),
-            "third": jj.RigidBody(0.5, 0.01 * jnp.ones(3), middle + second @ jnp.array([0.3, 0.0, 0.0]), third),
+            "first": jj.RigidBody(
+                2.0, own @ matrix @ own.T, start + first @ jnp.array([0.1, 0.2, 0.3]), first
+            ),
+            "second": jj.RigidBody(
+                1.5, jnp.array([0.02, 0.03, 0.04]), middle + second @ jnp.array([0.0, 0.1, 0.0]), second
+            ),
+            "third": jj.RigidBody(
+                0.5, 0.01 * jnp.ones(3), middle + second @ jnp.array([0.3, 0.0, 0.0]), third
+            ),
         }
 
     def loads(self, motion):
@@ -89,7 +100,11 @@ def test_a_file_is_read_as_its_text_is(tmp_path):
     scene = jj.from_urdf(path)()
     assert type(scene).__name__ == "Arm"
     assert scene.domain == {"turn": (-1.0, 2.0), "slide": (0.0, 0.5)}
-    assert sorted(scene.bodies(0.0, scene.coordinate_names.view(jnp.zeros(3)))) == ["first", "second", "third"]
+    assert sorted(scene.bodies(0.0, scene.coordinate_names.view(jnp.zeros(3)))) == [
+        "first",
+        "second",
+        "third",
+    ]
 
 
 def test_numbers_of_the_file_are_parameters():
@@ -112,7 +127,9 @@ def test_numbers_of_the_file_are_parameters():
 def test_the_place_of_a_link_is_a_parameter_where_it_is_to_be_one():
     arm = jj.from_urdf(ARM, free=["frame", "third"])()
     q = jnp.array([0.3, 0.2, 0.5])
-    slope = jax.jacobian(lambda origin: jj.pose_at(arm.replace(frame_origin=origin), 0.0, q)["third"].position)(arm.frame_origin)
+    slope = jax.jacobian(
+        lambda origin: jj.pose_at(arm.replace(frame_origin=origin), 0.0, q)["third"].position
+    )(arm.frame_origin)
     assert_allclose(slope, jj.pose_at(arm, 0.0, q)["first"].orientation, atol=1e-12)
     assert_allclose(arm.third_origin, [0.3, 0.0, 0.0])
 
@@ -127,20 +144,26 @@ class Robot(jj.from_urdf(ROBOT, base="planar", motors=["left", "right"])):
 def test_a_locked_joint_holds_its_link_where_it_would_have_moved_it():
     arm, held = jj.from_urdf(ARM)(), jj.from_urdf(ARM, locked={"turn": 0.3})()
     assert held.coordinate_names.entries == ("slide", "follow")
-    own, expected = jj.pose_at(held, 0.0, jnp.array([0.2, 0.5])), jj.pose_at(arm, 0.0, jnp.array([0.3, 0.2, 0.5]))
+    own, expected = (
+        jj.pose_at(held, 0.0, jnp.array([0.2, 0.5])),
+        jj.pose_at(arm, 0.0, jnp.array([0.3, 0.2, 0.5])),
+    )
     assert_allclose(own["third"].position, expected["third"].position, atol=1e-15)
     assert_allclose(own["third"].orientation, expected["third"].orientation, atol=1e-15)
 
 
 def test_a_link_without_mass_may_be_fixed_and_a_joint_be_called_as_a_coordinate_of_the_base():
     tool = _joint("fixed", "b", "c", '<mimic joint="x"/>', "k")
-    scene = jj.from_urdf(_robot(_joint("continuous", name="x"), tool, WEIGHT.format(0), links="ab"), base="planar")()
+    scene = jj.from_urdf(
+        _robot(_joint("continuous", name="x"), tool, WEIGHT.format(0), links="ab"), base="planar"
+    )()
     assert scene.coordinate_names.entries == ("x", "y", "heading", "x_")
     assert (float(scene.c_mass), float(scene.c_inertia[2])) == (0.0, 1.0)
 
 
 def test_a_robot_on_two_wheels_follows_its_closed_form():
-    # with v, omega of the middle of the axle, mass centre of the platform at -d, half track b, wheels of J, A:
+    # with v, omega of the middle of the axle, mass centre of the platform at -d, half track b, wheels of J,
+    # A:
     #   (m + 2 mw + 2 J/r^2) vdot + m d omega^2 = (tr + tl)/r,   (I + 2 J b^2/r^2) omegadot - m d v omega = b (tr - tl)/r
     r, b, c, J, A, mw = 0.033, 0.08, 0.0002, 0.000018, 0.00001, 0.03
     platform, lidar, x_platform, x_lidar = 1.2, 0.15, -0.03, -0.05
@@ -153,8 +176,16 @@ def test_a_robot_on_two_wheels_follows_its_closed_form():
     tl, tr = left - c * u_left, right - c * u_right
     vdot = ((tr + tl) / r + moment * omega**2) / (m + 2 * mw + 2 * J / r**2)
     omegadot = (b * (tr - tl) / r - moment * v * omega) / (turning + 2 * J * b**2 / r**2)
-    along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    expected = [*(vdot * along + v * omega * across), omegadot, (vdot - b * omegadot) / r, (vdot + b * omegadot) / r]
+    along, across = (
+        np.array([np.cos(heading), np.sin(heading)]),
+        np.array([-np.sin(heading), np.cos(heading)]),
+    )
+    expected = [
+        *(vdot * along + v * omega * across),
+        omegadot,
+        (vdot - b * omegadot) / r,
+        (vdot + b * omegadot) / r,
+    ]
     found = jj.accelerations(robot, 0.0, q, u, {"left_motor": left, "right_motor": right}).udot
     assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
@@ -162,18 +193,34 @@ def test_a_robot_on_two_wheels_follows_its_closed_form():
 @pytest.mark.parametrize("base", ["fixed", "planar", "free"])
 def test_a_base_is_as_free_as_it_is_said_to_be(base):
     expected = {"fixed": (), "planar": ("x_rate", "y_rate", "heading_rate")}
-    expected["free"] = ("x_rate", "y_rate", "z_rate", "attitude_omega_x", "attitude_omega_y", "attitude_omega_z")
-    assert jj.from_urdf(ROBOT, base=base)().speed_names.entries == (*expected[base], "left_rate", "right_rate")
+    expected["free"] = (
+        "x_rate",
+        "y_rate",
+        "z_rate",
+        "attitude_omega_x",
+        "attitude_omega_y",
+        "attitude_omega_z",
+    )
+    assert jj.from_urdf(ROBOT, base=base)().speed_names.entries == (
+        *expected[base],
+        "left_rate",
+        "right_rate",
+    )
 
 
 @pytest.mark.parametrize(("kind", "speeds"), [("floating", 6), ("planar", 3)])
 def test_joints_of_several_coordinates_move_as_a_free_body(kind, speeds):
     axis = '<axis xyz="0 0.6 0.8"/>'
-    text = f'<robot name="r"><link name="a"/>{LINK.format("b")}<joint name="j" type="{kind}"><parent link="a"/><child link="b"/>{axis}</joint></robot>'
+    text = (
+        f'<robot name="r"><link name="a"/>{LINK.format("b")}<joint name="j" type="{kind}"><parent'
+        f' link="a"/><child link="b"/>{axis}</joint></robot>'
+    )
     scene = jj.from_urdf(text)()
     t, q, u = (x[0] for x in jj.sample_states(scene, 1))
     assert len(u) == speeds
-    assert relative_error(unconstrained_equations(scene, t, q, u).M, np.eye(speeds)) < tolerance("round_off")  # 1 kg, 1 kg m^2
+    assert relative_error(unconstrained_equations(scene, t, q, u).M, np.eye(speeds)) < tolerance(
+        "round_off"
+    )  # 1 kg, 1 kg m^2
     motion = jj.motion_at(scene, t, q, u)["b"]
     if kind == "planar":
         normal = np.array([0.0, 0.6, 0.8])
@@ -186,7 +233,11 @@ def test_shapes_are_drawn_where_the_file_has_them():
     scene = jj.from_urdf(ARM)()
     pose = jj.pose_at(scene, 0.0, [0.3, 0.2, 0.5])
     looks = scene.visuals(pose)
-    assert {name: [look.kind for look in found] for name, found in looks.items()} == {"": ["box", "ellipsoid"], "first": ["box"], "second": ["cylinder"]}
+    assert {name: [look.kind for look in found] for name, found in looks.items()} == {
+        "": ["box", "ellipsoid"],
+        "first": ["box"],
+        "second": ["cylinder"],
+    }
     first = looks["first"][0]
     assert (first.colour, first.opacity) == ("#ff8000", 0.5)
     assert_allclose(first.position, [-0.1, -0.2, -0.1], atol=1e-12)  # from the mass centre
@@ -200,7 +251,9 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
     folder = tmp_path / "my_robot" / "urdf"
     (tmp_path / "my_robot" / "meshes").mkdir(parents=True)
     folder.mkdir()
-    (tmp_path / "my_robot" / "meshes" / "part.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (tmp_path / "my_robot" / "meshes" / "part.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
     mesh = '<visual><geometry><mesh filename="{}" scale="0.1 0.1 0.2"/></geometry></visual>'
     names = ("package://my_robot/meshes/part.obj", "../meshes/part.obj")
     link = LINK.format("b").replace("</link>", "".join(map(mesh.format, names)) + "</link>")
@@ -213,7 +266,9 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
 
 def test_elements_that_are_left_out_are_listed():
     extra = '<gazebo/><gazebo/><transmission name="t"/></robot>'
-    mesh = '<visual><geometry><mesh filename="package://gone/part.stl"/></geometry></visual></inertial></link>'
+    mesh = (
+        '<visual><geometry><mesh filename="package://gone/part.stl"/></geometry></visual></inertial></link>'
+    )
     text = ROBOT.replace("</robot>", extra).replace("</inertial>\n  </link>", mesh, 1)
     with pytest.warns(UserWarning, match=r"omitted `gazebo` \(2\), `transmission`; `ignore` silences this"):
         jj.from_urdf(text)
@@ -222,7 +277,9 @@ def test_elements_that_are_left_out_are_listed():
 
 
 def _joint(kind="revolute", parent="a", child="b", inside="", name="j"):
-    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+    )
 
 
 def _robot(*parts, links="ab"):
@@ -230,36 +287,78 @@ def _robot(*parts, links="ab"):
 
 
 NO_INERTIA = '<link name="c"><inertial><mass value="1"/></inertial></link>'
-WEIGHT = '<link name="c"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+WEIGHT = (
+    '<link name="c"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0"'
+    ' izz="1"/></inertial></link>'
+)
 BAD = {
     "no-file": ("nowhere.urdf", r"nowhere.urdf: cannot be read \(No such file"),
     "no-path": (None, r"`path` is `None`, expected the path of a URDF file"),
     "no-xml": ("<robot", r"not valid XML"),
     "another-root": ("<mujoco/>", r"its root is `mujoco`, expected `robot`"),
-    "xacro": ('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:property name="x"/></robot>', r"elements of xacro"),
+    "xacro": (
+        '<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:property name="x"/></robot>',
+        r"elements of xacro",
+    ),
     "no-links": ("<robot/>", r"it has no links"),
     "unknown-base": (_robot(_joint()), r"`base` is 'loose', expected one of 'fixed', 'planar', 'free'"),
-    "unknown-type": (_robot(_joint("revolut")), r"joint `j` is of the type `revolut`; did you mean `revolute`"),
-    "unknown-link": (_robot(_joint(child="bb")), r"joint `j` has the child `bb`, which is not a link; did you mean `b`"),
+    "unknown-type": (
+        _robot(_joint("revolut")),
+        r"joint `j` is of the type `revolut`; did you mean `revolute`",
+    ),
+    "unknown-link": (
+        _robot(_joint(child="bb")),
+        r"joint `j` has the child `bb`, which is not a link; did you mean `b`",
+    ),
     "no-parent": (_robot(_joint().replace('<parent link="a"/>', "")), r"joint `j` has no `parent`"),
     "two-parents": (_robot(_joint(), _joint(name="k")), r"link `b` is the child of joints `j` and `k`"),
     "two-roots": (_robot(), r"links `a`, `b` have none"),
     "loop": (_robot(_joint(), _joint(parent="b", child="a", name="k")), r"there is a loop"),
-    "loop-apart": (_robot(_joint(), _joint(parent="b", child="a", name="k"), links="abc"), r"link `a` is part of a loop"),
-    "no-inertia": (_robot(_joint(child="c"), NO_INERTIA, links="a"), r"link `c` has an `inertial` without `inertia`"),
-    "no-mass-moves": (_robot(_joint(child="c"), '<link name="c"/>', links="a"), r"link `c`, moved by `j`, has no mass"),
+    "loop-apart": (
+        _robot(_joint(), _joint(parent="b", child="a", name="k"), links="abc"),
+        r"link `a` is part of a loop",
+    ),
+    "no-inertia": (
+        _robot(_joint(child="c"), NO_INERTIA, links="a"),
+        r"link `c` has an `inertial` without `inertia`",
+    ),
+    "no-mass-moves": (
+        _robot(_joint(child="c"), '<link name="c"/>', links="a"),
+        r"link `c`, moved by `j`, has no mass",
+    ),
     "negative-mass": (_robot(_joint(child="c"), WEIGHT.format(-1), links="a"), r"mass of link `c` is -1"),
-    "mass-is-no-number": (_robot(_joint(child="c"), WEIGHT.format("heavy"), links="a"), r"value of `mass` of `inertial` of link `c` is `heavy`, expected"),
-    "axis-of-two": (_robot(_joint(inside='<axis xyz="1 0"/>')), r"xyz of `axis` of joint `j` is `1 0`, expected 3 numbers"),
+    "mass-is-no-number": (
+        _robot(_joint(child="c"), WEIGHT.format("heavy"), links="a"),
+        r"value of `mass` of `inertial` of link `c` is `heavy`, expected",
+    ),
+    "axis-of-two": (
+        _robot(_joint(inside='<axis xyz="1 0"/>')),
+        r"xyz of `axis` of joint `j` is `1 0`, expected 3 numbers",
+    ),
     "axis-zero": (_robot(_joint(inside='<axis xyz="0 0 0"/>')), r"xyz of `axis` of joint `j` is zero"),
-    "friction": (_robot(_joint(inside='<dynamics friction="0.1"/>')), r'the friction of joint `j` is not supported.*ignore=\("friction",\)'),
-    "negative-damping": (_robot(_joint(inside='<dynamics damping="-1"/>')), r"damping of `dynamics` of joint `j` is -1"),
+    "friction": (
+        _robot(_joint(inside='<dynamics friction="0.1"/>')),
+        r'the friction of joint `j` is not supported.*ignore=\("friction",\)',
+    ),
+    "negative-damping": (
+        _robot(_joint(inside='<dynamics damping="-1"/>')),
+        r"damping of `dynamics` of joint `j` is -1",
+    ),
     "unknown-motor": (_robot(_joint()), r"`motors` names `jj`, which is not a joint with one coordinate"),
     "unknown-free-link": (_robot(_joint()), r"`free` names `bb`, which is not a link; did you mean `b`"),
-    "unknown-leader": (_robot(_joint(inside='<mimic joint="x"/>')), r"`mimic` of joint `j`: `x` is not a joint"),
-    "leader-of-itself": (_robot(_joint(inside='<mimic joint="j" multiplier="2"/>')), r"joint `j` mimics itself"),
+    "unknown-leader": (
+        _robot(_joint(inside='<mimic joint="x"/>')),
+        r"`mimic` of joint `j`: `x` is not a joint",
+    ),
+    "leader-of-itself": (
+        _robot(_joint(inside='<mimic joint="j" multiplier="2"/>')),
+        r"joint `j` mimics itself",
+    ),
     "nothing-moves": (_robot(_joint("fixed")), r"no joint moves a body"),
-    "unknown-locked": (_robot(_joint("planar")), r"`locked` names `j`, which is not a joint with one coordinate"),
+    "unknown-locked": (
+        _robot(_joint("planar")),
+        r"`locked` names `j`, which is not a joint with one coordinate",
+    ),
     "no-name": ("<robot><link/></robot>", r"a link has no `name`"),
     "two-names-become-one": (
         _robot(_joint(child="b-c"), _joint(child="b_c", name="k"), links=["a", "b-c", "b_c"]),
@@ -270,7 +369,12 @@ BAD = {
         r"visual of link `c` has no shape",
     ),
 }
-OPTIONS = {"unknown-base": {"base": "loose"}, "unknown-motor": {"motors": ["jj"]}, "unknown-free-link": {"free": "bb"}, "unknown-locked": {"locked": {"j": 0}}}
+OPTIONS = {
+    "unknown-base": {"base": "loose"},
+    "unknown-motor": {"motors": ["jj"]},
+    "unknown-free-link": {"free": "bb"},
+    "unknown-locked": {"locked": {"j": 0}},
+}
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -1,4 +1,6 @@
-"""One checkable fact of each scene of `docs/gallery/scenes`, and the pages that `docs/make_gallery.py` writes."""
+"""One checkable fact of each scene of `docs/gallery/scenes`, and the pages that `docs/make_gallery.py`
+writes.
+"""
 
 import ast
 import importlib
@@ -30,7 +32,11 @@ def _gallery_can_be_imported():
 def scene_of(name, **parameters) -> jj.Scene:
     """The scene in the file of this name."""
     module = importlib.import_module(f"scenes.{name}")
-    kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, jj.Scene) and kind.__module__ == module.__name__]
+    kinds = [
+        kind
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, jj.Scene) and kind.__module__ == module.__name__
+    ]
     assert len(kinds) == 1
     return kinds[0](**parameters)
 
@@ -52,9 +58,13 @@ def test_a_trailer_hitched_behind_the_axle_runs_on_the_circle_of_the_closed_form
     hitch, tongue, speed, turn = 0.2, 0.6, 0.1 * 6.0, 0.1 * 2.0 / 0.36
     radius = speed / turn
     behind = np.sqrt(radius**2 + hitch**2 - tongue**2)
-    start = jj.start(robot, left_rate=5.0, right_rate=7.0, trailer=-np.arctan2(hitch, radius) - np.arctan2(tongue, behind))
+    start = jj.start(
+        robot, left_rate=5.0, right_rate=7.0, trailer=-np.arctan2(hitch, radius) - np.arctan2(tongue, behind)
+    )
     trailer = jj.motion_at(robot, 0.0, start.q, start.u)["trailer"]
-    assert_allclose([start["heading_rate"], start["trailer_rate"]], turn, rtol=1e-12)  # it turns as fast as the robot: steady
+    assert_allclose(
+        [start["heading_rate"], start["trailer_rate"]], turn, rtol=1e-12
+    )  # it turns as fast as the robot: steady
     assert_allclose(np.linalg.norm(trailer.velocity), turn * behind, rtol=1e-12)
 
 
@@ -72,7 +82,9 @@ def test_a_tricycle_turns_its_wheels_by_their_radii_and_carries_by_its_lever():
     start = jj.start(tricycle, steer=0.5, front_rate=6.0)
     turn = 6.0 * 0.2 / np.hypot(1.1 / np.tan(0.5), 1.1)  # rad/s
     wheels = [turn * (1.1 / np.tan(0.5) + side * 0.4) / 0.2 for side in (-1, 1)]
-    assert_allclose([start["heading_rate"], start["left_rate"], start["right_rate"]], [turn, *wheels], rtol=1e-12)
+    assert_allclose(
+        [start["heading_rate"], start["left_rate"], start["right_rate"]], [turn, *wheels], rtol=1e-12
+    )
 
 
 def test_a_push_moves_a_scooter_by_its_masses_and_the_turning_of_its_wheels():
@@ -91,8 +103,12 @@ def test_a_unicycle_leans_and_pitches_by_the_eigenvalues_of_the_closed_form():
     lever, about_line = m * r + rider * (r + h), m * r**2 + rim / 2 + rider * (r + h) ** 2 + inertia[0]
     for spin in (3.0, 8.0):
         found = jj.linearize(unicycle, jj.start(unicycle, spin_rate=spin)).eigenvalues()
-        lean = np.sqrt(complex((lever * G - (rim + lever * r) * rim * spin**2 / (rim / 2 + inertia[2])) / about_line))
-        pitch = np.sqrt(rider * G * h / (rider * h**2 + inertia[1] - (rider * h * r) ** 2 / ((m + rider) * r**2 + rim)))
+        lean = np.sqrt(
+            complex((lever * G - (rim + lever * r) * rim * spin**2 / (rim / 2 + inertia[2])) / about_line)
+        )
+        pitch = np.sqrt(
+            rider * G * h / (rider * h**2 + inertia[1] - (rider * h * r) ** 2 / ((m + rider) * r**2 + rim))
+        )
         among([lean, -lean, pitch, -pitch], found)
         assert (lean.real > 0.1) == (spin < 4.45)  # the critical spin
 
@@ -101,7 +117,9 @@ def test_a_ball_at_rest_on_a_free_plate_sets_off_as_in_the_closed_form():
     plate = scene_of("ball_on_plate", stiffness=0.0, damping=0.0)
     J, m, r, x, tilt = 0.05, 0.3, 0.03, 0.12, 0.3
     start = jj.start(plate, x=x, pitch=tilt)
-    rates = dict(zip(plate.speed_names.entries, jj.accelerations(plate, 0.0, start.q, start.u).udot, strict=True))
+    rates = dict(
+        zip(plate.speed_names.entries, jj.accelerations(plate, 0.0, start.q, start.u).udot, strict=True)
+    )
     # 7/5 m r^2 s'' = m g r sin(a),   (J + m x^2) a'' = m g x cos(a),   x = r (s - a)
     pitch = m * G * x * np.cos(tilt) / (J + m * x**2)
     assert_allclose(rates["pitch_rate"], pitch, rtol=1e-12)
@@ -111,7 +129,9 @@ def test_a_ball_at_rest_on_a_free_plate_sets_off_as_in_the_closed_form():
 def test_the_pendulum_of_a_spherical_robot_swings_at_the_frequency_of_the_closed_form():
     robot = scene_of("spherical_robot")
     M, r, m, length, J = 1.0, 0.15, 1.5, 0.08, 1e-3
-    rate = np.sqrt(m * G * length / (m * length**2 + J - (m * r * length) ** 2 / ((M + m) * r**2 + 2 / 3 * M * r**2)))
+    rate = np.sqrt(
+        m * G * length / (m * length**2 + J - (m * r * length) ** 2 / ((M + m) * r**2 + 2 / 3 * M * r**2))
+    )
     among([1j * rate, -1j * rate], jj.linearize(robot, {}).state_eigenvalues())
 
 
@@ -119,7 +139,10 @@ def test_the_pendulum_of_a_spherical_robot_swings_at_the_frequency_of_the_closed
 def test_a_roller_racer_straightens_forwards_and_folds_backwards(speed):
     racer = scene_of("roller_racer", stiffness=0.0, damping=0.0)
     I1, I2, a, b = 1.5, 0.05, 0.6, 0.1
-    among([-speed * (I1 * b + I2 * a) / (I1 * b**2 + I2 * a**2)], jj.linearize(racer, {"x_rate": speed}).state_eigenvalues())
+    among(
+        [-speed * (I1 * b + I2 * a) / (I1 * b**2 + I2 * a**2)],
+        jj.linearize(racer, {"x_rate": speed}).state_eigenvalues(),
+    )
 
 
 def test_a_two_wheeled_pendulum_falls_at_the_rate_of_the_closed_form():
@@ -132,8 +155,14 @@ def test_a_two_wheeled_pendulum_falls_at_the_rate_of_the_closed_form():
 
 def test_driven_wheels_leave_the_angular_momentum_of_a_satellite():
     satellite = scene_of("satellite")
-    drive = {"torque_x": lambda t: 0.4 * jnp.sin(t), "torque_y": lambda t: -0.3 * jnp.cos(2.0 * t), "torque_z": 0.1}
-    motion = jj.simulate(satellite, jj.start(satellite, **satellite.example), t1=5.0, rtol=1e-11, atol=1e-11, inputs=drive)
+    drive = {
+        "torque_x": lambda t: 0.4 * jnp.sin(t),
+        "torque_y": lambda t: -0.3 * jnp.cos(2.0 * t),
+        "torque_z": 0.1,
+    }
+    motion = jj.simulate(
+        satellite, jj.start(satellite, **satellite.example), t1=5.0, rtol=1e-11, atol=1e-11, inputs=drive
+    )
     assert jnp.abs(motion["attitude_x"][-1]) > 0.02  # it has turned
     for name, values in motion.invariants().items():
         assert_allclose(values, values[0], atol=1e-9, err_msg=name)

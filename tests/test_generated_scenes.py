@@ -1,8 +1,9 @@
-"""Generated scenes hold every invariant of mechanics under every reduction: 200 instances in 25 structures, 5,000 behind `-m slow`.
+"""Generated scenes hold every invariant of mechanics under every reduction: 200 instances in 25 structures,
+5,000 behind `-m slow`.
 
-The normal set runs every structure's equations on NumPy, the long one compiles them. Views from moved frames and in other
-coordinates, speeds, units and orders take most of the time: the normal set has those of one structure, the long one all. A failure names structure,
-invariant, reduction and seed.
+The normal set runs every structure's equations on NumPy, the long one compiles them. Views from moved frames
+and in other coordinates, speeds, units and orders take most of the time: the normal set has those of one
+structure, the long one all. A failure names structure, invariant, reduction and seed.
 """
 
 import jax
@@ -42,20 +43,30 @@ def check(number, *, parameters, states, least, seed, compiled, looks=True):
     _EVALUATED[number] = found if not compiled else {}
     where = f"{made}; seed {seed}"
     good = admitted(found)
-    assert good.sum() >= least, f"{where}: {good.sum()} instances of {good.size} lie on the rows, away from a loss of rank"
+    assert good.sum() >= least, (
+        f"{where}: {good.sum()} instances of {good.size} lie on the rows, away from a loss of rank"
+    )
     wrong = broken(made, found)
     assert not wrong, f"{where}: {wrong}"
     for name, applies in found["applicable"].items():
         where_it_must = good & (found["sigma"] > 0.1)
-        assert name in ("privileged", "gibbs-appell") or applies[where_it_must].all(), f"{where}: `{name}` does not apply"
-    if found["well conditioned"].all():  # by probing: at single states the pivot may be too small, and then the reduction says so
+        assert name in ("privileged", "gibbs-appell") or applies[where_it_must].all(), (
+            f"{where}: `{name}` does not apply"
+        )
+    if found[
+        "well conditioned"
+    ].all():  # by probing: at single states the pivot may be too small, and then the reduction says so
         for name in ("privileged", "gibbs-appell"):
-            assert found["applicable"][name][good].mean() >= 0.9, f"{where}: `{name}` applies at {found['applicable'][name][good].sum()} of {good.sum()}"
+            assert found["applicable"][name][good].mean() >= 0.9, (
+                f"{where}: `{name}` applies at {found['applicable'][name][good].sum()} of {good.sum()}"
+            )
 
 
 @pytest.mark.parametrize("number", STRUCTURES)
 def test_a_generated_scene_holds_every_invariant(number):
-    check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number == 0)
+    check(
+        number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number == 0
+    )
 
 
 @pytest.mark.parametrize("number", STRUCTURES)
@@ -66,8 +77,34 @@ def test_a_generated_scene_holds_every_invariant_at_200_instances(number):
 def test_the_structures_contain_everything_that_can_be_generated():
     made = [recipe(number) for number in STRUCTURES]
     assert len({(r.bodies, r.rows, r.loads, r.own_speeds) for r in made}) == len(made)
-    rows = {"edge", "rod", "flat pin", "pin", "steered row", "curve", "affine row", "timed row", "driven", "constant speed", "copy", "sum"}
-    loads = {"weight", "spring", "damper", "well", "tide", "torque", "steering", "follower", "magnet", "drag", "gust", "input"}
+    rows = {
+        "edge",
+        "rod",
+        "flat pin",
+        "pin",
+        "steered row",
+        "curve",
+        "affine row",
+        "timed row",
+        "driven",
+        "constant speed",
+        "copy",
+        "sum",
+    }
+    loads = {
+        "weight",
+        "spring",
+        "damper",
+        "well",
+        "tide",
+        "torque",
+        "steering",
+        "follower",
+        "magnet",
+        "drag",
+        "gust",
+        "input",
+    }
     occurring = set().union(*(r.kinds() for r in made))
     assert {*KINDS, *rows, *loads, "homogeneous quasi-velocities", "affine quasi-velocities"} <= occurring
     assert sum(r.reversible for r in made) >= 5
@@ -75,7 +112,9 @@ def test_the_structures_contain_everything_that_can_be_generated():
 
 
 def check_lowered(number, every_speed):
-    """The scalar program of a structure against the dense path; False where it is not lowered. `every_speed`: by multipliers, not by elimination."""
+    """The scalar program of a structure against the dense path; False where it is not lowered. `every_speed`:
+    by multipliers, not by elimination.
+    """
     made = recipe(number)
     stacked, scene, t, *_ = instances(made, PARAMETERS, STATES, 0)
     program = lowered(scene, every_speed)
@@ -92,8 +131,12 @@ def check_lowered(number, every_speed):
     ydot, z = probes(program.ydot).T[good], probes(program.z).T[good]
     dense, speeds = found["rate"][good], found["u"][good]
     size = np.max(np.abs(dense), axis=1, keepdims=True) + np.max(np.abs(speeds), axis=1, keepdims=True)
-    assert np.max(np.abs(ydot - dense[:, list(program.independent)]) / size, initial=0.0) <= tolerance("round_off"), f"{made}: accelerations"
-    assert np.max(np.abs(z - speeds[:, list(program.dependent)]) / size, initial=0.0) <= tolerance("round_off"), f"{made}: dependent speeds"
+    assert np.max(np.abs(ydot - dense[:, list(program.independent)]) / size, initial=0.0) <= tolerance(
+        "round_off"
+    ), f"{made}: accelerations"
+    assert np.max(np.abs(z - speeds[:, list(program.dependent)]) / size, initial=0.0) <= tolerance(
+        "round_off"
+    ), f"{made}: dependent speeds"
     return True
 
 
@@ -108,7 +151,8 @@ def test_the_scalar_programs_of_all_generated_scenes_are_their_dense_equations()
     assert sum(check_lowered(number, True) for number in STRUCTURES) >= 20
 
 
-# Deliberate errors in the engine, each of which some invariant must show: otherwise the tests above could not fail.
+# Deliberate errors in the engine, each of which some invariant must show: otherwise the tests above could not
+# fail.
 
 
 def _wrong_sign_of_bias(equations_of):
@@ -139,7 +183,9 @@ def _gradient_of_potential_halved(gradient):
 def _b_t_forgotten(rates_along_motion):
     def wrong(scene, t, q, u, inputs=None):
         value, rate, motion = rates_along_motion(scene, t, q, u, inputs)
-        _, explicit = jax.jvp(lambda t: instant._velocity_level(scene, t, q, u, inputs)[0], (t,), (jnp.ones_like(t),))
+        _, explicit = jax.jvp(
+            lambda t: instant._velocity_level(scene, t, q, u, inputs)[0], (t,), (jnp.ones_like(t),)
+        )
         return value, jax.tree.map(lambda x, y: x - y, rate, explicit), motion
 
     return wrong
@@ -167,9 +213,21 @@ def _torques_in_space_axes(impressed):
         (virtual_power, "equations_of", _wrong_sign_of_bias, 13, "h is the gradient of the Gibbs function"),
         (virtual_power, "rows_of", _row_forgotten, 12, "rows hold along the motion"),
         (virtual_power, "mass_matrix", _M_not_symmetric, 12, "M is symmetric"),
-        (virtual_power, "_potential_gradient", _gradient_of_potential_halved, 13, "dE/dt is the power of all that works"),
+        (
+            virtual_power,
+            "_potential_gradient",
+            _gradient_of_potential_halved,
+            13,
+            "dE/dt is the power of all that works",
+        ),
         (instant, "rates_along_motion", _b_t_forgotten, 13, "dE/dt is the power of all that works"),
-        (virtual_power, "_inertia_resultants", _gyroscopic_torque_forgotten, 3, "h is the gradient of the Gibbs function"),
+        (
+            virtual_power,
+            "_inertia_resultants",
+            _gyroscopic_torque_forgotten,
+            3,
+            "h is the gradient of the Gibbs function",
+        ),
         (virtual_power, "impressed", _torques_in_space_axes, 3, "dE/dt is the power of impressed forces"),
     ],
 )

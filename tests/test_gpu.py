@@ -1,4 +1,6 @@
-"""Kernels of GPUs, checked without one: programs are lowered as for a GPU, and a driver runs the kernels' text on the CPU; their bits are machine code's."""
+"""Kernels of GPUs, checked without one: programs are lowered as for a GPU, and a driver runs the kernels'
+text on the CPU; their bits are machine code's.
+"""
 
 import os
 import re
@@ -20,13 +22,17 @@ from jourdain_jax.kernels import ffi, gpu, nvidia
 from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.studies import Design, LogNormal, LogUniform, Normal, Uniform
 
-pytestmark = pytest.mark.skipif(bool(ffi.reason_against() or nvidia.reason_against_text()), reason="no machine code is made here")
+pytestmark = pytest.mark.skipif(
+    bool(ffi.reason_against() or nvidia.reason_against_text()), reason="no machine code is made here"
+)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_90", "sm_100")
 KINDS = {"values": lambda f: f, "tangents": jax.jacfwd, "gradients": jax.grad, "second": jax.hessian}
 
 
 def _numbers(name: str, kinds, **options) -> dict[str, np.ndarray]:
-    """Numbers made of five motions of a model, and their derivatives with respect to a parameter and two directions of the start."""
+    """Numbers made of five motions of a model, and their derivatives with respect to a parameter and two
+    directions of the start.
+    """
     scene = jj.models.MODELS[name]()
     scalars = [p for p, value, _ in parameters_of(scene) if np.ndim(value) == 0][:1]
     end, x = end_of_model(name, None, scalars, ts=[0.1, 0.2], **options)
@@ -34,7 +40,11 @@ def _numbers(name: str, kinds, **options) -> dict[str, np.ndarray]:
     return {kind: np.asarray(jax.jit(jax.vmap(KINDS[kind](end)))(lanes)) for kind in kinds}
 
 
-FEW = 2**19  # bytes of a device, of which an eighth is for the steps of all its motions: some slots for each thread, or one
+FEW = (
+    2**19
+    # bytes of a device, of which an eighth is for the steps of all its motions: some slots for each thread, or
+    # one
+)
 
 
 def _check(name: str, kinds, orders, **options) -> set[str]:
@@ -42,7 +52,9 @@ def _check(name: str, kinds, orders, **options) -> set[str]:
     for order, memory in orders:
         with gpu_twin.in_place_of_a_gpu(order, memory) as made:
             for kind, found in _numbers(name, kinds, **options).items():
-                np.testing.assert_array_equal(found, expected[kind], err_msg=f"{name}, {kind}, threads {order}")
+                np.testing.assert_array_equal(
+                    found, expected[kind], err_msg=f"{name}, {kind}, threads {order}"
+                )
         texts.update(made)
     return texts
 
@@ -57,7 +69,10 @@ def _check_text(texts, architectures) -> None:
                 gpu_twin.said_by_assembler(ptx)  # refuses what is wrong
 
 
-@pytest.mark.parametrize(("name", "kind"), [("chaplygin-sleigh", "gradients"), ("tilting-disc", "values"), ("double-pendulum-rods", "values")])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("chaplygin-sleigh", "gradients"), ("tilting-disc", "values"), ("double-pendulum-rods", "values")],
+)
 def test_threads_of_a_gpu_give_the_bits_of_wide_registers(name, kind):
     texts = _check(name, [kind], [("reversed", FEW)])
     assert len(texts) > 2
@@ -66,7 +81,9 @@ def test_threads_of_a_gpu_give_the_bits_of_wide_registers(name, kind):
 
 @pytest.mark.parametrize("name", sorted(jj.models.MODELS))
 def test_threads_of_a_gpu_give_the_bits_of_wide_registers_for_every_model(name):
-    texts = _check(name, ["values", "tangents", "gradients"], [("in order", 2**40), ("reversed", FEW), ("at once", FEW)])
+    texts = _check(
+        name, ["values", "tangents", "gradients"], [("in order", 2**40), ("reversed", FEW), ("at once", FEW)]
+    )
     _check_text(texts, ARCHITECTURES)
 
 
@@ -122,7 +139,7 @@ def test_no_lanes_are_no_call_that_fails():
 
 
 def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
-    run = lambda: jax.jit(jax.vmap(_end))(np.linspace(0.4, 0.6, 3))  # noqa: E731
+    run = lambda: jax.jit(jax.vmap(_end))(np.linspace(0.4, 0.6, 3))
     expected = run()
     for code, said in ((2, "RESOURCE_EXHAUSTED: out of memory"), (1, "INTERNAL: invalid argument")):
         with gpu_twin.in_place_of_a_gpu(fails=code), pytest.raises(jax.errors.JaxRuntimeError, match=said):
@@ -132,7 +149,11 @@ def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
 
 
 def test_a_kernel_that_this_process_has_not_loaded_is_an_error():
-    with gpu_twin.in_place_of_a_gpu(), mock.patch.object(gpu.Kernel, "number", 5), pytest.raises(jax.errors.JaxRuntimeError, match="invalid resource handle"):
+    with (
+        gpu_twin.in_place_of_a_gpu(),
+        mock.patch.object(gpu.Kernel, "number", 5),
+        pytest.raises(jax.errors.JaxRuntimeError, match="invalid resource handle"),
+    ):
         jax.jit(_end)(0.4)
 
 
@@ -141,7 +162,9 @@ def test_the_record_of_steps_keeps_to_the_memory_of_the_model():
     model = jj.build(jj.models.ChaplyginSleigh(), memory=memory)
     run = jax.jit(jax.vmap(jax.grad(lambda speed: _end(speed, model)[0])))
     with gpu_twin.in_place_of_a_gpu():
-        largest = 8 * max(map(int, re.findall(r"tensor<(\d+)xf64>", run.lower(np.linspace(0.4, 0.6, 100)).as_text())))
+        largest = 8 * max(
+            map(int, re.findall(r"tensor<(\d+)xf64>", run.lower(np.linspace(0.4, 0.6, 100)).as_text()))
+        )
     assert 0.9 * memory < largest <= memory + 8 * ffi.FIRST_OF_SCRATCH
 
 
@@ -162,8 +185,14 @@ def test_without_a_gpu_that_serves_it_is_said_why(monkeypatch):
 
 
 def test_a_model_says_on_which_devices_it_is_integrated():
-    for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"), ("no driver", "XLA: no driver")):
-        with gpu_twin.in_place_of_a_gpu(), mock.patch.object(nvidia, "reason_against", lambda reason=reason: reason):
+    for reason, said in (
+        ("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"),
+        ("no driver", "XLA: no driver"),
+    ):
+        with (
+            gpu_twin.in_place_of_a_gpu(),
+            mock.patch.object(nvidia, "reason_against", lambda reason=reason: reason),
+        ):
             assert said in str(jj.build(jj.models.ChaplyginSleigh()))
 
 
@@ -191,7 +220,9 @@ def test_many_lanes_run_at_once_on_a_gpu():
     with gpu_twin.in_place_of_a_gpu() as launched:
         jj.rollout(scene, {"x_rate": np.ones(1000)}, ts=[0.1])
         assert min(launched.values()) == 1
-        assert jj.Study(scene, start={"x_rate": Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15
+        assert (
+            jj.Study(scene, start={"x_rate": Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15
+        )
 
 
 OF_TWO_DEVICES = """
@@ -212,5 +243,10 @@ np.testing.assert_array_equal(second, expected)
 
 
 def test_several_gpus_share_lanes():
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", OF_TWO_DEVICES], env=environment, cwd=Path(__file__).parent, check=True)
+    environment = os.environ | {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    subprocess.run(
+        [sys.executable, "-c", OF_TWO_DEVICES], env=environment, cwd=Path(__file__).parent, check=True
+    )

@@ -52,7 +52,9 @@ def test_an_oscillator_that_rubs_stops_where_the_spring_no_longer_moves_it(deriv
 
 def test_a_batch_of_oscillators_stops_after_different_numbers_of_swings():
     forces = np.linspace(0.4, 6.0, 12)
-    motions = jj.rollout(Oscillator(), {"x": np.full(12, 0.5)}, parameters={"friction": forces}, ts=[12.0], **TIGHT)
+    motions = jj.rollout(
+        Oscillator(), {"x": np.full(12, 0.5)}, parameters={"friction": forces}, ts=[12.0], **TIGHT
+    )
     assert len({rest(0.5, force)[1] for force in forces}) > 5
     np.testing.assert_allclose(motions["x"][:, 0], [rest(0.5, force)[0] for force in forces], atol=1e-10)
 
@@ -134,7 +136,9 @@ class Braked(jj.Scene):
 
     def bodies(self, t, q):
         where = jnp.stack([q.x, 0 * q.x, q.z])
-        return {"wheel": jj.RigidBody.thin_disc(4.0, 0.3, position=where, orientation=jj.rot_y(q.spin), axis="y")}
+        return {
+            "wheel": jj.RigidBody.thin_disc(4.0, 0.3, position=where, orientation=jj.rot_y(q.spin), axis="y")
+        }
 
     def loads(self, motion):
         return jj.gravity(motion, 9.81), jj.joint_friction(motion, spin_rate=self.brake)
@@ -212,7 +216,9 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
         if np.any(moving & (modes != np.sign(u))):
             return False
         held = modes == 0
-        return bool(np.all(np.abs(L[held]) <= F[held] + 1e-13) and np.all((a * modes)[~held & ~moving] > -1e-9))
+        return bool(
+            np.all(np.abs(L[held]) <= F[held] + 1e-13) and np.all((a * modes)[~held & ~moving] > -1e-9)
+        )
 
     start, t, end = np.array([1.2, -0.9, 0.0, 0.0]), 0.0, 3.0
     y, changes, begins = start, 0, None
@@ -222,7 +228,9 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
         def rates(t, y, modes=modes):
             return np.concatenate([y[2:], forces(y[:2], y[2:], modes)[1]])
 
-        found = solve_ivp(rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, dense_output=True, max_step=0.05)
+        found = solve_ivp(
+            rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, dense_output=True, max_step=0.05
+        )
 
         def values(s, modes=modes, found=found):
             z = found.sol(s)
@@ -269,7 +277,9 @@ def test_what_cannot_hold_is_refused():
         Unknown()
     with pytest.raises(ValueError, match=r"the friction of `x_rate` of `Oscillator` is -0\.9"):
         jj.simulate(Oscillator(friction=-0.9), {"x": 0.5}, t1=1.0)
-    lanes = jj.rollout(Oscillator(), {"x": np.full(2, 0.5)}, parameters={"friction": np.array([0.9, -0.9])}, t1=1.0)
+    lanes = jj.rollout(
+        Oscillator(), {"x": np.full(2, 0.5)}, parameters={"friction": np.array([0.9, -0.9])}, t1=1.0
+    )
     assert lanes.lanes.succeeded.tolist() == [True, False]
 
     def elsewhere(motion):

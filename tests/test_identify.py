@@ -1,4 +1,5 @@
-"""Identification: estimates from synthetic measurements, their coverage, what cannot be told, and advice on bad input.
+"""Identification: estimates from synthetic measurements, their coverage, what cannot be told, and advice on
+bad input.
 
 Measurements come from closed forms or hand-written equations (tests/oracles), not from the engine.
 """
@@ -35,7 +36,12 @@ def sleigh_data(seed, repeats=()) -> Experiment:
     motion = sleigh_oracle.motion(ts, **parameters)
     noise = np.random.default_rng(seed)
     exact = {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
-    return Experiment(ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START)
+    return Experiment(
+        ts,
+        {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()},
+        SIGMA,
+        start=SLEIGH_START,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +59,7 @@ def near(estimate, truth, errors=4.0):
     return abs(float(estimate.value) - truth) <= errors * float(estimate.standard_error)
 
 
-# The sleigh. ----------------------------------------------------------------------------------------------------------
+# The sleigh. ------------------------------------------------------------------------------------------------
 
 
 def test_the_sleigh_is_identified(sleigh_fit):
@@ -75,7 +81,8 @@ def test_intervals_cover_the_truth_in_90_to_99_percent_of_200_repeats(sleigh_bat
         estimate, truth = sleigh_batch[name], float(getattr(TRUTH, name))
         covered = np.mean((estimate.low < truth) & (truth < estimate.high))
         assert 0.90 <= covered <= 0.99, (name, covered)
-        # spread of the estimates against the error each claims: 5 % is the sampling error of a deviation from 200
+        # spread of the estimates against the error each claims: 5 % is the sampling error of a deviation from
+        # 200
         assert np.std(estimate.value) == pytest.approx(float(np.mean(estimate.standard_error)), rel=0.2)
     assert "200 fits of ChaplyginSleigh: 200 converged" in str(sleigh_batch)
 
@@ -103,10 +110,10 @@ def test_printed_table(sleigh_fit):
         sleigh_fit["ofset"]
 
 
-# The rattleback. --------------------------------------------------------------------------------------------------------
+# The rattleback. --------------------------------------------------------------------------------------------
 
 
-# A cart with a spring, a damper and a push: quick, and with inputs. ------------------------------------------------------
+# A cart with a spring, a damper and a push: quick, and with inputs. -----------------------------------------
 
 
 CART = Cart()
@@ -127,7 +134,11 @@ def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Experiment:
     """A run without noise; the push comes as samples."""
     x, v = cart_motion(ts, x0, v0, push)
     sampled = jj.Sampled(jnp.array([0.0, 10.0]), jnp.array([push, push]))
-    given = {"values": {"x": x, "x_rate": v}, "sigma": {"x": 0.01, "x_rate": 0.02}, "start": {"x": x0, "x_rate": v0}}
+    given = {
+        "values": {"x": x, "x_rate": v},
+        "sigma": {"x": 0.01, "x_rate": 0.02},
+        "start": {"x": x0, "x_rate": v0},
+    }
     given |= {"inputs": {"push": sampled}} | options
     return Experiment(ts, given.pop("values"), given.pop("sigma"), **given)
 
@@ -135,7 +146,13 @@ def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Experiment:
 def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
     runs = [
         cart_run(),
-        cart_run(x0=-0.2, v0=0.5, push=-0.5, start={"x": -0.1, "x_rate": 0.5}, unknown_start={"x": bounds(-1.0, 1.0)}),
+        cart_run(
+            x0=-0.2,
+            v0=0.5,
+            push=-0.5,
+            start={"x": -0.1, "x_rate": 0.5},
+            unknown_start={"x": bounds(-1.0, 1.0)},
+        ),
         cart_run(x0=0.1, push=2.0, ts=TS[:11]),
         cart_run(x0=0.4, push=0.0),
     ]
@@ -154,7 +171,9 @@ def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
 
 
 def test_a_fit_by_dense_matrices_is_that_by_machine_code():
-    by_code, dense = (fit(jj.build(Cart(mass=1.7), backend=backend), cart_run(), ("mass",)) for backend in ("auto", "dense"))
+    by_code, dense = (
+        fit(jj.build(Cart(mass=1.7), backend=backend), cart_run(), ("mass",)) for backend in ("auto", "dense")
+    )
     assert dense["mass"].value == pytest.approx(float(by_code["mass"].value), rel=1e-9)
     assert dense["mass"].standard_error == pytest.approx(float(by_code["mass"].standard_error), rel=1e-6)
 
@@ -164,7 +183,14 @@ def test_samples_that_are_missing_do_not_count(missing):
     some, x = np.arange(21) % 2 == 0, cart_run().values["x"]
     wrong = np.where(some, x, np.nan if missing == "no number" else 99.0)
     sigma = np.where(some, 0.01, np.inf) if missing == "of no weight" else 0.01
-    found = fit(Cart(mass=1.7), cart_run(values={"x": np.ma.masked_where(~some, wrong) if missing == "masked" else wrong}, sigma={"x": sigma}), ("mass",))
+    found = fit(
+        Cart(mass=1.7),
+        cart_run(
+            values={"x": np.ma.masked_where(~some, wrong) if missing == "masked" else wrong},
+            sigma={"x": sigma},
+        ),
+        ("mass",),
+    )
     assert found.samples == found.residual_summary()[0].samples == 11
     assert found["mass"].value == pytest.approx(2.0, rel=1e-6)
     assert np.isnan(found.residuals[0]["x"][1::2]).all()
@@ -180,7 +206,9 @@ def test_log_likelihood_is_the_gaussian_one_and_differentiable():
 
     found, slope = jax.jvp(value, (2.02,), (1.0,))
     motion = jj.simulate(scene, {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": 1.0})
-    r = np.concatenate([np.subtract(motion[name], data.values[name]) / data.sigma[name] for name in ("x", "x_rate")])
+    r = np.concatenate(
+        [np.subtract(motion[name], data.values[name]) / data.sigma[name] for name in ("x", "x_rate")]
+    )
     expected = -0.5 * np.sum(r**2) - 21 * np.log(0.01 * 0.02) - 21 * np.log(2 * np.pi)
     assert found == pytest.approx(expected, rel=1e-9)
     step = 1e-4
@@ -199,9 +227,17 @@ def test_a_parameter_at_its_bound_is_said_to_be_there():
 
 
 def released(push) -> Experiment:
-    """A run without damping from rest, x = x0 cos(w t), with noise that asks for less than none where `push` is not zero."""
+    """A run without damping from rest, x = x0 cos(w t), with noise that asks for less than none where `push`
+    is not zero.
+    """
     w = np.sqrt(5.0 / 2.0)
-    return cart_run(values={"x": 0.3 * np.cos(w * TS) * (1 + push * TS), "x_rate": -0.3 * w * np.sin(w * TS) * (1 + push * TS)}, inputs=None)
+    return cart_run(
+        values={
+            "x": 0.3 * np.cos(w * TS) * (1 + push * TS),
+            "x_rate": -0.3 * w * np.sin(w * TS) * (1 + push * TS),
+        },
+        inputs=None,
+    )
 
 
 def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit():
@@ -221,7 +257,9 @@ def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit():
     for given in (unbounded(0.1), bounds(-1.0, 2.0)):
         other = fit(Cart(mass=2.2), released(0.002), {"mass": unbounded(), "damping": given})
         assert_allclose(other.values, found.values, rtol=1e-6)
-    with pytest.raises(ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared non-negative"):
+    with pytest.raises(
+        ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared non-negative"
+    ):
         fit(Cart(), released(0.0), {"damping": jj.Estimate(-0.5, range=bounds(-1.0, 2.0))})
 
 
@@ -251,14 +289,22 @@ def test_too_few_iterations_and_wrong_sigmas_are_warned_of():
     assert "no minimum was found" in found.warning
     data = cart_run()
     shaken = {name: values + 0.1 * np.sin(5.0 * TS) for name, values in data.values.items()}
-    assert "residuals are larger than the sigmas allow" in fit(Cart(mass=1.7), cart_run(values=shaken), ("mass",)).warning
+    assert (
+        "residuals are larger than the sigmas allow"
+        in fit(Cart(mass=1.7), cart_run(values=shaken), ("mass",)).warning
+    )
 
 
 def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     values = noisy(0, sigma=(0.01, 0.01)).values
     assert not fit(Cart(mass=1.7), cart_run(values=values, sigma=0.01), ("mass",)).warnings
-    (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
-    assert "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are too large" in warning
+    (warning,) = fit(
+        Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)
+    ).warnings
+    assert (
+        "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are"
+        " too large" in warning
+    )
     (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=huber()).warnings
     assert "the residuals are smaller than the sigmas predict" in warning
 
@@ -302,10 +348,15 @@ def test_an_angle_that_was_wrapped_is_named_and_one_that_swings_is_not():
     angle, some = 9.0 * 2.0 * (1 - np.exp(-0.5 * ts)), np.arange(61) % 7 > 0
 
     def run(x):
-        return cart_run(ts=ts, values={"encoder": x}, sigma=0.01, start={"x_rate": 9.0}, sensors={"encoder": "x"})
+        return cart_run(
+            ts=ts, values={"encoder": x}, sigma=0.01, start={"x_rate": 9.0}, sensors={"encoder": "x"}
+        )
 
     for x in (np.mod(angle + np.pi, 2 * np.pi) - np.pi, np.where(some, np.mod(angle, 2 * np.pi), np.nan)):
-        with pytest.warns(UserWarning, match=r"channel `encoder` of run 0 jumps by -[56]\.\d+ at .* s and stays within one turn"):
+        with pytest.warns(
+            UserWarning,
+            match=r"channel `encoder` of run 0 jumps by -[56]\.\d+ at .* s and stays within one turn",
+        ):
             log_likelihood(CART, run(x))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -316,8 +367,14 @@ def test_an_angle_that_was_wrapped_is_named_and_one_that_swings_is_not():
 def test_a_gap_in_a_logged_input_is_named():
     ts = np.linspace(0.0, 4.0, 81)
     gap = (ts > 1.0) & (ts < 1.9)
-    log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}  # noqa: E731
-    with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is interpolated linearly"):
+    log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}
+    with pytest.warns(
+        UserWarning,
+        match=(
+            r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is interpolated"
+            r" linearly"
+        ),
+    ):
         log_likelihood(CART, cart_run(inputs=log(~gap)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -328,7 +385,10 @@ def test_a_gap_in_a_logged_input_is_named():
 
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
     ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.6, 2.6, 10.0]))
-    with pytest.warns(UserWarning, match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s") as seen:
+    with pytest.warns(
+        UserWarning,
+        match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s",
+    ) as seen:
         found = fit(Cart(mass=1.7), [cart_run(), cart_run(inputs=ends)], ("mass",))
     assert len(seen) == 1
     assert sum("from 1 to 4 s" in warning for warning in found.warnings) == 1
@@ -344,13 +404,15 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
         assert not seen
 
 
-# Several runs, noise that is not stated, samples that are far out. -------------------------------------------------------
+# Several runs, noise that is not stated, samples that are far out. ------------------------------------------
 
 THREE = ("mass", "damping", "stiffness")
 
 
 def noisy(seed, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **options) -> Experiment:
-    """A run of the cart with noise; `memory`: correlation of neighbouring samples of it; one sample of x is far out by `outlier` sigmas."""
+    """A run of the cart with noise; `memory`: correlation of neighbouring samples of it; one sample of x is
+    far out by `outlier` sigmas.
+    """
     generator = np.random.default_rng(seed)
     x0 = options.pop("x0", 0.3)
     values = {}
@@ -368,7 +430,13 @@ def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_chan
         x, _ = cart_motion(TS, x0, 0.0, 0.0)
         path = np.stack([x, 0 * x, 0 * x], axis=1)
         scale = jnp.asarray(2.0)
-        return Experiment(TS, {"cart": 2 * path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": lambda motion: scale * motion["cart"].position})
+        return Experiment(
+            TS,
+            {"cart": 2 * path},
+            0.01,
+            start={"x": x0, "x_rate": 0.0},
+            sensors={"cart": lambda motion: scale * motion["cart"].position},
+        )
 
     first = fit(Cart(mass=1.5), [run(0.3), run(-0.5)], ("mass",))
     compilations.clear()
@@ -380,8 +448,17 @@ def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_chan
 
 
 def test_many_runs_with_unknown_starts_are_those_of_a_dense_fit():
-    # an independent solution: all residuals and all unknowns in one dense problem, slopes by differences of the closed form
-    runs = [noisy(k, x0=0.1 * k - 0.35, start={"x": 0.1 * k - 0.3, "x_rate": 0.0}, unknown_start={"x": unbounded(0.1)}) for k in range(8)]
+    # an independent solution: all residuals and all unknowns in one dense problem, slopes by differences of
+    # the closed form
+    runs = [
+        noisy(
+            k,
+            x0=0.1 * k - 0.35,
+            start={"x": 0.1 * k - 0.3, "x_rate": 0.0},
+            unknown_start={"x": unbounded(0.1)},
+        )
+        for k in range(8)
+    ]
     found = fit(Cart(mass=1.8), runs, ("mass",))
     assert found.converged
     assert len(found.labels) == 9
@@ -417,23 +494,31 @@ def test_one_sample_far_out_hardly_moves_a_robust_fit(loss, most):
     assert not spoilt.warnings
     plain = fit(guess, noisy(5, ts=ts, outlier=60.0), THREE)
     assert "residuals are larger" in plain.warning
-    shaken = cart_run(values={name: x + 0.1 * np.sin(5.0 * ts) for name, x in noisy(5, ts=ts).values.items()}, ts=ts)
+    shaken = cart_run(
+        values={name: x + 0.1 * np.sin(5.0 * ts) for name, x in noisy(5, ts=ts).values.items()}, ts=ts
+    )
     assert "residuals are larger" in str(fit(guess, shaken, THREE, loss=loss).warnings)
     assert np.max(np.abs(plain.values - clean.values) / clean.standard_errors) > 1.0
-    assert np.all(np.abs(clean.standard_errors / fit(guess, noisy(5, ts=ts), THREE).standard_errors - 1) < 0.3)
+    assert np.all(
+        np.abs(clean.standard_errors / fit(guess, noisy(5, ts=ts), THREE).standard_errors - 1) < 0.3
+    )
 
 
 def test_a_sigma_that_is_not_known_is_told_and_ends_at_a_floor_where_a_channel_is_met_to_round_off():
     run = noisy(7, ts=np.linspace(0.0, 12.0, 201), sigma=(0.03, 0.005))
     found = fit(Cart(mass=1.7), cart_run(ts=run.ts, values=run.values, sigma=None), THREE)
-    assert_allclose([found.sigma["x"], found.sigma["x_rate"]], [0.03, 0.005], rtol=0.15)  # three standard errors of a deviation from 201
+    assert_allclose(
+        [found.sigma["x"], found.sigma["x_rate"]], [0.03, 0.005], rtol=0.15
+    )  # three standard errors of a deviation from 201
     assert "sigma of `x`, estimated: 0.0" in str(found)
     # sigma_c^2 = sum e^2 / (n_c - p_c), and the p_c of both channels are the three unknowns
     assert sum(201 * (1 - one.rms**2) for one in found.residual_summary()) == pytest.approx(3.0, rel=1e-6)
     assert found.reduced_chi_square == pytest.approx(1.0, rel=1e-6)
     x = np.asarray(jj.simulate(CART, cart_run().start, ts=TS)["x"])
     for scale in (1.0, 1e6):  # whatever its unit
-        exact = cart_run(values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": Sensor("x", gain=scale)})
+        exact = cart_run(
+            values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": Sensor("x", gain=scale)}
+        )
         met = fit(Cart(mass=1.7), exact, ("mass",))
         assert met.converged
         assert met.sigma["mine"] == pytest.approx(1e-10 * scale * np.max(np.abs(x)), rel=1e-3)
@@ -448,14 +533,24 @@ def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
     assert "are not white" in str(claimed)
     assert 0.75 < claimed.autocorrelation["x"][0] < 0.95
     assert found[0].warning == ""
-    own = fit(Cart(mass=1.9), [noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)], ("mass",), errors="runs")
+    own = fit(
+        Cart(mass=1.9),
+        [noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)],
+        ("mass",),
+        errors="runs",
+    )
     assert "which makes intervals of unknowns of single runs (`run 0: x`)" in own.warning
     spread = np.std([float(f["mass"].value) for f in found])
-    honest, naive = np.mean([float(f["mass"].standard_error) for f in found]), float(claimed["mass"].standard_error)
+    honest, naive = (
+        np.mean([float(f["mass"].standard_error) for f in found]),
+        float(claimed["mass"].standard_error),
+    )
     assert honest == pytest.approx(spread, rel=0.5)  # 14 % is the sampling error of a deviation from 25
     assert naive < 0.6 * spread
     # intervals are those of Student's t with seven degrees of freedom
-    assert_allclose(found[0]["mass"].high - found[0]["mass"].value, 2.364624 * found[0]["mass"].standard_error, rtol=1e-3)
+    assert_allclose(
+        found[0]["mass"].high - found[0]["mass"].value, 2.364624 * found[0]["mass"].standard_error, rtol=1e-3
+    )
 
 
 def test_estimates_that_go_together_are_named():
@@ -464,17 +559,22 @@ def test_estimates_that_go_together_are_named():
     assert abs(found.correlation[0, 1]) > 0.98
     (pair,), (combination,) = found.correlated, found.weak
     assert "`mass` and `stiffness` correlate at 0.9" in pair
-    assert re.match(r"a change of `\w+` by \d+ % and a change of `\w+` by \d+ % together are one standard error", combination)
+    assert re.match(
+        r"a change of `\w+` by \d+ % and a change of `\w+` by \d+ % together are one standard error",
+        combination,
+    )
     assert pair in str(found)
 
 
 def test_a_fit_inside_a_transformation_is_refused():
     for transformed in (jax.jit, jax.grad):
-        with pytest.raises(jj.DifferentiationModeError, match=r"inside jit, vmap or a derivative.*`fit_batch`"):
+        with pytest.raises(
+            jj.DifferentiationModeError, match=r"inside jit, vmap or a derivative.*`fit_batch`"
+        ):
             transformed(lambda mass: fit(Cart(mass=mass), cart_run(), ("mass",)).values[0])(1.7)
 
 
-# What cannot be told. ---------------------------------------------------------------------------------------------------------
+# What cannot be told. ---------------------------------------------------------------------------------------
 
 
 def test_ratios_that_show_are_told_as_such():
@@ -491,7 +591,10 @@ def test_a_sum_that_shows_is_told_as_one():
         idle: float = jj.parameter(0.7)
 
         def loads(self, motion):
-            return (*super().loads(motion), jj.generalized_force(motion, x_rate=-self.second * motion.u.x_rate))
+            return (
+                *super().loads(motion),
+                jj.generalized_force(motion, x_rate=-self.second * motion.u.x_rate),
+            )
 
     found = fit(TwoDampers(mass=1.9, damping=0.37), cart_run(), ("mass", "damping", "second", "idle"))
     by_sum, idle = sorted(found.not_identifiable, key=lambda sentence: "idle" in sentence)
@@ -510,17 +613,25 @@ def test_what_moves_with_an_unknown_of_each_run_has_no_interval_and_all_else_kee
     def run(k):  # where the spring rests shows as little as the zero of an encoder and the place of the start
         sensor = Sensor("x", bias=jj.Estimate(0.0, per_run=True))
         values = {"encoder": noisy(k).values["x"]}
-        return cart_run(values=values, sigma=0.01, start={"x": 0.3}, unknown_start={"x": unbounded(0.1)}, sensors={"encoder": sensor})
+        return cart_run(
+            values=values,
+            sigma=0.01,
+            start={"x": 0.3},
+            unknown_start={"x": unbounded(0.1)},
+            sensors={"encoder": sensor},
+        )
 
     runs = [run(k) for k in range(3)]
-    found, known = (fit(Shifted(mass=1.9, stiffness=5.0), runs, free) for free in (("mass", "rest"), ("mass",)))
+    found, known = (
+        fit(Shifted(mass=1.9, stiffness=5.0), runs, free) for free in (("mass", "rest"), ("mass",))
+    )
     shown = {name for name in found.labels if np.isfinite(found[name].standard_error)}
     assert shown == {"mass"}
     assert found.information.rank == len(found.labels) - 1
     assert_allclose(found["mass"].standard_error, known["mass"].standard_error, rtol=1e-4)
 
 
-# Bad input. ---------------------------------------------------------------------------------------------------------------
+# Bad input. -------------------------------------------------------------------------------------------------
 
 
 def test_start_values_that_depend_on_each_other_are_refused():
@@ -531,7 +642,11 @@ def test_start_values_that_depend_on_each_other_are_refused():
         return Experiment(data.ts, data.values, SIGMA, start=start, **options)
 
     # y_rate follows from the offset, which is to change
-    with pytest.raises(ValueError, match=r"the start of run 0 violates the constraints when the unknowns change.*`blade`"):
+    with pytest.raises(
+        ValueError, match=r"the start of run 0 violates the constraints when the unknowns change.*`blade`"
+    ):
         fit(TRUTH, run(consistent), ("offset",))
-    with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*violates constraint `blade`"):
+    with pytest.raises(
+        ValueError, match=r"the start of run 1 is not admissible.*violates constraint `blade`"
+    ):
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))

@@ -1,6 +1,5 @@
 """Fits from first guesses that are far from the minimum: over growing spans."""
 
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,9 +49,15 @@ def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
     found = jj.fit_batch(Oscillator(stiffness=50.0), measured, FREE)
     assert found.grown[[0, 1, 2, 4]].all()
     good = [0, 1, 2, 4]
-    assert_allclose(found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max())
+    assert_allclose(
+        found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max()
+    )
     assert found.reduced_chi_square[3] > 100
-    alone = jj.fit(Oscillator(stiffness=50.0), jj.Experiment(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}), FREE)
+    alone = jj.fit(
+        Oscillator(stiffness=50.0),
+        jj.Experiment(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}),
+        FREE,
+    )
     assert_allclose(found.values[2], alone.values, rtol=1e-9)
 
 
@@ -92,12 +97,24 @@ class Resting(OnLine):
 
 @pytest.mark.parametrize(("curvature", "large"), [(3.0, 100.0), (5.0, 4.0)])
 def test_a_minimum_that_undamped_steps_overshoot_is_found(curvature, large):
-    """F = (x - 0.1)^2 + (R + a x^2 + a x^3 / 3)^2: at the minimum its second derivative is `curvature` times that of the linear problem."""
+    """F = (x - 0.1)^2 + (R + a x^2 + a x^3 / 3)^2: at the minimum its second derivative is `curvature` times
+    that of the linear problem.
+    """
     a = (curvature - 1) / 2 / large
     sensors = {"curved": Sensor(lambda motion: large + a * motion.q.x**2 + a * motion.q.x**3 / 3)}
-    run = jj.Experiment(jnp.ones(1), {"x": [0.1], "curved": [0.0]}, 1.0, start={"x": 0.3}, unknown_start=("x",), sensors=sensors, t0=0.0)
+    run = jj.Experiment(
+        jnp.ones(1),
+        {"x": [0.1], "curved": [0.0]},
+        1.0,
+        start={"x": 0.3},
+        unknown_start=("x",),
+        sensors=sensors,
+        t0=0.0,
+    )
     found = jj.fit(Resting(), run, ())
-    slope = np.polynomial.Polynomial([-0.1, 1.0]) + np.polynomial.Polynomial([large, 0.0, a, a / 3]) * np.polynomial.Polynomial([0.0, 2 * a, a])
+    slope = np.polynomial.Polynomial([-0.1, 1.0]) + np.polynomial.Polynomial(
+        [large, 0.0, a, a / 3]
+    ) * np.polynomial.Polynomial([0.0, 2 * a, a])
     least = min(slope.roots()[np.abs(slope.roots().imag) < 1e-9].real, key=abs)
     assert found.converged
     assert found.steps < 90

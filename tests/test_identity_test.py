@@ -28,14 +28,18 @@ def test_what_is_nowhere_a_number_is_equal_to_nothing():
 
 
 def test_replacements_that_change_nothing_are_found_one_by_one():
-    (node,), (x, y, _), probes = traced(lambda x, y, p: ((x + y) ** 2 - x * x - 2 * x * y + p * jnp.tanh(x - x * 1.0),))
+    (node,), (x, y, _), probes = traced(
+        lambda x, y, p: ((x + y) ** 2 - x * x - 2 * x * y + p * jnp.tanh(x - x * 1.0),)
+    )
     zero = probes.graph.zero
     assert unaffected(probes, [node], {x: zero, y: zero}) == {x: zero}
 
 
 def test_coordinates_are_put_onto_rows_at_generic_parameters():
     (row,), (x, y, _), probes = traced(lambda x, y, p: (x * x + y * y - p * p,))
-    near = Probes(probes.graph, {"q_0": np.full(COUNT, 0.6), "q_1": np.full(COUNT, 0.8), "p0_0": np.ones(COUNT)})
+    near = Probes(
+        probes.graph, {"q_0": np.full(COUNT, 0.6), "q_1": np.full(COUNT, 0.8), "p0_0": np.ones(COUNT)}
+    )
     on_circle = on_rows(probes, near, [row], {"q_0": x, "q_1": y})
     np.testing.assert_allclose(on_circle([row]), 0.0, atol=1e-11)
     assert np.ptp(on_circle.inputs["p0_0"]) > 0.5

@@ -39,7 +39,12 @@ def test_importing_computes_nothing_and_a_motion_imports_what_it_needs():
 def _imports(package):
     """The module of each name that the stub of a package imports."""
     nodes = ast.walk(ast.parse(Path(package.__file__).with_suffix(".pyi").read_text()))
-    return {alias.name: f"{package.__name__}.{node.module or alias.name}" for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    return {
+        alias.name: f"{package.__name__}.{node.module or alias.name}"
+        for node in nodes
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
@@ -58,7 +63,15 @@ def test_public_names_are_there_and_those_that_static_tools_see(package):
     assert public <= found.keys()
 
 
-@pytest.mark.parametrize(("name", "place"), [("Normal", "studies"), ("Sensor", "identification"), ("gibbs_function", "equations"), ("Report", "analysis")])
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("Normal", "studies"),
+        ("Sensor", "identification"),
+        ("gibbs_function", "equations"),
+        ("Report", "analysis"),
+    ],
+)
 def test_a_former_name_says_where_it_is(name, place):
     with pytest.raises(AttributeError, match=f"`jj.{place}.{name}`"):
         getattr(jj, name)

@@ -1,4 +1,6 @@
-"""Bodies without inertia and bodies that cannot be: refused by name, and a result code of their lane where no error can be raised."""
+"""Bodies without inertia and bodies that cannot be: refused by name, and a result code of their lane where no
+error can be raised.
+"""
 
 import equinox as eqx
 import jax
@@ -12,7 +14,8 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 
-# What has no inertia has no acceleration: it is refused by name where it never has any, and a lane says so where it has none.
+# What has no inertia has no acceleration: it is refused by name where it never has any, and a lane says so
+# where it has none.
 
 
 class Weightless(OnLine):
@@ -45,7 +48,11 @@ class ThinRod(jj.Scene):
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {"rod": jj.RigidBody.rod(1.0, 0.8, axis="x", position=q.array[:3], orientation=jj.quaternion_to_matrix(q["attitude"]))}
+        return {
+            "rod": jj.RigidBody.rod(
+                1.0, 0.8, axis="x", position=q.array[:3], orientation=jj.quaternion_to_matrix(q["attitude"])
+            )
+        }
 
 
 class OnSphere(jj.Scene):
@@ -56,13 +63,17 @@ class OnSphere(jj.Scene):
 
     def bodies(self, t, q):
         s = jnp.sin(q.polar)
-        return {"particle": jj.Particle(1.0, [s * jnp.cos(q.azimuth), s * jnp.sin(q.azimuth), jnp.cos(q.polar)])}
+        return {
+            "particle": jj.Particle(1.0, [s * jnp.cos(q.azimuth), s * jnp.sin(q.azimuth), jnp.cos(q.polar)])
+        }
 
 
 class Tumbling(jj.Scene):
     """A free body whose inertia is a matrix, as a CAD program gives it."""
 
-    inertia: jnp.ndarray = jj.parameter(np.array([[1.0, 0.1, 0.2], [0.1, 1.3, 0.05], [0.2, 0.05, 0.9]]), unit="kg m^2")
+    inertia: jnp.ndarray = jj.parameter(
+        np.array([[1.0, 0.1, 0.2], [0.1, 1.3, 0.05], [0.2, 0.05, 0.9]]), unit="kg m^2"
+    )
     coordinates = jj.coordinates(jj.quaternion("attitude"))
 
     def bodies(self, t, q):
@@ -75,16 +86,24 @@ def test_an_inertia_that_is_a_matrix_is_lowered_and_its_symmetric_part_counts():
     omega = np.array([1.0, -0.5, 2.0])
 
     def turned(inertia):
-        return jj.simulate(Tumbling(inertia), {"attitude_omega": omega}, ts=[0.5], rtol=1e-11, atol=1e-11).u_end
+        return jj.simulate(
+            Tumbling(inertia), {"attitude_omega": omega}, ts=[0.5], rtol=1e-11, atol=1e-11
+        ).u_end
 
     I, along = np.asarray(scene.inertia), np.array([[0.3, 0.7, 0.0], [0.7, 0.0, -0.4], [0.0, -0.4, 0.2]])
     for s in (0.0, 1.0):
         found = jj.accelerations(Tumbling(I + s * along), 0.0, [1.0, 0.0, 0.0, 0.0], omega).udot
-        assert_allclose((I + s * along) @ found, np.cross((I + s * along) @ omega, omega), rtol=1e-12, atol=1e-12)  # Euler
+        assert_allclose(
+            (I + s * along) @ found, np.cross((I + s * along) @ omega, omega), rtol=1e-12, atol=1e-12
+        )  # Euler
     weights = np.array([1.0, -2.0, 0.5])
     slopes = jax.jit(jax.grad(lambda inertia: weights @ turned(inertia)))(I)
     assert_allclose(slopes, slopes.T, atol=1e-14)
-    assert_allclose(np.sum(slopes * along), weights @ (turned(I + 1e-4 * along) - turned(I - 1e-4 * along)) / 2e-4, rtol=1e-6)
+    assert_allclose(
+        np.sum(slopes * along),
+        weights @ (turned(I + 1e-4 * along) - turned(I - 1e-4 * along)) / 2e-4,
+        rtol=1e-6,
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,7 +115,11 @@ def test_an_inertia_that_is_a_matrix_is_lowered_and_its_symmetric_part_counts():
         (ThinRod(), "`attitude_omega_x`"),
     ],
 )
-@pytest.mark.parametrize("ask", [jj.structure_of, jj.report, lambda scene: jj.simulate(scene, {}, t1=1.0)], ids=["structure", "report", "simulate"])
+@pytest.mark.parametrize(
+    "ask",
+    [jj.structure_of, jj.report, lambda scene: jj.simulate(scene, {}, t1=1.0)],
+    ids=["structure", "report", "simulate"],
+)
 def test_speeds_that_move_no_mass_are_refused_by_name(scene, names, ask):
     with pytest.raises(ValueError, match=f"has inertia along .*{names}.*: no mass moves with it"):
         ask(scene)
@@ -112,7 +135,9 @@ def test_an_isolated_loss_of_inertia_is_no_fault_of_the_scene():
     scene = OnSphere()
     assert jj.structure_of(scene).degrees_of_freedom == 2
     q, u, _ = scene.named(azimuth_rate=0.5)  # at the pole
-    for name, found in ((name, jj.accelerations(scene, 0.0, q, u, reduction=name)) for name in jj.reductions(scene)):
+    for name, found in (
+        (name, jj.accelerations(scene, 0.0, q, u, reduction=name)) for name in jj.reductions(scene)
+    ):
         assert not found.applicable, name
     assert np.all(np.isnan(jj.accelerations(scene, 0.0, q, u).udot))
 
@@ -165,16 +190,24 @@ def test_mass_that_leaves_takes_its_momentum_with_it():
     assert_allclose(motion.u_end, [1.0 + 6.0 * np.log(2.0), 2.0], atol=1e-9)  # m x'' = F, I angle'' = 0
 
 
-# Bodies that cannot be end a lane with a result code, where no error can be raised: negative masses, and inertias that no body has.
+# Bodies that cannot be end a lane with a result code, where no error can be raised: negative masses, and
+# inertias that no body has.
 
 
 def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
     generator = np.random.default_rng(0)
     turns = np.linalg.qr(generator.normal(size=(300, 3, 3)))[0]
-    moments = generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0)
+    moments = generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(
+        generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0
+    )
     moments *= 10.0 ** generator.uniform(-9, 9, (300, 1))
     inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
-    lanes = jj.rollout(Tumbling(), {"attitude_omega_x": 1e-3}, parameters={"inertia": (inertias + inertias.mT) / 2}, ts=[1e-6])
+    lanes = jj.rollout(
+        Tumbling(),
+        {"attitude_omega_x": 1e-3},
+        parameters={"inertia": (inertias + inertias.mT) / 2},
+        ts=[1e-6],
+    )
     assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
 
 
@@ -204,7 +237,9 @@ class Rolling(jj.Scene):
     def bodies(self, t, q):
         o = 0.0 * q.x
         inertia = jnp.diag(jnp.stack([self.moment, 0.3 + o, 0.3 + o])) + self.lopsided * jnp.eye(3, k=1)
-        turned = jj.rot_y(q.roll) @ jnp.diag(jnp.stack([self.stretch, self.stretch * self.mirror, self.stretch]))
+        turned = jj.rot_y(q.roll) @ jnp.diag(
+            jnp.stack([self.stretch, self.stretch * self.mirror, self.stretch])
+        )
         above = 0.4 * jnp.stack([jnp.sin(q.about), o, jnp.cos(q.about)])
         return {
             "wheel": jj.RigidBody(self.mass, inertia, [q.x, o, self.slope * q.x + self.height], turned),
@@ -213,9 +248,19 @@ class Rolling(jj.Scene):
 
     def contacts(self, pose):
         _, across, up = jnp.eye(3)
-        floor = jj.Plane(normal=self.normal * up, velocity=self.rise * up, angular_velocity=self.tilting * across)
-        pipe = jj.Cylinder(self.pipe, self.axis * across, side="inside", origin=self.carried * pose["wheel"].position[0] * across)
-        return {"rim": jj.wheel_contact(pose["wheel"], self.radius, self.tyre, ground=floor), "top": jj.ball_contact(pose["ball"], self.ball, ground=pipe)}
+        floor = jj.Plane(
+            normal=self.normal * up, velocity=self.rise * up, angular_velocity=self.tilting * across
+        )
+        pipe = jj.Cylinder(
+            self.pipe,
+            self.axis * across,
+            side="inside",
+            origin=self.carried * pose["wheel"].position[0] * across,
+        )
+        return {
+            "rim": jj.wheel_contact(pose["wheel"], self.radius, self.tyre, ground=floor),
+            "top": jj.ball_contact(pose["ball"], self.ball, ground=pipe),
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81, direction=self.down),)
@@ -223,23 +268,59 @@ class Rolling(jj.Scene):
 
 WRONG = {  # the code's text in a lane, the text of the error alone
     "mass=-0.5": ("a negative mass: body `wheel`", r"mass of -0\.5 kg, expected a number"),
-    "lopsided=0.01": ("an inertia that is not symmetric: body `wheel`", "give the same products of inertia above and below"),
-    "moment=-0.3": ("a negative moment of inertia: body `wheel`", r"moment of inertia of -0\.3 kg m\^2, expected"),
-    "stretch=2.0": ("an orientation that is no rotation: body `wheel`", "R' R differs from the identity by 3"),
+    "lopsided=0.01": (
+        "an inertia that is not symmetric: body `wheel`",
+        "give the same products of inertia above and below",
+    ),
+    "moment=-0.3": (
+        "a negative moment of inertia: body `wheel`",
+        r"moment of inertia of -0\.3 kg m\^2, expected",
+    ),
+    "stretch=2.0": (
+        "an orientation that is no rotation: body `wheel`",
+        "R' R differs from the identity by 3",
+    ),
     "mirror=-1.0": ("a reflected orientation: body `wheel`", "orientation of determinant -1, a reflection"),
     "height=0.2": ("a body off its ground: contact `rim`", r"its body is 0\.1 m off the ground"),
-    "radius=-0.1, height=-0.1": ("no positive length: the radius of contact `rim`", r"less the tyre of contact `rim` .* -0\.12 m"),
+    "radius=-0.1, height=-0.1": (
+        "no positive length: the radius of contact `rim`",
+        r"less the tyre of contact `rim` .* -0\.12 m",
+    ),
     "tyre=-0.01": ("a negative tyre: contact `rim`", r"tyre of -0\.01 m, expected a radius"),
-    "tyre=0.2": ("no positive length: the radius less the tyre of contact `rim`", r"less the tyre of contact `rim` .* -0\.1 m"),
-    "ball=0.6": ("no positive length: ground radius minus ball radius of contact `top`", "`top` .* finds no point where body and ground touch"),
-    "pipe=-0.5": ("no positive length: the radius of the ground of contact `top`", "`top` .* finds no point where body and ground touch"),
+    "tyre=0.2": (
+        "no positive length: the radius less the tyre of contact `rim`",
+        r"less the tyre of contact `rim` .* -0\.1 m",
+    ),
+    "ball=0.6": (
+        "no positive length: ground radius minus ball radius of contact `top`",
+        "`top` .* finds no point where body and ground touch",
+    ),
+    "pipe=-0.5": (
+        "no positive length: the radius of the ground of contact `top`",
+        "`top` .* finds no point where body and ground touch",
+    ),
     "slope=0.1": ("a body off its ground: contact `rim`", "at a probed state its body is"),
-    "tilting=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", "at 0 m/s by `origin`"),
-    "carried=1.0": ("a ground that another body carries: the ground of contact `top`", "moves with another body"),
+    "tilting=0.3": (
+        "a plane that contradicts its stated motion: the plane of contact `rim`",
+        "at 0 m/s by `origin`",
+    ),
+    "carried=1.0": (
+        "a ground that another body carries: the ground of contact `top`",
+        "moves with another body",
+    ),
     "axis=2.0": ("not a unit vector: the axis of contact `top`", "the axis of contact `top` .* from 1 by 1,"),
-    "normal=1.1": ("not a unit vector: the normal of contact `rim`", r"normal of contact `rim` .* from 1 by 0\.1"),
-    "rise=0.3": ("a plane that contradicts its stated motion: the plane of contact `rim`", r"at 0 m/s by `origin` .* but at 0\.3 m/s"),
-    "down=(0, 0, -2)": ("not a unit vector: the direction of gravity in load 1", "gravity in load 1 .* differs from 1 by 1,"),
+    "normal=1.1": (
+        "not a unit vector: the normal of contact `rim`",
+        r"normal of contact `rim` .* from 1 by 0\.1",
+    ),
+    "rise=0.3": (
+        "a plane that contradicts its stated motion: the plane of contact `rim`",
+        r"at 0 m/s by `origin` .* but at 0\.3 m/s",
+    ),
+    "down=(0, 0, -2)": (
+        "not a unit vector: the direction of gravity in load 1",
+        "gravity in load 1 .* differs from 1 by 1,",
+    ),
 }
 
 
@@ -256,7 +337,9 @@ def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, ba
     wrong = sound.replace(**eval(f"dict({kind})"))
     with pytest.raises(ValueError, match=text):
         jj.simulate(wrong, ts=[0.1])
-    both = {name: jnp.stack([getattr(wrong, name), getattr(sound, name)]) for name in Rolling.__annotations__}  # one program for all kinds
+    both = {
+        name: jnp.stack([getattr(wrong, name), getattr(sound, name)]) for name in Rolling.__annotations__
+    }  # one program for all kinds
     lanes = jj.rollout(sound, {}, parameters=both, ts=[0.1], backend=backend)
     assert lanes.result.tolist() == [results.BAD_PARAMETER, results.SUCCESS]
     assert fault in str(lanes)

@@ -1,4 +1,6 @@
-"""Inputs: what they are at the start counts in the start, their rates in the balance of energy, and steps end at the knots of samples."""
+"""Inputs: what they are at the start counts in the start, their rates in the balance of energy, and steps end
+at the knots of samples.
+"""
 
 from functools import partial
 
@@ -18,7 +20,9 @@ from jourdain_jax.models import ChaplyginSleigh
 
 
 class OnBelt(OnPlane):
-    """A bead that slides across a belt; the belt, at the speed of an input, carries it along faster the farther out it is."""
+    """A bead that slides across a belt; the belt, at the speed of an input, carries it along faster the
+    farther out it is.
+    """
 
     mass: float = jj.parameter(2.0, unit="kg", positive=True)
     inputs = jj.inputs("speed push")
@@ -75,10 +79,15 @@ def test_named_starts_of_simulate_rollout_and_linearize_meet_rows_that_depend_on
     assert jj.verify(scene, values, inputs=inputs).passed
 
 
-@pytest.mark.parametrize("inputs", [{"spede": 1.0}, {"speed": "fast"}, {"speed": [1.0, 2.0]}, [1.0, 2.0], 3.0], ids=str)
+@pytest.mark.parametrize(
+    "inputs", [{"spede": 1.0}, {"speed": "fast"}, {"speed": [1.0, 2.0]}, [1.0, 2.0], 3.0], ids=str
+)
 def test_a_start_refuses_inputs_in_the_words_of_simulate(inputs):
     said = []
-    for f in (lambda: jj.start(OnBelt(), inputs=inputs), lambda: jj.simulate(OnBelt(), {}, t1=1.0, inputs=inputs)):
+    for f in (
+        lambda: jj.start(OnBelt(), inputs=inputs),
+        lambda: jj.simulate(OnBelt(), {}, t1=1.0, inputs=inputs),
+    ):
         with pytest.raises(ValueError) as error:
             f()
         said.append(str(error.value))
@@ -90,11 +99,13 @@ def test_a_scene_without_inputs_takes_none_in_a_start():
         jj.start(ChaplyginSleigh(), inputs={"force": 1.0})
 
 
-# Potentials that depend on inputs. ------------------------------------------------------------------------------------
+# Potentials that depend on inputs. --------------------------------------------------------------------------
 
 
 class PulledBead(OnLine):
-    """A bead between a spring to the origin and one, stiffening in time, to a hand at the place of an input; a damper besides."""
+    """A bead between a spring to the origin and one, stiffening in time, to a hand at the place of an input;
+    a damper besides.
+    """
 
     mass: float = jj.parameter(2.0, unit="kg", positive=True)
     stiffness: float = jj.parameter(18.0, unit="N/m")
@@ -117,7 +128,9 @@ SPAN = np.linspace(0.0, 1.5, 6)
 
 
 def work_by_quadrature():
-    """The work on the bead by integrating the power of hand, clock, damper and push, from one knot of the hand's path to the next."""
+    """The work on the bead by integrating the power of hand, clock, damper and push, from one knot of the
+    hand's path to the next.
+    """
     m, k, s, c = 2.0, 18.0, 5.0, 0.5
     y, works = np.array([0.2, 0.0, 0.0]), {}
     for start, end, first, last in zip(KNOTS[:-1], KNOTS[1:], PLACES[:-1], PLACES[1:], strict=True):
@@ -127,10 +140,22 @@ def work_by_quadrature():
             x, v, _ = y
             stretch = x - (first + slope * (t - start))
             force = 0.7 - c * v
-            return [v, (force - k * x - (k + s * t) * stretch) / m, force * v + 0.5 * s * stretch**2 - (k + s * t) * stretch * slope]
+            return [
+                v,
+                (force - k * x - (k + s * t) * stretch) / m,
+                force * v + 0.5 * s * stretch**2 - (k + s * t) * stretch * slope,
+            ]
 
         times = [t for t in SPAN if start <= t <= end]
-        found = solve_ivp(rates, (start, end), y, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=[*times, end] if end not in times else times)
+        found = solve_ivp(
+            rates,
+            (start, end),
+            y,
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-14,
+            t_eval=[*times, end] if end not in times else times,
+        )
         works |= dict(zip(times, found.y[2], strict=False))
         y = found.y[:, -1]
     return np.array([works[t] for t in SPAN])
@@ -143,7 +168,9 @@ def work_by_quadrature():
 )
 def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):
     inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
-    motion = jj.simulate(PulledBead(), ts=SPAN, rtol=1e-11, atol=1e-11, inputs=inputs, **options).raise_if_failed()
+    motion = jj.simulate(
+        PulledBead(), ts=SPAN, rtol=1e-11, atol=1e-11, inputs=inputs, **options
+    ).raise_if_failed()
     work = work_by_quadrature()
     # the solver's steps cross the kinks of the hand's path, where its order is lost
     assert_allclose(motion.work, work, atol=1e-8 * np.max(np.abs(work)))
@@ -154,7 +181,9 @@ def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(opti
 def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
     jumps = {"hand": lambda t: jnp.where(t < 0.5, 0.1, 0.3)}
     scene = PulledBead(damping=0.0, stiffening=0.0, stiffness=18.0)
-    motion = jj.simulate(scene, ts=[0.0, 0.5 - 1e-9, 0.5, 1.0], rtol=1e-10, atol=1e-10, inputs=jumps).raise_if_failed()
+    motion = jj.simulate(
+        scene, ts=[0.0, 0.5 - 1e-9, 0.5, 1.0], rtol=1e-10, atol=1e-10, inputs=jumps
+    ).raise_if_failed()
     before, after = (0.5 * 18.0 * (motion["x"][2] - hand) ** 2 for hand in (0.1, 0.3))
     assert_allclose(motion.work, [0.0, 0.0, after - before, after - before], atol=1e-7)
     balance = np.asarray(motion.energies().balance)
@@ -170,7 +199,9 @@ def test_lanes_and_gradients_carry_the_work_of_inputs():
 
     def last(last_place):
         moved = jj.Sampled(KNOTS, jnp.asarray(PLACES).at[3].set(last_place))
-        return jj.simulate(PulledBead(), **options | {"inputs": {"hand": moved, "push": 0.7}, "backend": "xla"}).work[-1]
+        return jj.simulate(
+            PulledBead(), **options | {"inputs": {"hand": moved, "push": 0.7}, "backend": "xla"}
+        ).work[-1]
 
     slope = (last(0.2 + 1e-4) - last(0.2 - 1e-4)) / 2e-4
     assert_allclose(jax.grad(last)(0.2), slope, rtol=1e-6)
@@ -182,7 +213,7 @@ def test_potentials_that_depend_on_inputs_are_found_and_named():
     assert jj.structure_of(OnBelt()).potentials_of_inputs == ()
 
 
-# Rows that depend on inputs. ------------------------------------------------------------------------------------------
+# Rows that depend on inputs. --------------------------------------------------------------------------------
 
 
 class Towed(OnPlane):
@@ -200,7 +231,9 @@ class Towed(OnPlane):
     ids=["minimal", "full state"],
 )
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
-    motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()
+    motion = jj.simulate(
+        Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options
+    ).raise_if_failed()
     # x'' + y'' = 0, y'' - x'' = 2 t
     assert_allclose(motion.u_end, [-1.0, 3.0], atol=1e-8)
     assert_allclose(motion.q_end, [2.0 - 4.0 / 3.0, 2.0 + 4.0 / 3.0], atol=1e-7)
@@ -219,21 +252,30 @@ JUMPS = {
     "steps": lambda t: 0.1 * jnp.floor(3.0 * t),
     "a pulse": lambda t: jnp.where(jnp.abs(t - 0.5) < 0.1, 1.0, 0.0),
     "a comparison": lambda t: t >= 1.0,
-    "turns of a loop": lambda t: jax.lax.fori_loop(0, jnp.floor(3.0 * t).astype(int), lambda _, x: x + 0.1, 0.0),
+    "turns of a loop": lambda t: jax.lax.fori_loop(
+        0, jnp.floor(3.0 * t).astype(int), lambda _, x: x + 0.1, 0.0
+    ),
 }
 
 
 @pytest.mark.parametrize("way", JUMPS)
 def test_an_input_of_a_row_that_jumps_is_refused(way):
     for motions, rates in ((jj.simulate, 1.0), (jj.rollout, np.array([1.0, 2.0]))):
-        with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = .* s, but velocity constraints depend on it"):
+        with pytest.raises(
+            ValueError,
+            match=r"input `speed` of `Towed` jumps at t = .* s, but velocity constraints depend on it",
+        ):
             motions(Towed(), {"x_rate": rates}, t1=2.0, inputs={"speed": JUMPS[way]})
 
 
 def test_an_input_of_a_row_may_bend_and_be_steep():
-    steep = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.tanh(1e4 * (t - 1.0))})
+    steep = jj.simulate(
+        Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.tanh(1e4 * (t - 1.0))}
+    )
     assert_allclose(steep.u_end, [0.0, 1.0], atol=1e-5)
-    motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5})
+    motion = jj.simulate(
+        Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5}
+    )
     assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0
 
 
@@ -245,7 +287,8 @@ def test_an_input_of_a_row_that_has_no_derivative_is_refused():
         jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": measured})
 
 
-# Inputs given by samples: steps end at their knots, so that no feature is passed over, however short it is and at whatever tolerance.
+# Inputs given by samples: steps end at their knots, so that no feature is passed over, however short it is
+# and at whatever tolerance.
 
 
 class Struck(OnLine):
@@ -270,7 +313,9 @@ LOOPS = {
 
 @pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
 def test_a_hammer_blow_of_a_millisecond_is_felt_in_every_loop(options):
-    motion = jj.simulate(Struck(), t1=10.0, inputs={"force": BLOW}, work=False, **({"ts": [10.0]} | options)).raise_if_failed()
+    motion = jj.simulate(
+        Struck(), t1=10.0, inputs={"force": BLOW}, work=False, **({"ts": [10.0]} | options)
+    ).raise_if_failed()
     if not isinstance(options.get("solver"), jj.ImplicitMidpoint):
         assert_allclose(motion.q_end[0], 0.5 * (10 - 2.0142), rtol=1e-9)
     assert_allclose(motion.u_end[0], 0.5, rtol=1e-9)
@@ -280,8 +325,14 @@ def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
     random = np.random.default_rng(7)
     for tolerance in (0.3, 1e-2, 1e-5, 1e-11):
         at, long, high = random.uniform(0.1, 9.0), 10 ** random.uniform(-6, -1), 10 ** random.uniform(-3, 4)
-        ts, values = at + long * np.array([-1.0, -0.5, 0.0, 0.2, 0.7]), high * np.array([0.0, 1.0, -1.0, 0.5, 0.0])  # to and fro
-        inputs = {"force": jj.Sampled([0.0, *ts], [0.0, *values]), "push": jj.Sampled([0.0, 10.0], [-1.0, 1.0])}
+        ts, values = (
+            at + long * np.array([-1.0, -0.5, 0.0, 0.2, 0.7]),
+            high * np.array([0.0, 1.0, -1.0, 0.5, 0.0]),
+        )  # to and fro
+        inputs = {
+            "force": jj.Sampled([0.0, *ts], [0.0, *values]),
+            "push": jj.Sampled([0.0, 10.0], [-1.0, 1.0]),
+        }
         motion = jj.simulate(Struck(), ts=[10.0], inputs=inputs, rtol=tolerance, atol=tolerance, work=False)
         grid = np.concatenate([[0.0], ts, [10.0]])
         impulse = np.trapezoid(np.concatenate([[0.0], values, [0.0]]), grid)  # that of the push is zero
@@ -291,7 +342,9 @@ def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
 def test_a_blow_within_thousands_of_samples_is_felt():
     ts = np.linspace(0.0, 10.0, 10_001)
     values = np.where((ts > 2.0135) & (ts < 2.0165), 1000.0, 0.0)
-    motion = jj.simulate(Struck(), ts=[10.0], inputs={"force": jj.Sampled(ts, values)}, rtol=1e-3, atol=1e-3, work=False)
+    motion = jj.simulate(
+        Struck(), ts=[10.0], inputs={"force": jj.Sampled(ts, values)}, rtol=1e-3, atol=1e-3, work=False
+    )
     assert_allclose(motion.u_end[0], np.trapezoid(values, ts) / 2, rtol=1e-9)
     assert int(motion.accepted) < 100  # the straight parts have no knots
 
@@ -309,7 +362,11 @@ def test_lanes_feel_blows_of_their_own_forwards_and_backwards():
     assert_allclose(end(at, 10.0, 0.0), 0.5 * at, rtol=1e-9)
 
 
-CLOCK, FORCE, PUSH = np.linspace(0.0, 2.0, 6), np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]), np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5])
+CLOCK, FORCE, PUSH = (
+    np.linspace(0.0, 2.0, 6),
+    np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]),
+    np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5]),
+)
 MODES = {
     "reverse": ({}, jax.grad),
     "forward": ({}, jax.jacfwd),
@@ -327,7 +384,9 @@ def rate_of_late(values, t0, t1):
 @pytest.mark.parametrize(("options", "slope"), MODES.values(), ids=MODES)
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 2.0), (1.6, 0.0)])
 @pytest.mark.parametrize("times", [11, 2], ids=["saved at the knots", "two inputs by one clock"])
-def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and_saved_times(options, slope, t0, t1, times):
+def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and_saved_times(
+    options, slope, t0, t1, times
+):
     def end(late):
         inputs = {"force": jj.Sampled(CLOCK + late, FORCE), "push": jj.Sampled(CLOCK, PUSH)}
         asked = {"inputs": inputs, "rtol": 1e-5, "atol": 1e-5, "work": False, "backend": "xla"} | options
@@ -341,7 +400,17 @@ def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and
 def test_a_saved_time_at_a_knot_moves_its_own_state_alone(backend):
     def states(ts):
         inputs = {"force": jj.Sampled(CLOCK, FORCE)}
-        return jj.simulate(Struck(mass=1.0), {}, t0=0.0, ts=ts, inputs=inputs, rtol=1e-5, atol=1e-5, work=False, backend=backend)["x"]
+        return jj.simulate(
+            Struck(mass=1.0),
+            {},
+            t0=0.0,
+            ts=ts,
+            inputs=inputs,
+            rtol=1e-5,
+            atol=1e-5,
+            work=False,
+            backend=backend,
+        )["x"]
 
     speeds = np.concatenate([[0.0], np.cumsum(np.diff(CLOCK) * (FORCE[1:] + FORCE[:-1]) / 2)])
     assert_allclose(jax.jit(jax.jacrev(states))(jnp.asarray(CLOCK)), np.diag(speeds), atol=1e-9)

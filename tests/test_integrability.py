@@ -1,4 +1,6 @@
-"""Which rows are holonomic: Frobenius row by row, and the growth of the admissible velocities; cyclic and ignorable coordinates."""
+"""Which rows are holonomic: Frobenius row by row, and the growth of the admissible velocities; cyclic and
+ignorable coordinates.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordina
 
 FACTS = [
     (models.HeisenbergParticle(), {"growth_vector": (2, 3)}),
-    (models.ChaplyginSleigh(), {"growth_vector": (2, 3), "cyclic_coordinates": (), "ignorable_coordinates": ("x", "y")}),
+    (
+        models.ChaplyginSleigh(),
+        {"growth_vector": (2, 3), "cyclic_coordinates": (), "ignorable_coordinates": ("x", "y")},
+    ),
     (models.VerticalDisc(), {"growth_vector": (2, 3, 4)}),
     (models.BallOnTurntable(), {"growth_vector": (3, 5)}),
     (
@@ -19,10 +24,21 @@ FACTS = [
             "growth_vector": (2, 3, 4),
             "nonholonomic_rows": ("wheel1 slip[0]", "wheel1 slip[1]", "wheel2 slip[0]", "wheel2 slip[1]"),
             "holonomic_rows_together": 8,  # eight of the ten
-            "cyclic_coordinates": ("x1", "y1", "z1", "x2", "y2", "z2", "psi2"),  # Wang and Pao (2003), section VI; as free bodies z1 and z2 too
+            "cyclic_coordinates": (
+                "x1",
+                "y1",
+                "z1",
+                "x2",
+                "y2",
+                "z2",
+                "psi2",
+            ),  # Wang and Pao (2003), section VI; as free bodies z1 and z2 too
         },
     ),
-    (models.TwoWheelAxleQuasi(), {"growth_vector": (2, 3, 4), "cyclic_coordinates": ("x1", "y1", "x2", "y2", "psi2")}),
+    (
+        models.TwoWheelAxleQuasi(),
+        {"growth_vector": (2, 3, 4), "cyclic_coordinates": ("x1", "y1", "x2", "y2", "psi2")},
+    ),
     (
         models.TiltingDiscQuaternion(),
         {
@@ -31,11 +47,24 @@ FACTS = [
             "nonholonomic_rows": ("rim slip[0]", "rim slip[1]"),
         },
     ),
-    (models.TiltingDisc(), {"cyclic_coordinates": ("x", "y"), "ignorable_coordinates": ("x", "y", "yaw", "spin")}),
-    (models.DoublePendulumRods(), {"growth_vector": (2,), "integrable_rows": ("upper rod", "lower rod"), "nonholonomic_rows": ()}),
+    (
+        models.TiltingDisc(),
+        {"cyclic_coordinates": ("x", "y"), "ignorable_coordinates": ("x", "y", "yaw", "spin")},
+    ),
+    (
+        models.DoublePendulumRods(),
+        {"growth_vector": (2,), "integrable_rows": ("upper rod", "lower rod"), "nonholonomic_rows": ()},
+    ),
     (models.Suslov(), {"cyclic_coordinates": (), "ignorable_coordinates": ("attitude",)}),  # as a whole
     # a row that keeps a speed is no differential form, and has no growth vector
-    (models.IsokineticParticle(), {"frobenius_violations": {"constant speed": np.inf}, "nonholonomic_rows": ("constant speed",), "growth_vector": ()}),
+    (
+        models.IsokineticParticle(),
+        {
+            "frobenius_violations": {"constant speed": np.inf},
+            "nonholonomic_rows": ("constant speed",),
+            "growth_vector": (),
+        },
+    ),
     # an affine row with an integrating factor is holonomic: rows leave a line
     (AffineRows(), {"nonholonomic_rows": (), "growth_vector": (1,), "holonomic_rows_together": 2}),
     # fields d/dz and d/dt - x d/dx - s z x d/dy: their bracket is -s x d/dy
@@ -57,7 +86,9 @@ def test_a_row_that_is_nearly_holonomic_is_found_not_to_be():
     weak, weaker = (jj.report(AffineRows(strength=s)) for s in (1e-3, 1e-6))
     assert weak.nonholonomic_rows == weaker.nonholonomic_rows == ("sheet",)
     # the violation is of first order in the strength
-    assert weak.frobenius_violations["sheet"] / weaker.frobenius_violations["sheet"] == pytest.approx(1e3, rel=1e-2)
+    assert weak.frobenius_violations["sheet"] / weaker.frobenius_violations["sheet"] == pytest.approx(
+        1e3, rel=1e-2
+    )
 
 
 def test_a_bicycle_ignores_its_place_its_heading_and_the_turns_of_its_wheels():

@@ -1,4 +1,6 @@
-"""Priors of parameters that were measured together: the posterior is that of Bayes' theorem, whichever way it is asked."""
+"""Priors of parameters that were measured together: the posterior is that of Bayes' theorem, whichever way it
+is asked.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,13 @@ from small_scenes import Cart
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import benchmark_from_measurements, measured_bicycle
-from jourdain_jax.identification import joint_normal, log_density, log_likelihood, planned_information, unbounded
+from jourdain_jax.identification import (
+    joint_normal,
+    log_density,
+    log_likelihood,
+    planned_information,
+    unbounded,
+)
 from jourdain_jax.studies import Normal
 
 TS = np.linspace(0.1, 3.0, 16)
@@ -23,11 +31,20 @@ APART = {name: Normal(MEAN[name], float(np.sqrt(COVARIANCE[k, k]))) for k, name 
 
 def run():
     x = np.asarray(jj.simulate(CART, {"x": 0.3}, t0=0.0, ts=TS, inputs=PUSH)["x"])
-    return jj.Experiment(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, inputs=PUSH, t0=0.0)
+    return jj.Experiment(
+        TS,
+        {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))},
+        0.01,
+        start={"x": 0.3},
+        inputs=PUSH,
+        t0=0.0,
+    )
 
 
 def planned(scene, data):
-    """Information of the data about the names, without and with what is known of them before; one program, which compiles in half of the time of its parts."""
+    """Information of the data about the names, without and with what is known of them before; one program,
+    which compiles in half of the time of its parts.
+    """
     return jax.jit(lambda: [planned_information(scene, data, free).matrix for free in (NAMES, TOGETHER)])()
 
 
@@ -42,14 +59,18 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
     assert_allclose(scale * slope, scale * pull, atol=2e-6)
     of_data, of_both = planned(found.scene, data)
     order = [found.labels.index(name) for name in NAMES]
-    assert_allclose(found.covariance[np.ix_(order, order)], np.linalg.inv(of_data + np.linalg.inv(COVARIANCE)), rtol=1e-5)
+    assert_allclose(
+        found.covariance[np.ix_(order, order)], np.linalg.inv(of_data + np.linalg.inv(COVARIANCE)), rtol=1e-5
+    )
     assert_allclose(of_both - of_data, np.linalg.inv(COVARIANCE), rtol=1e-6)
 
 
 def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
     one = run()
     start = {"x": jj.Estimate(prior=Normal(0.3, 0.01))}
-    data = [jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, inputs=PUSH, t0=0.0)] * 2
+    data = [
+        jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, inputs=PUSH, t0=0.0)
+    ] * 2
     for count in (1, 2):
         found = jj.fit(CART, data[:count], TOGETHER)
         of_data, of_both = planned(found.scene, data[:count])
@@ -98,9 +119,16 @@ def test_pendulum_readings_give_a_joint_prior():
     bicycle = benchmark_from_measurements("Browser")
     joint = bicycle.joint_prior
     assert list(joint) == list(bicycle.prior)
-    assert_allclose([prior.sigma for prior in joint.values()], [prior.sigma for prior in bicycle.prior.values()], rtol=1e-12)
+    assert_allclose(
+        [prior.sigma for prior in joint.values()],
+        [prior.sigma for prior in bicycle.prior.values()],
+        rtol=1e-12,
+    )
     pair = [joint["IBxx"], joint["IBzz"]]
-    (own,), which = {id(prior.covariance): prior.covariance for prior in pair}.values(), [prior.place for prior in pair]
+    (own,), which = (
+        {id(prior.covariance): prior.covariance for prior in pair}.values(),
+        [prior.place for prior in pair],
+    )
     of = [list(bicycle.values).index(name) for name in ("IBxx", "IBzz")]
     assert_allclose(own[np.ix_(which, which)], bicycle.covariance[np.ix_(of, of)], rtol=1e-9)
     published = measured_bicycle("Browser")

@@ -1,4 +1,6 @@
-"""Ready-made rows in motion: pins, welds, driven coordinates, planes that move or tilt, and Baumgarte's terms."""
+"""Ready-made rows in motion: pins, welds, driven coordinates, planes that move or tilt, and Baumgarte's
+terms.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,11 @@ class PendulumInAngle(jj.Scene):
 
     def bodies(self, t, q):
         frame = upright(q.angle)
-        return {"rod": jj.RigidBody.rod(self.mass, self.length, axis="x", position=0.5 * self.length * frame[:, 0], orientation=frame)}
+        return {
+            "rod": jj.RigidBody.rod(
+                self.mass, self.length, axis="x", position=0.5 * self.length * frame[:, 0], orientation=frame
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
@@ -38,7 +44,11 @@ class BodyPendulum(PendulumInAngle):
 
     def bodies(self, t, q):
         place = jnp.stack([q.x, 0.0, q.z])
-        return {"rod": jj.RigidBody.rod(self.mass, self.length, axis="x", position=place, orientation=upright(q.angle))}
+        return {
+            "rod": jj.RigidBody.rod(
+                self.mass, self.length, axis="x", position=place, orientation=upright(q.angle)
+            )
+        }
 
     def geometric_constraints(self, pose):
         end = pose["rod"].place([-0.5 * self.length, 0.0, 0.0])
@@ -59,7 +69,9 @@ def test_a_pinned_rod_is_the_pendulum_in_its_angle_and_the_pin_carries_newtons_f
     a = 0.4 * (acceleration[:, None] * along - rate[:, None] ** 2 * radial)
     expected = 1.2 * (a + jnp.array([0.0, GRAVITY]))
     reactions = pinned.constraint_forces()
-    found = sum(reactions.force[:, s, 0] for s, row in enumerate(reactions.row_names) if row.startswith("hinge"))
+    found = sum(
+        reactions.force[:, s, 0] for s, row in enumerate(reactions.row_names) if row.startswith("hinge")
+    )
     assert relative_error(found[:, [0, 2]], expected) <= tolerance("closed_form")
     assert np.all(reactions.determined)
 
@@ -81,8 +93,13 @@ class Welded(jj.Scene):
         return {"first": half(q.array[:3], q["a1"]), "second": half(q.array[7:10], q["a2"])}
 
     def geometric_constraints(self, pose):
-        joint = {"at_first": jnp.stack([0.5 * self.length, 0.0, 0.0]), "at_second": jnp.stack([-0.5 * self.length, 0.0, 0.0])}
-        return {"weld": jj.weld(pose["first"], pose["second"], **joint, turn=jj.rot_z(jnp.asarray(jnp.pi / 2)))}
+        joint = {
+            "at_first": jnp.stack([0.5 * self.length, 0.0, 0.0]),
+            "at_second": jnp.stack([-0.5 * self.length, 0.0, 0.0]),
+        }
+        return {
+            "weld": jj.weld(pose["first"], pose["second"], **joint, turn=jj.rot_z(jnp.asarray(jnp.pi / 2)))
+        }
 
 
 def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
@@ -91,7 +108,18 @@ def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
     assert structure.rank == 6
     assert structure.degrees_of_freedom == 6
     quarter = jj.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(jnp.pi / 2))
-    start = jj.start(scene, x1=0.0, y1=0.0, z1=0.0, a1=jnp.array([1.0, 0, 0, 0]), x2=0.25, y2=0.25, z2=0.0, a2=quarter, a1_omega=jnp.array([0.6, -1.1, 2.0]))
+    start = jj.start(
+        scene,
+        x1=0.0,
+        y1=0.0,
+        z1=0.0,
+        a1=jnp.array([1.0, 0, 0, 0]),
+        x2=0.25,
+        y2=0.25,
+        z2=0.0,
+        a2=quarter,
+        a1_omega=jnp.array([0.6, -1.1, 2.0]),
+    )
     motion = jj.simulate(scene, start, t1=3.0, ts=jnp.linspace(0.0, 3.0, 4), **TIGHT)
     motion.raise_if_failed()
     positions, velocities = motion.residuals()
@@ -101,7 +129,9 @@ def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
     momentum = sum(body.mass[:, None] * body.velocity for body in moving.bodies.values())
     spin = sum(
         body.mass[:, None] * jnp.cross(body.position, body.velocity)
-        + jnp.einsum("tij,tjk,tlk,tl->ti", body.orientation, body.body.inertia, body.orientation, body.angular_velocity)
+        + jnp.einsum(
+            "tij,tjk,tlk,tl->ti", body.orientation, body.body.inertia, body.orientation, body.angular_velocity
+        )
         for body in moving.bodies.values()
     )
     assert relative_error(momentum, jnp.broadcast_to(momentum[0], momentum.shape), 1.0) <= tolerance("drift")
@@ -145,10 +175,14 @@ def test_a_driven_coordinate_needs_the_force_of_the_closed_form_and_does_its_wor
 
 
 def test_baumgartes_terms_pull_a_start_off_the_constraints_back_as_their_own_oscillator():
-    """`gddot + 2 a gdot + b^2 g = 0` on the hinge: off by g0 at rest, critically damped `g = g0 (1 + a t) exp(-a t)`."""
+    """`gddot + 2 a gdot + b^2 g = 0` on the hinge: off by g0 at rest, critically damped
+    `g = g0 (1 + a t) exp(-a t)`.
+    """
     scene = BodyPendulum()
     q, u, _ = scene.named(x=0.4 * np.sin(0.9) + 1e-3, z=-0.4 * np.cos(0.9), angle=0.9)
-    off = jj.State(jnp.asarray(0.0), q, u, *(jnp.asarray(0.0),) * 3, (scene.coordinate_names, scene.speed_names))
+    off = jj.State(
+        jnp.asarray(0.0), q, u, *(jnp.asarray(0.0),) * 3, (scene.coordinate_names, scene.speed_names)
+    )
     ts = jnp.linspace(0.0, 1.0, 6)
     terms = jj.Baumgarte(alpha=4.0, beta=4.0)
     motion = jj.simulate(scene, off, ts=ts, formulation=jj.Formulation("full", stabilisation=terms), **TIGHT)

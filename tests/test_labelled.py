@@ -23,7 +23,11 @@ def motion():
 def lanes():
     chain = jj.models.TrailerChain(trailers=1)
     return jj.rollout(
-        chain, {**chain.towing([0.0, 0.0]), "forward0": np.linspace(0.5, 2.0, 3)}, parameters={"car_mass": np.array([1.0, 2.0, 3.0])}, ts=TIMES, progress=False
+        chain,
+        {**chain.towing([0.0, 0.0]), "forward0": np.linspace(0.5, 2.0, 3)},
+        parameters={"car_mass": np.array([1.0, 2.0, 3.0])},
+        ts=TIMES,
+        progress=False,
     )
 
 
@@ -88,7 +92,9 @@ def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, p
 
 
 def test_wrong_names_and_traced_motions_are_refused(motion):
-    with pytest.raises(ValueError, match="`units` names `xx`, which is not a coordinate or speed of `TiltingDiscQuaternion`"):
+    with pytest.raises(
+        ValueError, match="`units` names `xx`, which is not a coordinate or speed of `TiltingDiscQuaternion`"
+    ):
         motion.to_xarray(units={"xx": "m"})
     with pytest.raises(TypeError, match="`to_xarray` was called inside jit"):
         jax.jit(lambda m: m.to_xarray() or 0)(motion)
@@ -96,7 +102,14 @@ def test_wrong_names_and_traced_motions_are_refused(motion):
 
 def test_a_scene_shows_its_parameters_with_units_in_a_notebook(lanes):
     shown = jj.models.TiltingDisc(mass=2.5)._repr_html_()
-    for part in ("<b>TiltingDisc</b> A thin disc", ">mass</th>", ">2.5</td>", ">kg</td>", "coordinates: x, y, yaw, lean, spin", "speeds: x_rate"):
+    for part in (
+        "<b>TiltingDisc</b> A thin disc",
+        ">mass</th>",
+        ">2.5</td>",
+        ">kg</td>",
+        "coordinates: x, y, yaw, lean, spin",
+        "speeds: x_rate",
+    ):
         assert part in shown
     assert "&lt;" in type("Odd", (jj.models.TiltingDisc,), {"__doc__": "a <b"})()._repr_html_()
 
@@ -130,5 +143,7 @@ def test_a_rollout_shows_medians_and_bands_of_its_coordinates_in_a_notebook(lane
     assert shown.startswith("<pre>Rollout of TrailerChain: 3 lanes")
     assert len(drawn[0].axes) == len(names)
     assert [(len(axes.lines), len(axes.collections)) for axes in drawn[0].axes] == [(1, 2)] * len(names)
-    low, high = (float(x) for x in (lanes.quantiles("x0", [0.025]).min(), lanes.quantiles("x0", [0.975]).max()))
+    low, high = (
+        float(x) for x in (lanes.quantiles("x0", [0.025]).min(), lanes.quantiles("x0", [0.975]).max())
+    )
     assert f"x0: {low:.3g} to {high:.3g}" in [axes.get_title() for axes in drawn[0].axes]

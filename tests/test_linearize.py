@@ -1,4 +1,6 @@
-"""Linearisation on the constraint manifold, and families of steady motions: against published bicycles and closed forms."""
+"""Linearisation on the constraint manifold, and families of steady motions: against published bicycles and
+closed forms.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,8 @@ from jourdain_jax.equations import potential_energy, unconstrained_equations
 from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, WhippleBicycle
 from jourdain_jax.studies import Normal
 
-# Linearisation on the constraint manifold, against published bicycles, closed forms, and what a state that is not steady must show.
+# Linearisation on the constraint manifold, against published bicycles, closed forms, and what a state that is
+# not steady must show.
 
 
 SPEEDS = np.arange(11.0)
@@ -31,9 +34,13 @@ def _running(bicycle, speed, **values):
 
 @pytest.fixture(scope="module")
 def bicycles():
-    """The benchmark bicycle linearised at v = 0, 1 ... 10 m/s, one after the other: a batch of them would be compiled for one use."""
+    """The benchmark bicycle linearised at v = 0, 1 ... 10 m/s, one after the other: a batch of them would be
+    compiled for one use.
+    """
     bicycle = WhippleBicycle()
-    found = [linearize(bicycle, _running(bicycle, v), ("lean", "steer"), dependent=("pitch",)) for v in SPEEDS]
+    found = [
+        linearize(bicycle, _running(bicycle, v), ("lean", "steer"), dependent=("pitch",)) for v in SPEEDS
+    ]
     return jax.tree.map(lambda *x: np.stack(x), *found)
 
 
@@ -67,16 +74,24 @@ def test_lean_and_steer_torque_act_on_lean_and_steer(bicycles):
 
 
 def test_the_first_order_form_has_the_same_motion(bicycles):
-    """A and B in the lean and steer rows are the published state matrix; the dependent yaw rate is the published one."""
+    """A and B in the lean and steer rows are the published state matrix; the dependent yaw rate is the
+    published one.
+    """
     five = _lane(bicycles, 5)
     rows = [five.states.index(name) for name in ("lean", "steer", "lean_rate", "steer_rate")]
     A = np.asarray(five.A)
-    assert relative_error(A[np.ix_(rows, rows)], whipple_bicycle.state_matrix(5.0)) < tolerance("linearization")
-    assert relative_error(np.asarray(five.B)[rows[2:]], np.linalg.inv(whipple_bicycle.M)) < tolerance("linearization")
+    assert relative_error(A[np.ix_(rows, rows)], whipple_bicycle.state_matrix(5.0)) < tolerance(
+        "linearization"
+    )
+    assert relative_error(np.asarray(five.B)[rows[2:]], np.linalg.inv(whipple_bicycle.M)) < tolerance(
+        "linearization"
+    )
     # yaw to the left is positive here: yaw_rate = -(v steer + c steer_rate) cos(lam)/w
     expected = -np.cos(np.pi / 10) / 1.02 * np.array([5.0, 0.08])
     yaw = A[five.states.index("yaw")]
-    assert relative_error([yaw[five.states.index("steer")], yaw[five.states.index("steer_rate")]], expected) < tolerance("round_off")
+    assert relative_error(
+        [yaw[five.states.index("steer")], yaw[five.states.index("steer_rate")]], expected
+    ) < tolerance("round_off")
 
 
 def test_the_dependent_pitch_is_found_without_being_named():
@@ -134,12 +149,16 @@ def test_what_couples_the_named_coordinate_to_the_rest_is_reported():
     alone = linearize(disc, {"spin_rate": 4.0}, ("lean",))
     together = linearize(disc, {"spin_rate": 4.0})
     assert together.coordinates == ("yaw", "lean", "spin")
-    assert alone.coupling == pytest.approx(1.5, rel=1e-12)  # (C + m a^2) spin = 1.5 N m s, where nothing else is in C
+    assert alone.coupling == pytest.approx(
+        1.5, rel=1e-12
+    )  # (C + m a^2) spin = 1.5 N m s, where nothing else is in C
     assert together.coupling == 0.0
 
 
 def test_a_free_body_spins_stably_about_its_extreme_axes_only():
-    """Euler: perturbed rates go with s^2 = -(I2 - I1)(I2 - I3) w^2/(I1 I3) about axis 2; turns are seen from the turning body."""
+    """Euler: perturbed rates go with s^2 = -(I2 - I1)(I2 - I3) w^2/(I1 I3) about axis 2; turns are seen from
+    the turning body.
+    """
     body, rate = FreeRigidBody(), 2.0
     I = [float(body.i1), float(body.i2), float(body.i3)]
     for k, axis in enumerate("xyz"):
@@ -159,18 +178,28 @@ def test_a_prescribed_motion_is_not_steady_while_it_accelerates():
 
 def test_privileged_speeds_may_be_named_in_any_order():
     disc = TiltingDisc(**DISC)
-    circle = jj.steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate")).state
+    circle = jj.steady(
+        disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate")
+    ).state
     named = (None, "spin_rate yaw_rate lean_rate")
-    assert_allclose(*(linearize(disc, circle, privileged=speeds).state_eigenvalues() for speeds in named), atol=1e-12)
+    assert_allclose(
+        *(linearize(disc, circle, privileged=speeds).state_eigenvalues() for speeds in named), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_derivatives_pass_through_linearisation(derivative):
-    """Of the gravity term -m g a of lean in the radius, and of the gyroscopic one (C + m a^2) spin = 3/2 m a^2 spin."""
+    """Of the gravity term -m g a of lean in the radius, and of the gyroscopic one (C + m a^2) spin = 3/2 m
+    a^2 spin.
+    """
 
     def terms(radius):
         disc = TiltingDisc(**{**DISC, "radius": radius})
-        small = linearize(disc, jj.consistent(disc, 0.0, *disc.named(spin_rate=4.0, x_rate=4.0 * radius)[:2]), ("yaw", "lean", "spin"))
+        small = linearize(
+            disc,
+            jj.consistent(disc, 0.0, *disc.named(spin_rate=4.0, x_rate=4.0 * radius)[:2]),
+            ("yaw", "lean", "spin"),
+        )
         return jnp.stack([small.K[1, 1], small.C[1, 0]])
 
     assert_allclose(jax.jit(derivative(terms))(0.5), [-9.81, -3.0 * 0.5 * 4.0], rtol=tolerance("round_off"))
@@ -224,7 +253,8 @@ def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve()
         linearize(scene, state, (), privileged=("heading_rate", "steer_rate"))
 
 
-# Families of steady motions: whole curves, their special points, stability; digits from independent equations (Newton-Euler in the turning frame).
+# Families of steady motions: whole curves, their special points, stability; digits from independent equations
+# (Newton-Euler in the turning frame).
 
 
 NAMES = ("lean", "steer", "pitch", "yaw_rate", "rear_spin_rate", "front_spin_rate")
@@ -263,7 +293,9 @@ def test_hands_free_turns_are_one_closed_curve_with_every_digit(turns):
     for lean in (0.1, 0.4):
         points = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])
         assert len(points) == 4  # two ways of turning, forward and backward
-        for point, expected in zip(points, (FIRST_HALF[lean], SECOND_HALF[lean], SECOND_HALF[lean], FIRST_HALF[lean]), strict=True):
+        for point, expected in zip(
+            points, (FIRST_HALF[lean], SECOND_HALF[lean], SECOND_HALF[lean], FIRST_HALF[lean]), strict=True
+        ):
             assert_allclose(magnitudes(point), (lean, *expected), rtol=0, atol=2e-11)
             assert point.state.residual < 1e-10
 
@@ -278,7 +310,10 @@ def test_folds_and_rest_of_the_turns(turns):
 
 
 def test_the_third_family_runs_through_its_fold_to_the_other_side(bicycle):
-    found = jj.family(bicycle, {"lean": 0.9, "steer": 0.25, "yaw_rate": -2.57, "rear_spin_rate": 22.2, "front_spin_rate": 20.6})
+    found = jj.family(
+        bicycle,
+        {"lean": 0.9, "steer": 0.25, "yaw_rate": -2.57, "rear_spin_rate": 22.2, "front_spin_rate": 20.6},
+    )
     expected = (0.9, 0.253265658718, 0.005858374011, 2.569920264555, 22.179528967864, 20.642557477777)
     assert_allclose(magnitudes(*found.at(lean=0.9)), expected, atol=1e-10)
     assert min(abs(abs(fold["lean"]) - 0.4811) for fold in found.folds if fold.kind == "fold in lean") < 5e-5
@@ -288,12 +323,19 @@ def test_the_third_family_runs_through_its_fold_to_the_other_side(bicycle):
 
 def test_straight_running_crosses_the_turns_at_the_capsize_speed(turns, straight):
     for family in (turns, straight):
-        assert sorted(point["x_rate"] for point in family.branches) == pytest.approx([-CAPSIZE, CAPSIZE], abs=1e-9)
+        assert sorted(point["x_rate"] for point in family.branches) == pytest.approx(
+            [-CAPSIZE, CAPSIZE], abs=1e-9
+        )
     assert not any(point.differentiable for point in straight.branches)
 
 
 def test_speeds_of_the_modes_are_the_published_ones(straight):
-    changes = {(point.kind, name): point["x_rate"] for point in straight.changes for name in point.modes if point["x_rate"] > 0}
+    changes = {
+        (point.kind, name): point["x_rate"]
+        for point in straight.changes
+        for name in point.modes
+        if point["x_rate"] > 0
+    }
     which = ("pair on the imaginary axis", "weave"), ("zero eigenvalue", "capsize"), ("double root", "weave")
     assert_allclose([changes[one] for one in which], (WEAVE, CAPSIZE, DOUBLE), atol=1e-9)
     speeds = straight["x_rate"]
@@ -313,12 +355,16 @@ def test_columns_are_those_of_the_modes(straight, bicycle):
 
 def test_a_slow_start_does_not_misname_what_passes_zero_at_the_capsize_speed():
     """Castering and capsize of this bicycle are a pair at 1.7 m/s."""
-    slow = jj.family(measured_bicycle("Browser").scene, {"rear_spin_rate": 5.0}, until={"rear_spin_rate": 35.0})
+    slow = jj.family(
+        measured_bicycle("Browser").scene, {"rear_spin_rate": 5.0}, until={"rear_spin_rate": 35.0}
+    )
     assert [point.modes for point in slow.changes if point.kind == "zero eigenvalue"] == [("capsize",)]
 
 
 def test_the_same_turn_ridden_backward_has_opposite_eigenvalues(turns):
-    forward, backward = (sorted(turns.at(lean=0.3), key=lambda point: point["rear_spin_rate"])[k] for k in (3, 0))
+    forward, backward = (
+        sorted(turns.at(lean=0.3), key=lambda point: point["rear_spin_rate"])[k] for k in (3, 0)
+    )
     assert_allclose(np.sort_complex(backward.eigenvalues), np.sort_complex(-forward.eigenvalues), atol=1e-8)
 
 
@@ -339,8 +385,14 @@ def test_an_upright_disc_is_stable_above_its_critical_spin():
 
 
 def test_steady_turns_of_a_disc_meet_their_closed_form():
-    found = jj.family(TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0})
-    assert_allclose(found["spin_rate"], -rolling_disc.steady_circle(np.pi / 2 + 0.3, found["yaw_rate"], **DISC)["spin_rate"], atol=1e-9)
+    found = jj.family(
+        TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0}
+    )
+    assert_allclose(
+        found["spin_rate"],
+        -rolling_disc.steady_circle(np.pi / 2 + 0.3, found["yaw_rate"], **DISC)["spin_rate"],
+        atol=1e-9,
+    )
 
 
 def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
@@ -398,7 +450,12 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
     _, (axis,) = jj.plot(turns, "x_rate", "lean", units={"lean": "deg"})
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("x_rate", "lean in deg")
     assert max(axis.lines[0].get_ydata()) == pytest.approx(np.rad2deg(0.4200892), abs=0.2)
-    assert {text.get_text() for text in axis.get_legend().get_texts()} == {"unstable", "fold", "branch point", "eigenvalues meet or cross"}
+    assert {text.get_text() for text in axis.get_legend().get_texts()} == {
+        "unstable",
+        "fold",
+        "branch point",
+        "eigenvalues meet or cross",
+    }
     stable = jj.plot(straight, "x_rate", "rear_spin_rate")[1][0].lines[1].get_ydata()
     assert np.isfinite(stable).sum() == straight.stable.sum() > 0
     with pytest.raises(ValueError, match="got 1 names"):
@@ -412,10 +469,22 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
         ({"leen": 0.3}, {}, "did you mean `lean`"),
         ({"lean": 0.3}, {"vary": "radios"}, "did you mean `radius`"),
         ({"lean": 0.3}, {"until": {"x": 1.0}}, "`x` is not an unknown"),
-        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {"held": "lean", "names": ("one",)}, "expected one for each of the 2 modes"),
+        (
+            {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0},
+            {"held": "lean", "names": ("one",)},
+            "expected one for each of the 2 modes",
+        ),
         ({"lean": float("nan")}, {}, "undefined near the guess"),
-        ({"spin_rate": -4.0}, {"held": "lean", "until": {"spin_rate": float("nan")}}, "`until` of `spin_rate` is nan, expected a finite"),
-        ({"spin_rate": -4.0}, {"held": "lean", "until": {"spin_rate": "far"}}, "`until` of `spin_rate` is .*expected real numbers"),
+        (
+            {"spin_rate": -4.0},
+            {"held": "lean", "until": {"spin_rate": float("nan")}},
+            "`until` of `spin_rate` is nan, expected a finite",
+        ),
+        (
+            {"spin_rate": -4.0},
+            {"held": "lean", "until": {"spin_rate": "far"}},
+            "`until` of `spin_rate` is .*expected real numbers",
+        ),
     ],
 )
 def test_what_cannot_be_followed_is_refused(guess, options, says):
@@ -431,7 +500,9 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
     with pytest.raises(ValueError, match="expected two axes"):
         jj.stability_chart(bicycle, {"c": (0.02, 0.12)})
     with pytest.raises(ValueError, match=r"`prior` is .*expected `jj.studies.Normal"):
-        jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (9.0, 10.0)}, prior={"w": 0.1}, points=3)
+        jj.stability_chart(
+            bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (9.0, 10.0)}, prior={"w": 0.1}, points=3
+        )
     with pytest.raises(ValueError, match="one name with its value"):
         turns.at(lean=0.1, steer=0.1)
     with pytest.raises(KeyError, match="did you mean `lean`"):
@@ -493,7 +564,9 @@ def test_critical_speeds_have_derivatives_by_all_parameters(bicycle, straight):
 
 
 def linear_speeds(c):
-    return stability_speeds(*linear_matrices({name: getattr(WhippleBicycle(), name) for name in PARAMETER_NAMES} | {"c": c}))
+    return stability_speeds(
+        *linear_matrices({name: getattr(WhippleBicycle(), name) for name in PARAMETER_NAMES} | {"c": c})
+    )
 
 
 def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
@@ -507,16 +580,29 @@ def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
 
 def test_a_chart_has_the_speeds_of_stability_as_its_boundaries_and_what_measurements_leave_open(bicycle):
     prior = {"w": Normal(1.02, 0.01), "lam": Normal(0.314, 0.005), "c": Normal(0.08, 1.0)}
-    chart = jj.stability_chart(bicycle, {"c": (0.04, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3, prior=prior)
+    chart = jj.stability_chart(
+        bicycle, {"c": (0.04, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3, prior=prior
+    )
     linear = linear_speeds(0.12)
-    assert_allclose([curve.speed[2] for _, curve in chart.boundaries], [linear.weave_speed, linear.capsize_speed], rtol=1e-12)
+    assert_allclose(
+        [curve.speed[2] for _, curve in chart.boundaries],
+        [linear.weave_speed, linear.capsize_speed],
+        rtol=1e-12,
+    )
     slopes = np.array([whipple_bicycle.AT_5["w"][2:], whipple_bicycle.AT_5["lam"][2:]])
-    assert_allclose([band[1] for band in chart.bands], np.hypot(0.01 * slopes[0], 0.005 * slopes[1]) / 0.3, rtol=1e-9)
-    assert str(chart) == "weave, pair on the imaginary axis: 3 of 3 found\ncapsize, zero eigenvalue: 3 of 3 found"
+    assert_allclose(
+        [band[1] for band in chart.bands], np.hypot(0.01 * slopes[0], 0.005 * slopes[1]) / 0.3, rtol=1e-9
+    )
+    assert (
+        str(chart)
+        == "weave, pair on the imaginary axis: 3 of 3 found\ncapsize, zero eigenvalue: 3 of 3 found"
+    )
 
 
 @pytest.mark.parametrize("place", [0.0123, 0.05, 0.0877])
-@pytest.mark.parametrize(("damped", "kind"), [(1.0, "fold in push"), (1.0, "zero eigenvalue"), (0.0, "pair on the imaginary axis")])
+@pytest.mark.parametrize(
+    ("damped", "kind"), [(1.0, "fold in push"), (1.0, "zero eigenvalue"), (0.0, "pair on the imaginary axis")]
+)
 def test_two_special_points_a_hundredth_of_a_step_apart_are_found(place, damped, kind):
     for apart, expected in ((1e-6, [-5e-4, 5e-4]), (-1e-6, [])):
         scene = Twice(place=place, apart=apart, damped=damped)
@@ -525,7 +611,9 @@ def test_two_special_points_a_hundredth_of_a_step_apart_are_found(place, damped,
 
 
 class Fluttering(OnLine):
-    """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed back."""
+    """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed
+    back.
+    """
 
     gain: float = jj.parameter(0.5)
     drag: float = jj.parameter(1.0)
@@ -546,9 +634,13 @@ def frequency(stiffness):
 
 def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
     curve = jj.family(Fluttering(), {"x": 0.2}, vary="gain", until={"gain": 3.0})
-    critical = lambda drag, stiffness: jj.critical(Fluttering(drag=drag, stiffness=stiffness), curve, "pair on the imaginary axis")  # noqa: E731
+    critical = lambda drag, stiffness: jj.critical(
+        Fluttering(drag=drag, stiffness=stiffness), curve, "pair on the imaginary axis"
+    )
     assert float(critical(1.5, 5.0)["gain"]) == pytest.approx(1.5, rel=1e-12)
-    assert_allclose(jax.jit(jax.grad(lambda x: critical(*x)["gain"]))(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11)
+    assert_allclose(
+        jax.jit(jax.grad(lambda x: critical(*x)["gain"]))(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11
+    )
     of_stiffness = jax.jit(jax.hessian(lambda k: critical(1.5, k).eigenvalue.imag))(5.0)
     assert float(of_stiffness) == pytest.approx(float(jax.jit(jax.hessian(frequency))(5.0)), rel=1e-9)
 

@@ -49,7 +49,9 @@ KINKS = {
     "Hertz": lambda m, p: 1e5 * jnp.maximum(p - m.q.y, 0.0) ** 1.5,
     "Hunt and Crossley": lambda m, p: 1e5 * jnp.maximum(p - m.q.y, 0.0) ** 1.5 * (1.0 - 0.3 * m.u.y_rate),
     "equal pieces": lambda m, p: jnp.where(m.q.x > p, m.q.x**2, p**2 + 2.0 * p * (m.q.x - p)),
-    "a guarded quotient": lambda m, p: jnp.where(m.q.x == 0.0, 1.0, jnp.sin(m.q.x) / jnp.where(m.q.x == 0.0, 1.0, m.q.x)),
+    "a guarded quotient": lambda m, p: jnp.where(
+        m.q.x == 0.0, 1.0, jnp.sin(m.q.x) / jnp.where(m.q.x == 0.0, 1.0, m.q.x)
+    ),
     "a root of what may be negative": lambda m, p: jnp.sqrt(m.q.y) + jnp.abs(m.q.x),
     "a pole": lambda m, p: p / m.q.x + jnp.abs(m.q.y),
     "a table that slides": lambda m, p: jnp.interp(m.t, TS + p, jnp.cos(TS)),
@@ -61,7 +63,13 @@ def end(push, start=0.4, **options):
     """Where the particle ends, as a function of its speed along x."""
 
     def of(speed, size=0.4):
-        motion = jj.simulate(Pushed(push=push, size=size), {"x": start, "x_rate": speed, "y_rate": 0.1}, ts=[1.0], work=False, **options)
+        motion = jj.simulate(
+            Pushed(push=push, size=size),
+            {"x": start, "x_rate": speed, "y_rate": 0.1},
+            ts=[1.0],
+            work=False,
+            **options,
+        )
         return motion.q_end[1]
 
     return of
@@ -72,7 +80,11 @@ def warned(f, *arguments):
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
         jax.block_until_ready(f(*arguments))
-    return [str(w.message) for w in given if issubclass(w.category, jj.SensitivityWarning) and "jump" in str(w.message)]
+    return [
+        str(w.message)
+        for w in given
+        if issubclass(w.category, jj.SensitivityWarning) and "jump" in str(w.message)
+    ]
 
 
 @pytest.mark.parametrize("name", JUMPS)
@@ -106,7 +118,9 @@ class UntilThere(Pushed):
 
 
 def test_a_motion_that_ends_at_the_jump_and_another_after_it_have_the_right_derivative():
-    """With the jump at s = 0.2/k, y(1) = s^2/2 + s (1 - s) + (1 - s)^2 and dy/dk = -(1 - s) ds/dk = 0.2 (1 - s)/k^2."""
+    """With the jump at s = 0.2/k, y(1) = s^2/2 + s (1 - s) + (1 - s)^2 and dy/dk = -(1 - s) ds/dk = 0.2 (1 -
+    s)/k^2.
+    """
     before, after = UntilThere(push=lambda m, p: 1.0 + 0.0 * p), Pushed(push=lambda m, p: 2.0 + 0.0 * p)
 
     def in_two(k):
@@ -133,7 +147,11 @@ def test_values_kinks_and_times_that_no_parameter_moves_do_not_warn():
 def test_derivatives_of_lanes_warn():
     def mean(size, backend):
         options = {"ts": [0.5], "work": False, "backend": backend}
-        lanes = jj.rollout(Pushed(push=JUMPS["at a place"], size=size), {"x": jnp.array([0.0, 1.0]), "x_rate": jnp.array([1.0, 2.0]) * size}, **options)
+        lanes = jj.rollout(
+            Pushed(push=JUMPS["at a place"], size=size),
+            {"x": jnp.array([0.0, 1.0]), "x_rate": jnp.array([1.0, 2.0]) * size},
+            **options,
+        )
         return jnp.mean(lanes["y"][:, -1])
 
     assert not warned(jax.grad(mean), 0.3, "native")
@@ -163,7 +181,10 @@ PULLS = {
     "steps": (True, lambda on: lambda t: jnp.floor(t / (0.5 * on))),
     "switched on at a time that does not move": (False, lambda on: lambda t: jnp.where(t > 0.4, on, 0.0)),
     "a ramp": (False, lambda on: lambda t: jnp.clip(3.0 * (t - on), 0.0, 1.0)),
-    "samples": (False, lambda on: jj.Sampled(jnp.stack([0.0 * on, on, 2.0 * on]), jnp.array([0.0, 1.0, 0.0]))),
+    "samples": (
+        False,
+        lambda on: jj.Sampled(jnp.stack([0.0 * on, on, 2.0 * on]), jnp.array([0.0, 1.0, 0.0])),
+    ),
 }
 
 
@@ -175,7 +196,9 @@ def test_inputs_that_jump_at_a_time_that_moves(name):
     options = {"backend": "xla"} if name == "samples" else {"backend": "dense"} if jumps else {}
 
     def f(on):
-        return jj.simulate(ByInput(push=KINKS["smooth"]), {}, ts=[1.0], inputs={"pull": pull(on)}, work=False, **options).q_end[0]
+        return jj.simulate(
+            ByInput(push=KINKS["smooth"]), {}, ts=[1.0], inputs={"pull": pull(on)}, work=False, **options
+        ).q_end[0]
 
     for slope in (jax.grad(f), jax.jacfwd(f))[: 1 + jumps]:
         assert len(warned(slope, 0.4)) == jumps
@@ -186,7 +209,9 @@ def test_a_derivative_along_which_no_time_moves_does_not_warn():
 
     def f(on, size):
         scene = ByInput(push=KINKS["smooth"], size=size)
-        return jj.simulate(scene, {}, ts=[1.0], inputs={"pull": pull(on)}, work=False, backend="dense").q_end[0]
+        return jj.simulate(scene, {}, ts=[1.0], inputs={"pull": pull(on)}, work=False, backend="dense").q_end[
+            0
+        ]
 
     assert len(warned(jax.grad(f, 0), 0.4, 0.4)) == 1
     assert not warned(jax.grad(f, 1), 0.4, 0.4)
@@ -203,9 +228,13 @@ SMOOTH = {
     "stiff": lambda m, p: -p * jnp.sin(m.q.x) + 1e6 * (m.q.y + m.u.y_rate),
     "steep": lambda m, p: -p * jnp.tanh(1e5 * m.u.y_rate) + 1e3 * jnp.abs(m.q.x - 0.1),
     "air, Hertz and a guarded quotient": lambda m, p: (
-        -1e3 * p * jnp.abs(m.u.y_rate) * m.u.y_rate + 1e5 * jnp.maximum(-m.q.y, 0.0) ** 1.5 + KINKS["a guarded quotient"](m, p)
+        -1e3 * p * jnp.abs(m.u.y_rate) * m.u.y_rate
+        + 1e5 * jnp.maximum(-m.q.y, 0.0) ** 1.5
+        + KINKS["a guarded quotient"](m, p)
     ),
-    "tables": lambda m, p: jj.Spline(TS, jnp.sin(3.0 * TS))(m.q.x + 0.5) + jnp.interp(m.q.x + 0.3, TS, jnp.sin(TS)),
+    "tables": lambda m, p: (
+        jj.Spline(TS, jnp.sin(3.0 * TS))(m.q.x + 0.5) + jnp.interp(m.q.x + 0.3, TS, jnp.sin(TS))
+    ),
     "large and far away": lambda m, p: 1e9 + 1e3 * jnp.where(m.q.x > 1.0, 2.0, m.q.x),
 }
 AT_REST = ROUGH | SMOOTH
@@ -216,12 +245,16 @@ def test_linearizing_where_a_load_has_no_slope_warns(name):
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
         jj.linearize(Pushed(push=AT_REST[name]), {"x": 0.0, "y": 0.0, "x_rate": 0.0, "y_rate": 0.0})
-    assert ["the force along `y_rate`" in str(w.message) for w in given if w.category is jj.SensitivityWarning] == [True] * (name in ROUGH)
+    assert [
+        "the force along `y_rate`" in str(w.message) for w in given if w.category is jj.SensitivityWarning
+    ] == [True] * (name in ROUGH)
 
 
 def test_a_linearization_at_rest_on_dry_friction_says_so():
     scene = Pushed(push=JUMPS["friction"])
-    with pytest.warns(jj.SensitivityWarning, match="the force along `y_rate` has no derivative at this state") as said:
+    with pytest.warns(
+        jj.SensitivityWarning, match="the force along `y_rate` has no derivative at this state"
+    ) as said:
         jj.linearize(scene, {"y_rate": 0.0})
     assert said[0].filename == __file__
     with warnings.catch_warnings():

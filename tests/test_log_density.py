@@ -25,7 +25,13 @@ def closed(start, damping, stiffness, mass=2.0):
 def runs(sigma=0.02, starts=(0.3, -0.2)):
     noise = np.random.default_rng(2)
     return [
-        jj.Experiment(TS, {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))}, sigma, start={"x": x + 0.01}, unknown_start=("x",))
+        jj.Experiment(
+            TS,
+            {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))},
+            sigma,
+            start={"x": x + 0.01},
+            unknown_start=("x",),
+        )
         for x in starts
     ]
 
@@ -33,7 +39,12 @@ def runs(sigma=0.02, starts=(0.3, -0.2)):
 def by_hand(theta, data, sigma):
     """`log p` in the unknowns themselves."""
     damping, stiffness, *starts = theta
-    r = jnp.stack([(closed(x, damping, stiffness) - run.values["x"]) / sigma for x, run in zip(starts, data, strict=True)])
+    r = jnp.stack(
+        [
+            (closed(x, damping, stiffness) - run.values["x"]) / sigma
+            for x, run in zip(starts, data, strict=True)
+        ]
+    )
     likelihood = -0.5 * jnp.sum(r**2) - r.size * jnp.log(sigma * jnp.sqrt(2 * jnp.pi))
     return likelihood - 0.5 * ((stiffness - 5.2) / 0.4) ** 2 - jnp.log(0.4 * jnp.sqrt(2 * jnp.pi))
 
@@ -60,7 +71,12 @@ def test_density_is_likelihood_times_prior_times_derivative_of_the_transforms():
 
 
 def remembering():
-    return [jj.Experiment(run.ts, run.values, None, start=run.start, unknown_start=run.unknown_start, correlation_time=None) for run in runs()]
+    return [
+        jj.Experiment(
+            run.ts, run.values, None, start=run.start, unknown_start=run.unknown_start, correlation_time=None
+        )
+        for run in runs()
+    ]
 
 
 def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
@@ -77,9 +93,18 @@ def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
         tau = -h / jnp.log(jnp.sin(angle))
         covariance = sigma**2 * jnp.exp(-jnp.abs(TS[:, None] - TS) / tau)
         likelihoods = [
-            jax.scipy.stats.multivariate_normal.logpdf(run.values["x"], closed(x, damping, stiffness), covariance) for x, run in zip(starts, data, strict=True)
+            jax.scipy.stats.multivariate_normal.logpdf(
+                run.values["x"], closed(x, damping, stiffness), covariance
+            )
+            for x, run in zip(starts, data, strict=True)
         ]
-        slopes = jax.nn.log_sigmoid(z[0]) + jax.nn.log_sigmoid(-z[0]) + z[1] + jax.nn.log_sigmoid(z[5]) + jax.nn.log_sigmoid(-z[5])
+        slopes = (
+            jax.nn.log_sigmoid(z[0])
+            + jax.nn.log_sigmoid(-z[0])
+            + z[1]
+            + jax.nn.log_sigmoid(z[5])
+            + jax.nn.log_sigmoid(-z[5])
+        )
         return sum(likelihoods) - 0.5 * ((stiffness - 5.2) / 0.4) ** 2 + slopes
 
     first = density.initial
@@ -95,15 +120,29 @@ def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
     assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
     assert_allclose(middle["x.sigma"], fit.sigma["x"], rtol=1e-12)
     in_white, plain = jax.jit(lambda z: white(z)), [value, of_both(density.unconstrain(middle))[0]]
-    assert_allclose(np.diff([in_white(white.unconstrain(point)) for point in (density.named(other), middle)]), np.diff(plain), atol=1e-8)
-    here, *around = (in_white(0.1 * z) for z in np.concatenate([np.zeros((1, 6)), np.eye(6)[:5], -np.eye(6)[:5]]))
-    assert_allclose((np.array(around[:5]) + np.array(around[5:]) - 2 * here) / 0.01, -1.0, atol=0.1)  # nearly round
+    assert_allclose(
+        np.diff([in_white(white.unconstrain(point)) for point in (density.named(other), middle)]),
+        np.diff(plain),
+        atol=1e-8,
+    )
+    here, *around = (
+        in_white(0.1 * z) for z in np.concatenate([np.zeros((1, 6)), np.eye(6)[:5], -np.eye(6)[:5]])
+    )
+    assert_allclose(
+        (np.array(around[:5]) + np.array(around[5:]) - 2 * here) / 0.01, -1.0, atol=0.1
+    )  # nearly round
 
 
 def test_unknowns_lead_back_and_stay_finite_far_away():
     start = {"x": unbounded(1.0), "x_rate": jj.bounds(-1.0, 3.0)}
     free = {"stiffness": jj.positive()}
-    data = jj.Experiment(np.linspace(0.0, 1.0, 5), {"x": np.zeros(5)}, 0.1, start={"x": 0.1, "x_rate": 0.5}, unknown_start=start)
+    data = jj.Experiment(
+        np.linspace(0.0, 1.0, 5),
+        {"x": np.zeros(5)},
+        0.1,
+        start={"x": 0.1, "x_rate": 0.5},
+        unknown_start=start,
+    )
     density = log_density(Oscillator(), data, free)
     x = jnp.array([[-2.0, 0.3, 1.5], [3.0, 800.0, -20.0]])
     for point in x:

@@ -1,4 +1,5 @@
-"""Long chains of bodies take a time in proportion to their length: counted in operations and entries, not in seconds.
+"""Long chains of bodies take a time in proportion to their length: counted in operations and entries, not in
+seconds.
 
 Sparse matrices are compared with dense matrices.
 """
@@ -19,7 +20,9 @@ from jourdain_jax.structure.assembly import assemble
 
 
 def links(count) -> tuple[Pattern, np.ndarray]:
-    """Rods in a row whose ends are points of a plane, and points on a zigzag: their rows in an order of no use."""
+    """Rods in a row whose ends are points of a plane, and points on a zigzag: their rows in an order of no
+    use.
+    """
     order = np.random.default_rng(0).permutation(count)
     entries = [(int(order[i]), 2 * j + axis) for i in range(count) for j in (i, i + 1) for axis in range(2)]
     points = np.stack([np.arange(count + 1.0), np.arange(count + 1) % 2 * 0.3], axis=1).ravel()
@@ -31,7 +34,10 @@ def looking(pattern: Pattern, squares: np.ndarray):
 
     def look(q, which):
         G = np.zeros((len(q), *pattern.shape))
-        difference = [q[:, pattern.columns[4 * k + 2 : 4 * k + 4]] - q[:, pattern.columns[4 * k : 4 * k + 2]] for k in range(pattern.shape[0])]
+        difference = [
+            q[:, pattern.columns[4 * k + 2 : 4 * k + 4]] - q[:, pattern.columns[4 * k : 4 * k + 2]]
+            for k in range(pattern.shape[0])
+        ]
         for k, d in enumerate(difference):
             row = pattern.rows[4 * k]
             G[:, row, pattern.columns[4 * k : 4 * k + 4]] = np.concatenate([-2 * d, 2 * d], axis=1)
@@ -86,7 +92,9 @@ def test_what_acts_by_less_than_round_off_is_not_left_out():
     graph = Graph()
     headings = [graph.input(f"q_{i}", True) for i in range(n)]
     rate = graph.one
-    for q in headings:  # the last one changes the rate by some 1e-5 to the power of the number of those before
+    for (
+        q
+    ) in headings:  # the last one changes the rate by some 1e-5 to the power of the number of those before
         rate = graph.add(graph.one, graph.mul(graph.const(1e-5), graph.mul(graph.call("cos", q), rate)))
     states = {f"q_{i}": np.random.default_rng(i).normal(size=12) for i in range(n)}
     builder = SimpleNamespace(graph=graph, identity_probes=identity_probes(Probes(graph, states), ()))

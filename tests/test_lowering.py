@@ -41,12 +41,19 @@ def test_scenes_without_rows_and_with_multipliers_are_shortened_too():
 
 def test_the_summary_says_what_was_dropped_and_chosen():
     text = str(jj.lower(MODELS["tilting-disc"]()))
-    for part in ("independent speeds: yaw_rate, lean_rate, spin_rate", "eliminated: x_rate, y_rate", "x, y, yaw, spin", "operations"):
+    for part in (
+        "independent speeds: yaw_rate, lean_rate, spin_rate",
+        "eliminated: x_rate, y_rate",
+        "x, y, yaw, spin",
+        "operations",
+    ):
         assert part in text
 
 
 class Rough(jj.Scene):
-    """A bead on a rough wire, pushed while it is slow or far: signs, sizes, choices, and names that a program might use itself."""
+    """A bead on a rough wire, pushed while it is slow or far: signs, sizes, choices, and names that a program
+    might use itself.
+    """
 
     mass: float = jj.parameter(1.3, unit="kg", positive=True)
     k1: float = jj.parameter(2.0, unit="N/m")
@@ -59,10 +66,19 @@ class Rough(jj.Scene):
     def loads(self, motion):
         x, v = motion.q.s0, motion.u.s0_rate
         push = jnp.where((jnp.abs(v) < 0.5) | ~(x < 1.0), jnp.maximum(x, 0.1), 0.0)
-        return (jj.generalized_force(motion, s0_rate=push - self.k1 * x - self.double * jnp.sign(v), rates_rate=-self.double * jnp.sin(motion.t)),)
+        return (
+            jj.generalized_force(
+                motion,
+                s0_rate=push - self.k1 * x - self.double * jnp.sign(v),
+                rates_rate=-self.double * jnp.sin(motion.t),
+            ),
+        )
 
 
-PRINTED = {name: MODELS[name]() for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")} | {"rough": Rough()}
+PRINTED = {
+    name: MODELS[name]()
+    for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")
+} | {"rough": Rough()}
 
 
 @cache
@@ -95,11 +111,23 @@ def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, 
         pytest.skip("there is no C compiler `cc` on this machine")
     program = jj.lower(PRINTED[name])
     (tmp_path / "rates.c").write_text(program.c_source())
-    command = [compiler, "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "rates.c", "-o", "rates.so", "-lm"]
+    command = [
+        compiler,
+        "-O2",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-shared",
+        "-fPIC",
+        "rates.c",
+        "-o",
+        "rates.so",
+        "-lm",
+    ]
     made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
     rates = ctypes.CDLL(str(tmp_path / "rates.so")).rates
-    vector = lambda values: (ctypes.c_double * max(1, len(values)))(*map(float, values))  # noqa: E731
+    vector = lambda values: (ctypes.c_double * max(1, len(values)))(*map(float, values))
     parameters = vector([x for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)])
     for (t, q, y, inputs), expected in printed_states(name):
         out = vector(np.zeros(len(expected)))
@@ -111,7 +139,10 @@ def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
     disc = jj.lower(MODELS["tilting-disc"]())
     assert "SI units and radians): mass (kg), radius (m), gravity (m/s^2)" in str(disc)
     assert "monitored guards, which must stay positive: cos(lean)" in str(disc)
-    assert '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""' in disc.python_source()
+    assert (
+        '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""'
+        in disc.python_source()
+    )
     assert "positive spin rolls forward" in disc.python_source()
     assert "const double spin_rate = speeds[2];" in disc.c_source()
     two = jj.lower(TwoLateralRows())
@@ -210,11 +241,16 @@ class MistakenRow(jj.models.ChaplyginSleigh):
 def test_a_derivative_rule_is_believed_as_jax_believes_it(scene):
     """Whatever it says: the program and dense matrices move in the same way."""
     assert "has a custom derivative" in jj.lower(scene).calls[0]
-    program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, backend=backend).raise_if_failed() for backend in ("auto", "dense"))
+    program, dense = (
+        jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, backend=backend).raise_if_failed()
+        for backend in ("auto", "dense")
+    )
     assert_allclose(program.q_end, dense.q_end, rtol=1e-8, atol=1e-9)
 
 
-def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(monkeypatch):
+def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(
+    monkeypatch,
+):
     class Disc(MODELS["tilting-disc"]):
         """One that nothing was built for."""
 
@@ -235,7 +271,10 @@ class Walled(MODELS["chaplygin-sleigh"]):
     """A sleigh that is held back beyond 10 m, where no probe is."""
 
     def loads(self, motion):
-        return (*super().loads(motion), jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 10.0, -1.0, 0.0)))
+        return (
+            *super().loads(motion),
+            jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 10.0, -1.0, 0.0)),
+        )
 
 
 def test_a_coordinate_that_chooses_a_branch_is_not_ignorable_where_no_probe_takes_the_other_one():
@@ -247,7 +286,9 @@ def test_what_a_scene_has_not_costs_nothing():
     free = jj.lower(Falling())
     assert free.operations == 0  # no row, no rotation, no force that changes, no time
     assert free.pivots == free.guards == ()
-    assert not {"sin", "cos", "sqrt"} & {free.graph.op[n] for n in free.graph.reachable([*free.qdot, *free.ydot])}
+    assert not {"sin", "cos", "sqrt"} & {
+        free.graph.op[n] for n in free.graph.reachable([*free.qdot, *free.ydot])
+    }
     assert int(free.traced.t) not in free.graph.reachable([*free.qdot, *free.ydot])
     assert jj.lower(MODELS["rosenberg-particle"]()).operations <= 6  # particles have no rotation
 
@@ -263,7 +304,7 @@ class Falling(Upright):
 
 
 def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
-    both = lambda x: fused((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
+    both = lambda x: fused((jnp.sin(x) * 2.0, jnp.sin(x) + x))
     x = jnp.linspace(-2.0, 2.0, 7)
     assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
     assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)
@@ -273,7 +314,9 @@ def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
 
 
 def test_rates_mapped_over_states_are_linearised_inside_jit():
-    """A rate that is the same in all lanes (a skate has one) has no axis of lanes, by itself and in the rule of differentiation."""
+    """A rate that is the same in all lanes (a skate has one) has no axis of lanes, by itself and in the rule
+    of differentiation.
+    """
     scene = MODELS["skate"]()
     program = jj.lower(scene)
     fixed, (_, q, u) = program.fixed_values(scene), jj.sample_states(scene, 3)
@@ -291,7 +334,9 @@ def test_rates_mapped_over_states_are_linearised_inside_jit():
 def test_loops_over_steps_are_compiled_into_one_function():
     """Ten times the time per step hangs on it, and on it the number of lanes in lockstep."""
     x = jnp.zeros(512)
-    loop = jax.jit(lambda x: jax.lax.while_loop(lambda s: s[0] < 9, lambda s: (s[0] + 1, jnp.sin(s[1]) + x), (0, x)))
+    loop = jax.jit(
+        lambda x: jax.lax.while_loop(lambda s: s[0] < 9, lambda s: (s[0] + 1, jnp.sin(s[1]) + x), (0, x))
+    )
     assert "xla_cpu_small_call" in loop.lower(x).compile().as_text()
 
 
@@ -302,18 +347,27 @@ class OnNarrowEllipse(jj.Scene):
     coordinates = jj.coordinates("angle")
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, [jnp.cos(q.angle), jnp.sqrt(1 - self.eccentricity**2) * jnp.sin(q.angle), 0.0])}
+        return {
+            "bead": jj.Particle(
+                1.0, [jnp.cos(q.angle), jnp.sqrt(1 - self.eccentricity**2) * jnp.sin(q.angle), 0.0]
+            )
+        }
 
 
 def test_a_parameter_near_the_end_of_its_range_does_not_keep_a_scene_from_its_program():
     assert jj.lower(OnNarrowEllipse()).operations < 20
     s, c, b = np.sin(0.3), np.cos(0.3), 1 - 0.97**2
-    motion = jj.simulate(OnNarrowEllipse(), {"angle": 0.3, "angle_rate": 2.0}, ts=[1.0], rtol=1e-11, atol=1e-11)
+    motion = jj.simulate(
+        OnNarrowEllipse(), {"angle": 0.3, "angle_rate": 2.0}, ts=[1.0], rtol=1e-11, atol=1e-11
+    )
     angle, rate = float(motion.q_end[0]), float(motion.u_end[0])
-    assert_allclose(rate**2 * (np.sin(angle) ** 2 + b * np.cos(angle) ** 2), 4.0 * (s**2 + b * c**2), rtol=1e-9)  # its speed is constant
+    assert_allclose(
+        rate**2 * (np.sin(angle) ** 2 + b * np.cos(angle) ** 2), 4.0 * (s**2 + b * c**2), rtol=1e-9
+    )  # its speed is constant
 
 
-# A loop of the user's that does not end is named while a scene is probed, in whatever method it stands; and reasons for not lowering are true.
+# A loop of the user's that does not end is named while a scene is probed, in whatever method it stands; and
+# reasons for not lowering are true.
 
 
 def endless(x):
@@ -322,7 +376,9 @@ def endless(x):
 
 def endless_where_negative(x):
     """A root by Newton's method, which does not arrive where there is none."""
-    return jax.lax.while_loop(lambda c: jnp.abs(c * c - x) > 1e-12, lambda c: 0.5 * (c + x / c), 1.0 + 0.0 * x)
+    return jax.lax.while_loop(
+        lambda c: jnp.abs(c * c - x) > 1e-12, lambda c: 0.5 * (c + x / c), 1.0 + 0.0 * x
+    )
 
 
 class Looped(jj.Scene):
@@ -349,7 +405,9 @@ class Looped(jj.Scene):
 @pytest.mark.parametrize("where", ["bodies", "loads", "rows"])
 def test_a_loop_that_does_not_end_is_named(where, monkeypatch):
     monkeypatch.setattr(Looped, "where", where)
-    with pytest.raises(ValueError, match=r"a `while_loop` in `endless` \(line \d+ of test_lowering.py\) does not end"):
+    with pytest.raises(
+        ValueError, match=r"a `while_loop` in `endless` \(line \d+ of test_lowering.py\) does not end"
+    ):
         jj.lower(Looped())
 
 
@@ -369,6 +427,9 @@ class Kinked(OnPlane):
 
 def test_no_scene_is_said_to_have_derivatives_of_its_own_that_has_none():
     for scene in (Kinked(), jj.models.TwoWheelAxleRedundant()):
-        said = jj.report(scene).lowering if isinstance(scene, Kinked) else jj.lower(scene, every_speed=True).summary()
+        said = (
+            jj.report(scene).lowering
+            if isinstance(scene, Kinked)
+            else jj.lower(scene, every_speed=True).summary()
+        )
         assert "custom derivative" not in said
-

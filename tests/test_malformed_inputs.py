@@ -1,4 +1,6 @@
-"""Every malformed input of the tables is answered with the right kind of error, or code, and with words that say what to do."""
+"""Every malformed input of the tables is answered with the right kind of error, or code, and with words that
+say what to do.
+"""
 
 import jaxtyping
 import malformed_calls
@@ -13,7 +15,9 @@ CASES = {code: (table, case) for table in TABLES for code, case in table.TABLE.i
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory):
-    """What the cases of each table are written with. Run-time type checks, which users do not have, would answer first: they are off."""
+    """What the cases of each table are written with. Run-time type checks, which users do not have, would
+    answer first: they are off.
+    """
     folder = tmp_path_factory.mktemp("malformed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -36,8 +40,15 @@ def test_malformed_input_is_named_with_what_is_expected(code, names):
     kind, words = ("ValueError", case) if isinstance(case, str) else case
     try:
         answer = eval(code, names[table])
-        kinds, text = answer if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], str) else ("accepted", repr(answer)[:200])
+        kinds, text = (
+            answer
+            if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], str)
+            else ("accepted", repr(answer)[:200])
+        )
     except Exception as error:
-        kinds, text = "/".join(kind.__name__ for kind in type(error).__mro__), str(error)  # a kind of ValueError is one
+        kinds, text = (
+            "/".join(kind.__name__ for kind in type(error).__mro__),
+            str(error),
+        )  # a kind of ValueError is one
     assert all(part in text for part in words.split(" ... ")), text
     assert kind in kinds.split("/"), text

@@ -1,4 +1,6 @@
-"""What holds of every scene of particles, blades, wheels, discs and balls, at random states and for other parameters."""
+"""What holds of every scene of particles, blades, wheels, discs and balls, at random states and for other
+parameters.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +43,9 @@ SCENES = [
     (SpringAndRod(mass1=0.8, mass2=0.7, stiffness=55.0, damping=0.3, rod_length=0.7), 3),
     (IsokineticParticle(mass=1.3, speed=1.9), 1),
 ]
-every_scene = pytest.mark.parametrize(("scene", "freedoms"), SCENES, ids=[type(scene).__name__ for scene, _ in SCENES])
+every_scene = pytest.mark.parametrize(
+    ("scene", "freedoms"), SCENES, ids=[type(scene).__name__ for scene, _ in SCENES]
+)
 
 
 def _states(scene, count):
@@ -57,7 +61,11 @@ def test_the_scene_has_its_degrees_of_freedom(scene, freedoms):
     assert scene.privileged is None or chosen == scene.privileged
 
 
-@pytest.mark.parametrize("scene", [scene for scene, _ in SCENES if type(scene).invariants is not jj.Scene.invariants], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "scene",
+    [scene for scene, _ in SCENES if type(scene).invariants is not jj.Scene.invariants],
+    ids=lambda x: type(x).__name__,
+)
 def test_known_integrals_do_not_change_along_the_motion(scene):
     t, q, u = _states(scene, 20)
 
@@ -72,7 +80,7 @@ def test_known_integrals_do_not_change_along_the_motion(scene):
 
         rate = jax.jvp(integrals, (t, q, u), velocity)[1]
         gradient = jax.jacrev(integrals, argnums=(0, 1, 2))(t, q, u)
-        norm = lambda xs: jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(xs)))  # noqa: E731
+        norm = lambda xs: jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(xs)))
         return {name: (rate[name], norm(gradient[name]) * norm(velocity)) for name in rate}
 
     for name, (rate, size) in rates(t, q, u).items():

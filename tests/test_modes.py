@@ -1,4 +1,6 @@
-"""Events after which a motion goes on: states that jump, modes that switch, and derivatives through both, in both modes and to the second order."""
+"""Events after which a motion goes on: states that jump, modes that switch, and derivatives through both, in
+both modes and to the second order.
+"""
 
 import functools
 
@@ -34,7 +36,9 @@ class Ball(jj.Scene):
 
 
 class Switching(jj.Scene):
-    """A block on springs of two stiffnesses: events depend on time, state and parameters, and move coordinates, speeds and modes."""
+    """A block on springs of two stiffnesses: events depend on time, state and parameters, and move
+    coordinates, speeds and modes.
+    """
 
     mass: float = jj.parameter(1.3, positive=True)
     stiff: float = jj.parameter(4.0)
@@ -52,7 +56,9 @@ class Switching(jj.Scene):
 
     def loads(self, motion):
         q, u, spring, side = motion.q, motion.u, motion.modes.spring, motion.modes.side
-        along_x = -(self.stiff * (1 - spring) + self.soft * spring) * q.x - self.drag * u.x_rate * (1 + spring)
+        along_x = -(self.stiff * (1 - spring) + self.soft * spring) * q.x - self.drag * u.x_rate * (
+            1 + spring
+        )
         along_x = along_x + motion.inputs.push + 0.3 * jnp.cos(2 * motion.t)
         return (jj.Load(forces={"block": jnp.stack([along_x, 0.5 * side * q.x - 2.0 * q.y, 0.0 * q.x])}),)
 
@@ -62,7 +68,10 @@ class Switching(jj.Scene):
         back = {"y_rate": -self.kept * u.y_rate, "y": q.y + 0.01 * (1 + u.x_rate**2)}
         return {
             "over": jj.Event(jnp.where(spring == 0, self.limit - q.x, 1.0), to={"spring": "soft"}, jump=over),
-            "under": jj.Event(jnp.where(spring == 1, q.x - 0.1 * self.limit * (1 + 0.1 * t), 1.0), to={"spring": "stiff", "side": "out"}),
+            "under": jj.Event(
+                jnp.where(spring == 1, q.x - 0.1 * self.limit * (1 + 0.1 * t), 1.0),
+                to={"spring": "stiff", "side": "out"},
+            ),
             "y": jj.Event(q.y + 0.3, jump=back),
         }
 
@@ -79,20 +88,29 @@ def switching(numbers, **options):
 
 def seen(numbers, **options):
     motion = switching(numbers, **options)
-    return jnp.concatenate([motion.q.ravel(), motion.u.ravel(), motion.work, motion.phases.ts[:3], motion.phases.count[None]])
+    return jnp.concatenate(
+        [motion.q.ravel(), motion.u.ravel(), motion.work, motion.phases.ts[:3], motion.phases.count[None]]
+    )
 
 
 def bounces(e, h, **options):
-    return jj.simulate(Ball(e), {"z": h}, ts=[1.3, 5.5], **(TIGHT | {"max_transitions": 15} | options)).phases.ts[9]
+    return jj.simulate(
+        Ball(e), {"z": h}, ts=[1.3, 5.5], **(TIGHT | {"max_transitions": 15} | options)
+    ).phases.ts[9]
 
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
 def test_ten_bounces(backend):
-    """t_10 = sqrt(2 h/g) (1 + 2 (e + ... + e^9)), and its derivatives along e and h together. Reverse mode by XLA is that of modes and jumps below."""
-    time = lambda s: bounces(0.7 + s, 1.0 + s, backend=backend)  # noqa: E731
-    along = lambda f: lambda s: jax.jvp(f, (s,), (1.0,))  # noqa: E731
+    """t_10 = sqrt(2 h/g) (1 + 2 (e + ... + e^9)), and its derivatives along e and h together. Reverse mode by
+    XLA is that of modes and jumps below.
+    """
+    time = lambda s: bounces(0.7 + s, 1.0 + s, backend=backend)
+    along = lambda f: lambda s: jax.jvp(f, (s,), (1.0,))
     value, by_e, by_e_twice = 2.47360446364125, 8.53571984478680, 41.2871353427762
-    exact, close = np.array([value, by_e + value / 2, by_e_twice + by_e - value / 4]), np.array([1e-14, 1e-13, 1e-12])
+    exact, close = (
+        np.array([value, by_e + value / 2, by_e_twice + by_e - value / 4]),
+        np.array([1e-14, 1e-13, 1e-12]),
+    )
 
     def right(found, *orders):
         assert_array_less(np.abs(np.array(jax.tree.leaves(found)) / exact[[*orders]] - 1), close[[*orders]])
@@ -115,7 +133,9 @@ def test_lanes_bounce_by_themselves():
 
 @pytest.mark.parametrize(("e", "slope"), [(1.0, -1.0), (0.8, -0.8)])
 def test_a_bounce_without_gravity_turns_the_derivative_round(e, slope):
-    """z(1) = -e (z_0 + v), so that dz(1)/dz_0 = -e: simulators of soft contact give another sign (google/brax#317)."""
+    """z(1) = -e (z_0 + v), so that dz(1)/dz_0 = -e: simulators of soft contact give another sign
+    (google/brax#317).
+    """
 
     def end(z):
         return jj.simulate(Ball(e, 0.0), {"z": z, "z_rate": -2.0}, ts=[1.0], **TIGHT)["z"][-1]
@@ -127,7 +147,11 @@ def test_a_bounce_without_gravity_turns_the_derivative_round(e, slope):
 def test_derivatives_through_modes_and_jumps():
     """Against differences; both modes of differentiation, and the second order, against each other."""
     motion = switching(NUMBERS)
-    assert [motion.event_names[i] for i in motion.phases.events[: int(motion.phases.count)]] == ["over", "y", "under"]
+    assert [motion.event_names[i] for i in motion.phases.events[: int(motion.phases.count)]] == [
+        "over",
+        "y",
+        "under",
+    ]
     assert_array_equal([motion.phase("spring"), motion.phase("side")], [[1, 0], [0, 1]])
     beside = NUMBERS + 1e-5 * np.concatenate([np.eye(10), -np.eye(10)])
 
@@ -155,7 +179,9 @@ def test_the_loops_agree_and_lanes_are_in_modes_of_their_own():
     assert_array_equal(together[:4], [alone(x) for x in numbers[:4]])
     by_arrays = jax.jit(jax.vmap(lambda x: seen(x, backend="xla")))(numbers)
     assert_allclose(together, by_arrays, rtol=1e-11, atol=1e-11)
-    assert_allclose(together, jax.jit(jax.vmap(lambda x: seen(x, solver=jj.Taylor())))(numbers), rtol=1e-10, atol=1e-10)
+    assert_allclose(
+        together, jax.jit(jax.vmap(lambda x: seen(x, solver=jj.Taylor())))(numbers), rtol=1e-10, atol=1e-10
+    )
     assert len(np.unique(together[:, -1])) > 2
 
 
@@ -180,7 +206,9 @@ def test_energy_falls_by_what_events_take():
 
 
 class Rimless(jj.Scene):
-    """A wheel of eight spokes without a rim, its mass in the hub, that rolls down a slope; each spoke sticks where it strikes (McGeer, 1990)."""
+    """A wheel of eight spokes without a rim, its mass in the hub, that rolls down a slope; each spoke sticks
+    where it strikes (McGeer, 1990).
+    """
 
     slope: float = jj.parameter(0.08)
     coordinates = jj.coordinates("angle")  # of the spoke on the ground, from the vertical, downhill
@@ -199,10 +227,12 @@ class Rimless(jj.Scene):
 
 def test_rimless_wheel():
     def periods(rate, slope=0.08, t=4.2):
-        motion = jj.simulate(Rimless(slope), {"angle": slope - jnp.pi / 8, "angle_rate": rate}, ts=[t], **TIGHT)
+        motion = jj.simulate(
+            Rimless(slope), {"angle": slope - jnp.pi / 8, "angle_rate": rate}, ts=[t], **TIGHT
+        )
         return jnp.diff(motion.phases.ts, prepend=0.0)
 
-    cycle = lambda slope: periods(1.2, slope, 45.0)[38]  # noqa: E731
+    cycle = lambda slope: periods(1.2, slope, 45.0)[38]
     slope, time = with_value(jax.jacfwd, cycle)(0.08)
     assert_allclose(time, 1.03454981142327, rtol=1e-10)
     assert_allclose(slope, -25.1071124092, rtol=1e-8)
@@ -212,27 +242,48 @@ def test_rimless_wheel():
 
 
 class Walker(jj.Scene):
-    """The simplest walking model (Garcia et al., 1998): a hip on two legs, of which the swinging one weighs nothing; lengths and times without units."""
+    """The simplest walking model (Garcia et al., 1998): a hip on two legs, of which the swinging one weighs
+    nothing; lengths and times without units.
+    """
 
     slope: float = jj.parameter(0.009)
     coordinates = jj.coordinates("stance swing")
 
     def bodies(self, t, q):
-        return {name: jj.Particle(1.0, [angle, 0.0, 0.0]) for name, angle in (("stance", q.stance), ("swing", q.swing))}
+        return {
+            name: jj.Particle(1.0, [angle, 0.0, 0.0])
+            for name, angle in (("stance", q.stance), ("swing", q.swing))
+        }
 
     def loads(self, motion):
         swing, rate, lean = motion.q.swing, motion.u.stance_rate, motion.q.stance - self.slope
-        return (jj.generalized_force(motion, stance_rate=jnp.sin(lean), swing_rate=jnp.sin(lean) + (rate**2 - jnp.cos(lean)) * jnp.sin(swing)),)
+        return (
+            jj.generalized_force(
+                motion,
+                stance_rate=jnp.sin(lean),
+                swing_rate=jnp.sin(lean) + (rate**2 - jnp.cos(lean)) * jnp.sin(swing),
+            ),
+        )
 
     def events(self, motion):
         (stance, swing), rate = motion.q.array, motion.u.stance_rate
         c = jnp.cos(2 * stance)
-        after = {"stance": -stance, "swing": -2 * stance, "stance_rate": c * rate, "swing_rate": c * (1 - c) * rate}
-        return {"strike": jj.Event(jnp.where(stance < 0, 2 * stance - swing, 1.0), jump=after), "upright": stance}
+        after = {
+            "stance": -stance,
+            "swing": -2 * stance,
+            "stance_rate": c * rate,
+            "swing_rate": c * (1 - c) * rate,
+        }
+        return {
+            "strike": jj.Event(jnp.where(stance < 0, 2 * stance - swing, 1.0), jump=after),
+            "upright": stance,
+        }
 
 
 def test_simplest_walker():
-    """Period, multipliers and stance of its gait; the third multiplier is zero, since the leg that strikes forgets how fast it swung."""
+    """Period, multipliers and stance of its gait; the third multiplier is zero, since the leg that strikes
+    forgets how fast it swung.
+    """
     guess = {"swing": -0.0532, "stance_rate": -0.0594, "swing_rate": -0.3398}
 
     @jax.jit
@@ -244,14 +295,20 @@ def test_simplest_walker():
     slope, orbit = gait(0.009)
     assert_allclose(orbit.period, 3.88246375, atol=5e-9)
     expected = [-0.19009984 + 0.55759878j, -0.19009984 - 0.55759878j, 0.0]
-    assert_allclose(sorted(orbit.multipliers, key=lambda x: -x.imag - 2 * (abs(x) > 0.1)), expected, atol=2e-8)
+    assert_allclose(
+        sorted(orbit.multipliers, key=lambda x: -x.imag - 2 * (abs(x) > 0.1)), expected, atol=2e-8
+    )
     strikes = jj.simulate(Walker(), orbit.state, ts=jnp.array([1.8317]), events=False, **TIGHT)
-    assert strikes["stance"][-1] - 0.19983247 * (strikes.phases.ts[0] - 1.8317) == pytest.approx(0.2003109, abs=1e-7)
+    assert strikes["stance"][-1] - 0.19983247 * (strikes.phases.ts[0] - 1.8317) == pytest.approx(
+        0.2003109, abs=1e-7
+    )
     assert_allclose(slope, (gait(0.00901)[1].period - gait(0.00899)[1].period) / 2e-5, rtol=1e-5)
 
 
 class Belt(OnLine):
-    """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s: it sticks until the spring pulls with more than mu_s m g, then slips."""
+    """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s: it sticks until the spring pulls with more
+    than mu_s m g, then slips.
+    """
 
     static: float = jj.parameter(0.4)
     sliding: float = jj.parameter(0.25)
@@ -265,8 +322,12 @@ class Belt(OnLine):
     def events(self, motion):
         sticks = motion.modes.block == 0
         return {
-            "breaks": jj.Event(jnp.where(sticks, self.static * 9.81 - 40.0 * motion.q.x, 1.0), to={"block": "slips"}),
-            "holds": jj.Event(jnp.where(sticks, 1.0, 0.1 - motion.u.x_rate), to={"block": "sticks"}, jump={"x_rate": 0.1}),
+            "breaks": jj.Event(
+                jnp.where(sticks, self.static * 9.81 - 40.0 * motion.q.x, 1.0), to={"block": "slips"}
+            ),
+            "holds": jj.Event(
+                jnp.where(sticks, 1.0, 0.1 - motion.u.x_rate), to={"block": "sticks"}, jump={"x_rate": 0.1}
+            ),
         }
 
 
@@ -307,7 +368,10 @@ class Ended(Ball):
 def test_without_stop_events_the_others_stay():
     stopped = jj.simulate(Ended(), {"z": 1.0}, t1=2.0, **TIGHT)
     assert stopped.event_names[int(stopped.event)] == "again"
-    motion, free = (jj.simulate(scene, {"z": 1.0}, t1=2.0, events=events, **TIGHT) for scene, events in ((Ended(), False), (Ball(), True)))
+    motion, free = (
+        jj.simulate(scene, {"z": 1.0}, t1=2.0, events=events, **TIGHT)
+        for scene, events in ((Ended(), False), (Ball(), True))
+    )
     assert_array_equal(motion.q, free.q)
     assert motion.succeeded
 
@@ -315,7 +379,9 @@ def test_without_stop_events_the_others_stay():
 def test_a_fit_of_bounces():
     """100 throws with noise of 4 mm: the spread of the estimates is their standard error."""
     ts = jnp.linspace(0.0, 1.6, 81)
-    heights = jj.simulate(Ball(0.72), {"z": 1.0}, ts=ts)["z"] + 0.004 * jax.random.normal(jax.random.PRNGKey(0), (100, 81))
+    heights = jj.simulate(Ball(0.72), {"z": 1.0}, ts=ts)["z"] + 0.004 * jax.random.normal(
+        jax.random.PRNGKey(0), (100, 81)
+    )
     throws = jj.Experiment(ts, {"z": heights}, 0.004, start={"z": 1.0})
     fits = jj.fit_batch(Ball(0.7, 9.7), throws, free=("bounce", "gravity"))
     assert fits.converged.all()
@@ -344,7 +410,9 @@ def test_an_event_counts_again_where_another_one_lifts_its_value(backend):
 
 
 class Sunk(Ball):
-    """It strikes, and begins again below its floor: it rises above that for a while, and falls through it again."""
+    """It strikes, and begins again below its floor: it rises above that for a while, and falls through it
+    again.
+    """
 
     def events(self, motion):
         return {"floor": jj.Event(motion.q.z, jump={"z": -0.01, "z_rate": 0.3})}
@@ -372,13 +440,22 @@ class Timed(OnLine):
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_state_and_mode_at_a_saved_time_agree(direction):
-    """Where an event and a saved time are a rounding apart, either both are from before the event or both from after it."""
+    """Where an event and a saved time are a rounding apart, either both are from before the event or both
+    from after it.
+    """
     after = set()
     for k in range(12):
         t = direction * (0.7 + 0.0317 * k)
         for at in (np.nextafter(t, -9), t, np.nextafter(t, 9)):
             scene = Timed(at) if direction > 0 else Back(at)
-            motion = jj.simulate(scene, {"x_rate": 1.0 * direction}, t0=0.3 * direction, ts=[t, t + direction], rtol=1e-10, atol=1e-10)
+            motion = jj.simulate(
+                scene,
+                {"x_rate": 1.0 * direction},
+                t0=0.3 * direction,
+                ts=[t, t + direction],
+                rtol=1e-10,
+                atol=1e-10,
+            )
             stopped = bool(abs(motion["x_rate"][0]) < 1e-9)
             assert int(motion.phase("push")[0]) == stopped
             assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-9)
@@ -388,11 +465,17 @@ def test_state_and_mode_at_a_saved_time_agree(direction):
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
 def test_work_of_potentials_that_depend_on_modes(backend):
-    """What a mode and a jump add to a potential is the event's, not work done between events; x = 1.12 m at the event."""
+    """What a mode and a jump add to a potential is the event's, not work done between events; x = 1.12 m at
+    the event.
+    """
 
     class Moved(Timed):
         def events(self, motion):
-            return {"late": jj.Event(self.at - motion.t, to={"push": "hard"}, jump={"x": motion.q.x + 1.0, "x_rate": 0.0})}
+            return {
+                "late": jj.Event(
+                    self.at - motion.t, to={"push": "hard"}, jump={"x": motion.q.x + 1.0, "x_rate": 0.0}
+                )
+            }
 
     motion = jj.simulate(Moved(0.8), {"x_rate": 1.0}, ts=[0.5, 1.5], backend=backend, rtol=1e-10, atol=1e-10)
     assert_allclose(motion.work, 0.0, atol=1e-8)
@@ -420,7 +503,7 @@ def test_too_many_transitions():
 
 def test_what_happens_at_the_start_has_no_derivative():
     """Below the floor already: the bounce is there, and its derivative, which does not exist, is NaN."""
-    end = lambda z: jj.simulate(Ball(), {"z": z, "z_rate": -1.0}, ts=[0.05])["z"][-1]  # noqa: E731
+    end = lambda z: jj.simulate(Ball(), {"z": z, "z_rate": -1.0}, ts=[0.05])["z"][-1]
     forwards, backwards = (with_value(derivative, end) for derivative in (jax.jacfwd, jax.grad))
     assert forwards(-1e-3)[1] > forwards(0.0)[1] - 2e-3
     assert np.isnan([forwards(-1e-3)[0], backwards(-1e-3)[0]]).all()
@@ -431,7 +514,9 @@ def test_wrong_events_are_named():
         def events(self, motion):
             return {"floor": jj.Event(motion.q.z, jump={"w": 0.0})}
 
-    with pytest.raises(ValueError, match=r"event `floor` of `Wrong` moves `w`, which is not a coordinate or speed"):
+    with pytest.raises(
+        ValueError, match=r"event `floor` of `Wrong` moves `w`, which is not a coordinate or speed"
+    ):
         jj.simulate(Wrong())
 
     class WrongMode(Ball):

@@ -1,7 +1,9 @@
-"""Deliberate errors of one line in what a motion runs through by default: each must be caught by a check that passes without it.
+"""Deliberate errors of one line in what a motion runs through by default: each must be caught by a check that
+passes without it.
 
-The checks know nothing of the code that they judge: they compare with closed forms, with dense matrices, and with differences. The scalar program is
-also compared with dense matrices where it is built; a program that is wrong is then not used, which counts as caught.
+The checks know nothing of the code that they judge: they compare with closed forms, with dense matrices, and
+with differences. The scalar program is also compared with dense matrices where it is built; a program that is
+wrong is then not used, which counts as caught.
 """
 
 import inspect
@@ -47,10 +49,17 @@ from jourdain_jax.structure.trace import named_values
 def rewritten(function: Callable, right: str, wrong: str) -> Callable:
     """The function with one piece of its text replaced, without its decorators; that piece must occur once."""
     text = textwrap.dedent(inspect.getsource(inspect.unwrap(function)))
-    assert text.count(right) == 1, f"`{right}` occurs {text.count(right)} times in `{function.__name__}`: this mutant must follow the code"
+    assert text.count(right) == 1, (
+        f"`{right}` occurs {text.count(right)} times in `{function.__name__}`: this mutant must follow the"
+        " code"
+    )
     made: dict = {}
     text = text[text.index("def ") :] if text.startswith("@") else text
-    exec(compile(text.replace(right, wrong), f"a mutant of {function.__name__}", "exec"), inspect.unwrap(function).__globals__, made)
+    exec(
+        compile(text.replace(right, wrong), f"a mutant of {function.__name__}", "exec"),
+        inspect.unwrap(function).__globals__,
+        made,
+    )
     return made[function.__name__]
 
 
@@ -105,7 +114,12 @@ def a_double_pendulum_of_rods_is_put_back_onto_them():
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 2))
     off = q + 1e-7 * np.cos(np.arange(q.size)).reshape(q.shape)
     expected = [project_positions(scene, *map(jnp.asarray, state)) for state in zip(t, off, strict=True)]
-    assert_allclose(values(scene, program, t, off, u)(program.projected_q).T, expected, atol=tolerance("round_off"), err_msg="coordinates")
+    assert_allclose(
+        values(scene, program, t, off, u)(program.projected_q).T,
+        expected,
+        atol=tolerance("round_off"),
+        err_msg="coordinates",
+    )
 
 
 def a_snakeboard_is_put_back_onto_its_rows():
@@ -113,7 +127,12 @@ def a_snakeboard_is_put_back_onto_its_rows():
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 2))
     off = u + 0.3 * np.cos(np.arange(u.size)).reshape(u.shape)
     expected = [project_speeds(scene, *map(jnp.asarray, state)) for state in zip(t, q, off, strict=True)]
-    assert_allclose(values(scene, program, t, q, off)(program.projected_u).T, expected, atol=tolerance("ill_conditioned"), err_msg="speeds")
+    assert_allclose(
+        values(scene, program, t, q, off)(program.projected_u).T,
+        expected,
+        atol=tolerance("ill_conditioned"),
+        err_msg="speeds",
+    )
 
 
 def a_program_knows_where_rows_are_parallel():
@@ -128,9 +147,13 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None, dt0: float = 1.0, longest=np.inf) -> Callable:
-    """`(y0, goals, k)` -> (loop on arrays, its start); functions are of (t, y, k), the state is one of coordinates."""
-    state = lambda y: Integrated(y, jnp.zeros(0), None)  # noqa: E731
+def loop(
+    rates: Callable, *, rtol: float, project=None, events=None, knots=None, dt0: float = 1.0, longest=np.inf
+) -> Callable:
+    """`(y0, goals, k)` -> (loop on arrays, its start); functions are of (t, y, k), the state is one of
+    coordinates.
+    """
+    state = lambda y: Integrated(y, jnp.zeros(0), None)
     given = SimpleNamespace(
         rates=lambda t, y, k: state(rates(t, y.q, k)),
         project=lambda t, y, k: state(project(t, y.q, k)),
@@ -141,9 +164,13 @@ def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None,
 
     def run(y0, goals, k=1.0):
         known, rest = array_functions.split(jnp.asarray(k))
-        form = array_functions.ArrayForm(None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0)
+        form = array_functions.ArrayForm(
+            None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0
+        )
         control = tuple(map(jnp.asarray, (rtol, rtol, 1e-14, longest, dt0, 2000.0)))
-        start = Start(() if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,))
+        start = Start(
+            () if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,)
+        )
         return Loop(form, method_of(diffrax.Dopri8()), rest, 2000), start
 
     return run
@@ -163,7 +190,9 @@ def motion(run: Callable) -> Callable:
 def steps_follow_a_closed_form():
     goals = np.array([0.5, 1.1, 2.0, 2.1])
     end = motion(loop(lambda t, y, k: -2 * t * y, rtol=1e-10))(jnp.ones(1), goals)
-    assert int(end.accepted + end.rejected) < 60, f"{end.accepted} steps and {end.rejected} rejected ones, too many for the order of the method"
+    assert int(end.accepted + end.rejected) < 60, (
+        f"{end.accepted} steps and {end.rejected} rejected ones, too many for the order of the method"
+    )
     assert_allclose(end.ys.q[:, 0], np.exp(-(goals[:-1] ** 2)), atol=1e-8, err_msg="closed form")
     assert int(end.rejected) > 0, "no step was rejected, as this check needs it"
 
@@ -173,22 +202,36 @@ def projected_steps_stay_on_a_circle():
         return (1 + t) * jnp.stack([-y[1], y[0]])
 
     run = loop(turning, rtol=1e-4, project=lambda t, y, k: y / jnp.sqrt(jnp.sum(y**2)), dt0=0.1)
-    assert_allclose(np.sum(motion(run)(jnp.array([1.0, 0.0]), np.array([1.0, 2.0, 2.1])).ys.q ** 2, axis=1), 1.0, atol=1e-14, err_msg="circle")
+    assert_allclose(
+        np.sum(motion(run)(jnp.array([1.0, 0.0]), np.array([1.0, 2.0, 2.1])).ys.q ** 2, axis=1),
+        1.0,
+        atol=1e-14,
+        err_msg="circle",
+    )
 
 
 def steps_end_at_knots():
     run = loop(lambda t, y, k: 2 * jnp.abs(t - 0.3)[None], rtol=1e-3, knots=[0.3, np.inf])
-    assert_allclose(motion(run)(jnp.zeros(1), np.ones(1)).y_end.q[0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot")
+    assert_allclose(
+        motion(run)(jnp.zeros(1), np.ones(1)).y_end.q[0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot"
+    )
 
 
 def an_event_within_a_step_ends_the_motion():
-    end = motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, events=lambda t, y, k: (y - 0.52) ** 2 - 1e-4))(jnp.zeros(1), np.full(1, 2.0))
+    end = motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, events=lambda t, y, k: (y - 0.52) ** 2 - 1e-4))(
+        jnp.zeros(1), np.full(1, 2.0)
+    )
     assert end.code == results.EVENT, "an event was passed over"
     assert_allclose(end.t_end, 0.51, atol=1e-10, err_msg="event")
 
 
 def steps_are_no_longer_than_allowed():
-    assert motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, longest=0.25))(jnp.zeros(1), np.full(1, 2.0)).accepted == 8, "the longest step"
+    assert (
+        motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, longest=0.25))(
+            jnp.zeros(1), np.full(1, 2.0)
+        ).accepted
+        == 8
+    ), "the longest step"
 
 
 def a_motion_leaves_an_event_at_which_it_starts():
@@ -202,7 +245,9 @@ def a_motion_leaves_an_event_at_which_it_starts():
 
 def driven(t, y, k):
     """A point on a circle drives a damped number."""
-    return jnp.stack([*(k * (1 + 0.5 * jnp.cos(t)) * jnp.stack([-y[1], y[0]])), -k * y[2] + jnp.sin(2 * t) * y[0]])
+    return jnp.stack(
+        [*(k * (1 + 0.5 * jnp.cos(t)) * jnp.stack([-y[1], y[0]])), -k * y[2] + jnp.sin(2 * t) * y[0]]
+    )
 
 
 def onto_circle(t, y, k):
@@ -213,8 +258,12 @@ def falls(t, y, k):
     return (0.3 + y[0] + 0.05 * k + 0.02 * t)[None]
 
 
-# each saved time is one step, of whatever error, so that the states are a smooth function of all arguments, also off the circle; and a precise motion
-CASES = {"saved times": {"project": onto_circle, "rtol": 1e3, "dt0": 100.0}, "an event": {"events": falls, "rtol": 1e-12, "dt0": 0.1}}
+# each saved time is one step, of whatever error, so that the states are a smooth function of all arguments,
+# also off the circle; and a precise motion
+CASES = {
+    "saved times": {"project": onto_circle, "rtol": 1e3, "dt0": 100.0},
+    "an event": {"events": falls, "rtol": 1e-12, "dt0": 0.1},
+}
 GOALS = {"saved times": 0.2 * np.arange(25.0), "an event": np.array([0.0, 0.5, 1.5, 4.0])}
 START = {"y0": np.array([0.8, 0.6, 0.4]), "k": np.array(1.1)}
 
@@ -233,7 +282,9 @@ def weighed(end: Solved):
 def backwards_through(of: Loop, start: Start, end: Solved) -> tuple:
     """Its derivatives by the start and by k, in reverse mode."""
     g = jax.jit(jax.grad(weighed, allow_int=True))(end)
-    by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(start, native_motion.cotangents_of_states(g), g.y_end.rows, g.t_end, g.passed.ts)
+    by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(
+        start, native_motion.cotangents_of_states(g), g.y_end.rows, g.t_end, g.passed.ts
+    )
     return by_y0, by_k
 
 
@@ -256,7 +307,12 @@ def differences(case: str) -> dict:
 def forward_mode_agrees_with_differences(case: str) -> None:
     expected, found = differences(case), motion(loop(driven, **CASES[case]))
     along = jax.jvp(lambda x: weighed(found(*given(case, x))), (START,), (START,))[1]
-    assert_allclose(along, sum(np.sum(expected[name] * START[name]) for name in START), atol=1e-6, err_msg="derivative forward")
+    assert_allclose(
+        along,
+        sum(np.sum(expected[name] * START[name]) for name in START),
+        atol=1e-6,
+        err_msg="derivative forward",
+    )
 
 
 def reverse_mode_agrees_with_differences(case: str) -> None:
@@ -306,25 +362,70 @@ class Mutant:
 
     def bring(self, monkeypatch) -> None:
         """Put it in the place of the right code."""
-        monkeypatch.setattr(self.owner, self.name, rewritten(getattr(self.owner, self.name), self.right, self.wrong))
+        monkeypatch.setattr(
+            self.owner, self.name, rewritten(getattr(self.owner, self.name), self.right, self.wrong)
+        )
 
 
 DENSE = "differs from the dense path"
 BUILD, KINEMATICS = appell.AppellOnGraph, appell._Kinematics
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts
-STEPS, TIMES, ALONG, EVENT = steps_follow_a_closed_form, cotangents_through_saved_times, tangents_to_an_event, cotangents_to_an_event
+STEPS, TIMES, ALONG, EVENT = (
+    steps_follow_a_closed_form,
+    cotangents_through_saved_times,
+    tangents_to_an_event,
+    cotangents_to_an_event,
+)
 DIVISORS = rates_of_coordinates_have_their_divisors
 MUTANTS = [
     Mutant("no divisors of rates", lower, "_divisors", '== "div"]', '== "none"]', DIVISORS, "differs"),
     Mutant("no tangents among rates", lower, "_divisors", '== "tan"]', '== "none"]', DIVISORS, "differs"),
-    Mutant("no gyroscopic torque", BUILD, "_inertia_resultants", "g.add(g.dot(row, alpha), w)", "g.dot(row, alpha)", DISC, DENSE),
-    Mutant("no a_0", BUILD, "_inertia_resultants", "g.mul(int(at.mass[b]), x) for x in a", "g.zero for x in a", DISC, DENSE),
     Mutant(
-        "one mass twice", BUILD, "_equations", "g.mul(mass, g.dot(beta[i], beta[j]))", "g.mul(g.mul(g.const(2.0), mass), g.dot(beta[i], beta[j]))", DISC, DENSE
+        "no gyroscopic torque",
+        BUILD,
+        "_inertia_resultants",
+        "g.add(g.dot(row, alpha), w)",
+        "g.dot(row, alpha)",
+        DISC,
+        DENSE,
     ),
-    Mutant("sign of the drift of rows", KINEMATICS, "_implicitly", "[[g.neg(d)] for d in drift]", "[[d] for d in drift]", DISC, DENSE),
-    Mutant("no phi_0", KINEMATICS, "_solve", "g.neg(rest)]", "g.mul(g.zero, rest)]", a_ball_on_a_turntable_is_given_the_power_of_its_contact, DENSE),
+    Mutant(
+        "no a_0",
+        BUILD,
+        "_inertia_resultants",
+        "g.mul(int(at.mass[b]), x) for x in a",
+        "g.zero for x in a",
+        DISC,
+        DENSE,
+    ),
+    Mutant(
+        "one mass twice",
+        BUILD,
+        "_equations",
+        "g.mul(mass, g.dot(beta[i], beta[j]))",
+        "g.mul(g.mul(g.const(2.0), mass), g.dot(beta[i], beta[j]))",
+        DISC,
+        DENSE,
+    ),
+    Mutant(
+        "sign of the drift of rows",
+        KINEMATICS,
+        "_implicitly",
+        "[[g.neg(d)] for d in drift]",
+        "[[d] for d in drift]",
+        DISC,
+        DENSE,
+    ),
+    Mutant(
+        "no phi_0",
+        KINEMATICS,
+        "_solve",
+        "g.neg(rest)]",
+        "g.mul(g.zero, rest)]",
+        a_ball_on_a_turntable_is_given_the_power_of_its_contact,
+        DENSE,
+    ),
     Mutant(
         "no inertia in the power of contacts",
         BUILD,
@@ -334,9 +435,33 @@ MUTANTS = [
         a_ball_on_a_turntable_is_given_the_power_of_its_contact,
         "power",
     ),
-    Mutant("a square root left out", BUILD, "projection", 'g.div(part, g.call("sqrt", n))', "g.div(part, n)", a_quaternion_is_put_back_to_length_one, "norm"),
-    Mutant("multipliers without drift", kept_rows, "accelerations_by_multipliers", "graph.add(d, graph.dot(row, free))", "graph.dot(row, free)", BOARD, DENSE),
-    Mutant("sign of multipliers", kept_rows, "accelerations_by_multipliers", "graph.add(w, graph.dot(", "graph.sub(w, graph.dot(", BOARD, DENSE),
+    Mutant(
+        "a square root left out",
+        BUILD,
+        "projection",
+        'g.div(part, g.call("sqrt", n))',
+        "g.div(part, n)",
+        a_quaternion_is_put_back_to_length_one,
+        "norm",
+    ),
+    Mutant(
+        "multipliers without drift",
+        kept_rows,
+        "accelerations_by_multipliers",
+        "graph.add(d, graph.dot(row, free))",
+        "graph.dot(row, free)",
+        BOARD,
+        DENSE,
+    ),
+    Mutant(
+        "sign of multipliers",
+        kept_rows,
+        "accelerations_by_multipliers",
+        "graph.add(w, graph.dot(",
+        "graph.sub(w, graph.dot(",
+        BOARD,
+        DENSE,
+    ),
     Mutant(
         "sign of the correction",
         appell,
@@ -364,29 +489,179 @@ MUTANTS = [
         a_program_knows_where_rows_are_parallel,
         "margins",
     ),
-    Mutant("a wrong weight", step, "stages", "method.b[:n]]", "(1 + 1e-6) * method.b[:n]]", STEPS, "closed form"),
-    Mutant("rows of the tableau too small", step, "stages", "*method.A[1:n, :n]", "*0.999 * method.A[1:n, :n]", STEPS, "closed form"),
-    Mutant("the whole step for its error", on_arrays, "tried_by_stages", "method.b_error", "method.b", STEPS, "too many for the order"),
-    Mutant("stages at the first time", step, "stages", "w.fma(step, c[i], t)", "w.fma(0 * step, c[i], t)", STEPS, "closed form"),
+    Mutant(
+        "a wrong weight", step, "stages", "method.b[:n]]", "(1 + 1e-6) * method.b[:n]]", STEPS, "closed form"
+    ),
+    Mutant(
+        "rows of the tableau too small",
+        step,
+        "stages",
+        "*method.A[1:n, :n]",
+        "*0.999 * method.A[1:n, :n]",
+        STEPS,
+        "closed form",
+    ),
+    Mutant(
+        "the whole step for its error",
+        on_arrays,
+        "tried_by_stages",
+        "method.b_error",
+        "method.b",
+        STEPS,
+        "too many for the order",
+    ),
+    Mutant(
+        "stages at the first time",
+        step,
+        "stages",
+        "w.fma(step, c[i], t)",
+        "w.fma(0 * step, c[i], t)",
+        STEPS,
+        "closed form",
+    ),
     Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", STEPS, "closed form"),
-    Mutant("a rejected step takes time", step, "taken", 'w.where(accept, aim.t_1, p["t"])', "aim.t_1", STEPS, "closed form"),
-    Mutant("other states are saved", Loop, "saving", "update_index_in_dim(ys, y,", "update_index_in_dim(ys, 0.99 * y,", STEPS, "closed form"),
-    Mutant("stages twice", ArrayWriter, "over_stages", "body(i, carry[1])", "body(i // 2, carry[1])", STEPS, "closed form|too many"),
-    Mutant("no branch is taken", ArrayWriter, "if_any", "(rooms, arrays, body)[0]", "(rooms, arrays, lambda: None)[0]", EVENT, "derivative|assert"),
-    Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", projected_steps_stay_on_a_circle, "circle"),
-    Mutant("no step ends at a knot", Loop, "saving", "jnp.minimum(goal * direction, jnp.min(ahead, axis=0))", "goal * direction", steps_end_at_knots, "knot"),
-    Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", an_event_within_a_step_ends_the_motion, "passed over"),
-    Mutant("the first step without a bound", Start, "numbers", "jnp.minimum(jnp.abs(first), longest)", "jnp.abs(first)", LONGEST, "the longest step"),
-    Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
-    Mutant("no start at an event", event_search, "at_start", "rises = ((rate > 0.0)", "rises = ((rate > 1e9)", LEAVES, "leaves"),
+    Mutant(
+        "a rejected step takes time",
+        step,
+        "taken",
+        'w.where(accept, aim.t_1, p["t"])',
+        "aim.t_1",
+        STEPS,
+        "closed form",
+    ),
+    Mutant(
+        "other states are saved",
+        Loop,
+        "saving",
+        "update_index_in_dim(ys, y,",
+        "update_index_in_dim(ys, 0.99 * y,",
+        STEPS,
+        "closed form",
+    ),
+    Mutant(
+        "stages twice",
+        ArrayWriter,
+        "over_stages",
+        "body(i, carry[1])",
+        "body(i // 2, carry[1])",
+        STEPS,
+        "closed form|too many",
+    ),
+    Mutant(
+        "no branch is taken",
+        ArrayWriter,
+        "if_any",
+        "(rooms, arrays, body)[0]",
+        "(rooms, arrays, lambda: None)[0]",
+        EVENT,
+        "derivative|assert",
+    ),
+    Mutant(
+        "no projection",
+        step,
+        "project",
+        'w.run("project", p.pointer, t1, y1)',
+        "None",
+        projected_steps_stay_on_a_circle,
+        "circle",
+    ),
+    Mutant(
+        "no step ends at a knot",
+        Loop,
+        "saving",
+        "jnp.minimum(goal * direction, jnp.min(ahead, axis=0))",
+        "goal * direction",
+        steps_end_at_knots,
+        "knot",
+    ),
+    Mutant(
+        "no dips",
+        step,
+        "monitored",
+        "((share < 1.0) | again)",
+        "again",
+        an_event_within_a_step_ends_the_motion,
+        "passed over",
+    ),
+    Mutant(
+        "the first step without a bound",
+        Start,
+        "numbers",
+        "jnp.minimum(jnp.abs(first), longest)",
+        "jnp.abs(first)",
+        LONGEST,
+        "the longest step",
+    ),
+    Mutant(
+        "no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"
+    ),
+    Mutant(
+        "no start at an event",
+        event_search,
+        "at_start",
+        "rises = ((rate > 0.0)",
+        "rises = ((rate > 1e9)",
+        LEAVES,
+        "leaves",
+    ),
     Mutant("every start at an event", event_search, "at_start", "noise * rate", "rate", LEAVES, "leaves"),
-    Mutant("no cotangents of later stages", backwards, "step_back", "columns[stage][j], total)", "0 * columns[stage][j], total)", TIMES, "derivative"),
-    Mutant("one stage without parameters", backwards, "step_back", "at, v, of_stage, added)", "at, v, of_stage, w.room(max(asked, 1)))", TIMES, "by k"),
-    Mutant("a projection not gone back over", backwards, "step_back", "at, g1, added)", "at, w.room(count), added)", TIMES, "by y0"),
-    Mutant("saved states forgotten", motions, "cotangents", "(index < last), g_ys", "(index < last), 0 * g_ys", TIMES, "derivative"),
-    Mutant("an earlier window left out", motions, "cotangents", "(x, number, 0, keepdims=False)", "(x, 0 * number, 0, keepdims=False)", TIMES, "derivative"),
-    Mutant("tangents of times forgotten", event_search, "put_tangents", "-dc / slope", "0 * dc", ALONG, "forward"),
-    Mutant("time of an event forgotten", backwards, "event_back", "total = w.load(g_t)", "total = 0 * w.load(g_t)", EVENT, "derivative"),
+    Mutant(
+        "no cotangents of later stages",
+        backwards,
+        "step_back",
+        "columns[stage][j], total)",
+        "0 * columns[stage][j], total)",
+        TIMES,
+        "derivative",
+    ),
+    Mutant(
+        "one stage without parameters",
+        backwards,
+        "step_back",
+        "at, v, of_stage, added)",
+        "at, v, of_stage, w.room(max(asked, 1)))",
+        TIMES,
+        "by k",
+    ),
+    Mutant(
+        "a projection not gone back over",
+        backwards,
+        "step_back",
+        "at, g1, added)",
+        "at, w.room(count), added)",
+        TIMES,
+        "by y0",
+    ),
+    Mutant(
+        "saved states forgotten",
+        motions,
+        "cotangents",
+        "(index < last), g_ys",
+        "(index < last), 0 * g_ys",
+        TIMES,
+        "derivative",
+    ),
+    Mutant(
+        "an earlier window left out",
+        motions,
+        "cotangents",
+        "(x, number, 0, keepdims=False)",
+        "(x, 0 * number, 0, keepdims=False)",
+        TIMES,
+        "derivative",
+    ),
+    Mutant(
+        "tangents of times forgotten", event_search, "put_tangents", "-dc / slope", "0 * dc", ALONG, "forward"
+    ),
+    Mutant(
+        "time of an event forgotten",
+        backwards,
+        "event_back",
+        "total = w.load(g_t)",
+        "total = 0 * w.load(g_t)",
+        EVENT,
+        "derivative",
+    ),
     Mutant(
         "tangents of parameters forgotten",
         array_functions.Functions,
@@ -396,14 +671,24 @@ MUTANTS = [
         ALONG,
         "forward",
     ),
-    Mutant("an event by parameters forgotten", backwards, "event_back", "w.where(usable, w.load(added, i), 0.0)", "0.0", EVENT, "by k"),
+    Mutant(
+        "an event by parameters forgotten",
+        backwards,
+        "event_back",
+        "w.where(usable, w.load(added, i), 0.0)",
+        "0.0",
+        EVENT,
+        "by k",
+    ),
 ]
 CHECKS = [*dict.fromkeys(mutant.check for mutant in MUTANTS), tangents_through_saved_times]
 
 
 @pytest.fixture(autouse=True)
 def _nothing_kept(monkeypatch):
-    """Programs are built in each test, and none of them afterwards; short windows, so that a motion has several; functions of a test's own."""
+    """Programs are built in each test, and none of them afterwards; short windows, so that a motion has
+    several; functions of a test's own.
+    """
     monkeypatch.setattr(backwards, "SLOTS", 8)
     monkeypatch.setattr(array_functions, "integrands", None)
     lower._lowered.cache_clear()
@@ -426,7 +711,11 @@ def test_a_mutant_is_caught(mutant, monkeypatch):
 def test_a_record_goes_back_over_fewer_steps_than_it_has_room_for(monkeypatch):
     monkeypatch.setattr(backwards, "SLOTS", 48)
     run, arguments = loop(driven, **CASES["saved times"]), given("saved times")
-    assert_allclose(backwards_through(*run(*arguments), motion(run)(*arguments))[1], differences("saved times")["k"], atol=1e-7)
+    assert_allclose(
+        backwards_through(*run(*arguments), motion(run)(*arguments))[1],
+        differences("saved times")["k"],
+        atol=1e-7,
+    )
 
 
 def test_a_mutant_of_a_line_that_is_gone_is_no_mutant():

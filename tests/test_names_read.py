@@ -1,4 +1,6 @@
-"""Methods are traced once: what they read is refused where it has state, noticed where it is bound anew, and a constant where it is a class or a module."""
+"""Methods are traced once: what they read is refused where it has state, noticed where it is bound anew, and
+a constant where it is a class or a module.
+"""
 
 import copy
 import gc
@@ -29,14 +31,34 @@ class Spring(jj.Scene):
         return (jj.generalized_force(motion, x_rate=-({read}) * motion.q.x),)
 """
 TWO_FIELDS = "@dataclasses.dataclass(frozen=True)\nclass Two:\n    a: float = 1.0\n    b: tuple = (1.0,)\n"
-PLANETS = "class Planet(enum.Enum):\n    moon = 1.0\n    earth = 4.0\n    def __init__(self, pull): self.pull = pull\n"
-WRAPPER = "class Own:\n    def __init__(self, f): functools.update_wrapper(self, f).k = 1.0\n    def __call__(self): return self.k\n"
+PLANETS = (
+    "class Planet(enum.Enum):\n    moon = 1.0\n    earth = 4.0\n    def __init__(self, pull): self.pull ="
+    " pull\n"
+)
+WRAPPER = (
+    "class Own:\n    def __init__(self, f): functools.update_wrapper(self, f).k = 1.0\n    def"
+    " __call__(self): return self.k\n"
+)
 
 
 def cell(text, read, before="pass"):
-    """What a cell of a notebook defines, and a spring below it whose stiffness in N/m is what it reads; `before`: a line of the method before that."""
+    """What a cell of a notebook defines, and a spring below it whose stiffness in N/m is what it reads;
+    `before`: a line of the method before that.
+    """
     names = {"jj": jj, "jnp": jnp, "np": np, "__name__": "__main__"}
-    modules = ("argparse", "array", "collections", "contextvars", "dataclasses", "enum", "fractions", "functools", "itertools", "random", "types")
+    modules = (
+        "argparse",
+        "array",
+        "collections",
+        "contextvars",
+        "dataclasses",
+        "enum",
+        "fractions",
+        "functools",
+        "itertools",
+        "random",
+        "types",
+    )
     names |= {name: importlib.import_module(name) for name in modules}
     exec(text, names)
     exec(SPRING.format(read=read, before=before), names)
@@ -66,25 +88,61 @@ NOTICED = {
     "a number of another type": ("k = True", "jnp.where(isinstance(k, bool), 1.0, 4.0)", "k = 1"),
     "a number of NumPy": ("k = np.float32(1)", "k", "k = np.float32(4)"),
     "a tuple": ("k = (1.0, (2.0, 'a'))", "k[0]", "k = (4.0, (2.0, 'a'))"),
-    "a named tuple": ("Two = collections.namedtuple('Two', 'a b')\nk = Two(1.0, 2.0)", "k.a", "k = Two(4.0, 2.0)"),
+    "a named tuple": (
+        "Two = collections.namedtuple('Two', 'a b')\nk = Two(1.0, 2.0)",
+        "k.a",
+        "k = Two(4.0, 2.0)",
+    ),
     "a text": ("k = 'soft'", "{'soft': 1.0, 'stiff': 4.0}[k]", "k = 'stiff'"),
     "a function of JAX": ("law = jnp.add", "law(0.5, 0.5)", "law = lambda a, b: 4.0"),
     "a slice": ("k = slice(0, 1)", "jnp.array([1.0, 4.0])[k][0]", "k = slice(1, 2)"),
     "a fraction": ("k = fractions.Fraction(1)", "float(k)", "k = fractions.Fraction(4)"),
-    "an enumeration": ("Kind = enum.Enum('Kind', 'soft stiff')\nk = Kind.soft", "1.0 if k is Kind.soft else 4.0", "k = Kind.stiff"),
-    "an enumeration of tuples": ("Kind = enum.Enum('Kind', dict(soft=(1.0, 'a'), stiff=(4.0, 'b')))\nk = Kind.soft", "k.value[0]", "k = Kind.stiff"),
+    "an enumeration": (
+        "Kind = enum.Enum('Kind', 'soft stiff')\nk = Kind.soft",
+        "1.0 if k is Kind.soft else 4.0",
+        "k = Kind.stiff",
+    ),
+    "an enumeration of tuples": (
+        "Kind = enum.Enum('Kind', dict(soft=(1.0, 'a'), stiff=(4.0, 'b')))\nk = Kind.soft",
+        "k.value[0]",
+        "k = Kind.stiff",
+    ),
     "an enumeration with attributes": (PLANETS + "k = Planet.moon", "k.pull", "k = Planet.earth"),
-    "a function that remembers": ("law = functools.lru_cache(lambda x: 1.0)", "law(1)", "law = functools.lru_cache(lambda x: 4.0)"),
+    "a function that remembers": (
+        "law = functools.lru_cache(lambda x: 1.0)",
+        "law(1)",
+        "law = functools.lru_cache(lambda x: 4.0)",
+    ),
     "a frozen dataclass": (TWO_FIELDS + "k = Two()", "k.a", "k = Two(a=4.0)"),
     "a function": ("def law(): return 1.0", "law()", "def law(): return 4.0"),
-    "other code in a function": ("def law(): return 1.0\ndef other(): return 4.0", "law()", "law.__code__ = other.__code__"),
-    "a compiled function": ("import jax\nlaw = jax.jit(lambda x: 1.0 * x)", "law(1.0)", "law = jax.jit(lambda x: 4.0 * x)"),
-    "a partial function": ("law = functools.partial(pow, 1.0)", "law(2)", "law = functools.partial(pow, 2.0)"),
+    "other code in a function": (
+        "def law(): return 1.0\ndef other(): return 4.0",
+        "law()",
+        "law.__code__ = other.__code__",
+    ),
+    "a compiled function": (
+        "import jax\nlaw = jax.jit(lambda x: 1.0 * x)",
+        "law(1.0)",
+        "law = jax.jit(lambda x: 4.0 * x)",
+    ),
+    "a partial function": (
+        "law = functools.partial(pow, 1.0)",
+        "law(2)",
+        "law = functools.partial(pow, 2.0)",
+    ),
     "a class": ("class Law:\n    k = 1.0", "Law.k", "class Law:\n    k = 4.0"),
-    "a module": ("law = types.ModuleType('law')\nlaw.k = 1.0", "law.k", "law = types.ModuleType('law')\nlaw.k = 4.0"),
+    "a module": (
+        "law = types.ModuleType('law')\nlaw.k = 1.0",
+        "law.k",
+        "law = types.ModuleType('law')\nlaw.k = 4.0",
+    ),
     "a function inside the method": ("k = 1.0", "(lambda: k)()", "k = 4.0"),
     "a name defined below": ("", "k", "k = 4.0"),
-    "a replaced method": ("", "1.0", "Spring.loads = lambda self, motion: (jj.generalized_force(motion, x_rate=-4.0 * motion.q.x),)"),
+    "a replaced method": (
+        "",
+        "1.0",
+        "Spring.loads = lambda self, motion: (jj.generalized_force(motion, x_rate=-4.0 * motion.q.x),)",
+    ),
     "an attribute of the scene's class": ("", "Spring.k if hasattr(Spring, 'k') else 1.0", "Spring.k = 4.0"),
 }
 
@@ -136,10 +194,14 @@ HAS_STATE = {
     "class beneath a dataclass": TWO_FIELDS + "class Beneath(Two): pass\nk = Beneath()",
     "frozen dataclass with a list of its own": TWO_FIELDS + "k = Two()\nobject.__setattr__(k, 'more', [1.0])",
     "member of an enumeration whose value is a list": "k = enum.Enum('Kind', {'soft': [1.0]}).soft",
-    "member of an enumeration whose value is an array": "k = enum.Enum('Kind', {'soft': (1.0, np.ones(2))}).soft",
+    "member of an enumeration whose value is an array": (
+        "k = enum.Enum('Kind', {'soft': (1.0, np.ones(2))}).soft"
+    ),
     "member of an enumeration with a list of its own": "k = enum.Enum('Kind', 'soft').soft\nk.more = [1.0]",
     "wrapped function with a number": WRAPPER + "k = Own(lambda: 1.0)",
-    "wrapped method with a number": WRAPPER + "class Other:\n    @Own\n    def law(self): return 1.0\nk = Other.law",
+    "wrapped method with a number": (
+        WRAPPER + "class Other:\n    @Own\n    def law(self): return 1.0\nk = Other.law"
+    ),
     "frozen dataclass with a list": TWO_FIELDS + "k = Two(b=[1.0])",
     "object": "class Own: pass\nk = Own()",
     "object with slots": "class Own:\n    __slots__ = ('a',)\nk = Own()",
@@ -160,8 +222,16 @@ def test_what_has_state_is_refused_by_name_when_the_class_is_made(kind):
 
 def test_methods_of_the_class_and_of_those_it_is_derived_from_count():
     names = cell("k = 1.0", "k")
-    exec("class Law:\n    def law(self, motion): return jj.generalized_force(motion, x_rate=-more * motion.q.x)", names)
-    exec("class Stiffer(Spring, Law):\n    def loads(self, motion): return (*super().loads(motion), self.law(motion))", names)
+    exec(
+        "class Law:\n    def law(self, motion): return jj.generalized_force(motion, x_rate=-more *"
+        " motion.q.x)",
+        names,
+    )
+    exec(
+        "class Stiffer(Spring, Law):\n    def loads(self, motion): return (*super().loads(motion),"
+        " self.law(motion))",
+        names,
+    )
     scene, names["more"] = names["Stiffer"](), 2.0
     assert stiffness(scene, "accelerations") == pytest.approx(3.0)
     names["more"] = 4.0
@@ -184,7 +254,12 @@ def test_an_object_that_takes_the_place_of_a_number_is_refused_at_the_next_call(
 
 OWN_MODULE = "import sys\nsys.modules['own_constants'] = own = types.ModuleType('own')\nown.k = 1.0"
 CONSTANTS = {
-    "an attribute of a module": ("pkg = types.ModuleType('pkg')\npkg.k = 1.0", "pkg.k", "pass", "pkg.k = 4.0"),
+    "an attribute of a module": (
+        "pkg = types.ModuleType('pkg')\npkg.k = 1.0",
+        "pkg.k",
+        "pass",
+        "pkg.k = 4.0",
+    ),
     "an attribute of a class": ("class Law:\n    k = 1.0", "Law.k", "pass", "Law.k = 4.0"),
     "what a helper reads": ("k = 1.0\ndef law(): return k", "law()", "pass", "k = 4.0"),
     "a name imported in the method": (OWN_MODULE, "k", "from own_constants import k", "own.k = 4.0"),
@@ -265,7 +340,11 @@ class Pushed(OnLine):
     held: object = law
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push + self.static(motion.q.x) - self.held(motion.q.x)),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=motion.inputs.push + self.static(motion.q.x) - self.held(motion.q.x)
+            ),
+        )
 
 
 def test_functions_in_fields_and_inputs_count(monkeypatch):
@@ -284,11 +363,15 @@ def test_functions_in_fields_and_inputs_count(monkeypatch):
     monkeypatch.setitem(globals(), "GAIN", 4.0)
     assert jax.tree.structure(scene) != structure
     assert np.isfinite(end(by_name))
-    assert Pushed(held=lambda x: table[0] * x) is not None  # of a function in a field, what has state is a constant
+    assert (
+        Pushed(held=lambda x: table[0] * x) is not None
+    )  # of a function in a field, what has state is a constant
 
 
 def test_nothing_is_traced_anew_where_nothing_has_changed():
-    names = cell("k, calls = 1.0, 0\nseen = []\ndef note(): seen.append(1)", "k", "global calls; calls += 1; note()")
+    names = cell(
+        "k, calls = 1.0, 0\nseen = []\ndef note(): seen.append(1)", "k", "global calls; calls += 1; note()"
+    )
     scene = names["Spring"]()
     for way in ("accelerations", "simulate"):
         stiffness(scene, way)

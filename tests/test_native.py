@@ -38,8 +38,18 @@ def _motions(scene, starts=None, **options):
 )
 def test_motions_are_those_of_xla_step_by_step(name, options):
     ours, theirs = _motions(jj.models.MODELS[name](), **options)
-    assert (int(ours.accepted), int(ours.rejected), int(ours.result)) == (int(theirs.accepted), int(theirs.rejected), int(theirs.result))
-    for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end), (ours.u_end, theirs.u_end), (ours.t_end, theirs.t_end)):
+    assert (int(ours.accepted), int(ours.rejected), int(ours.result)) == (
+        int(theirs.accepted),
+        int(theirs.rejected),
+        int(theirs.result),
+    )
+    for a, b in (
+        (ours.q, theirs.q),
+        (ours.u, theirs.u),
+        (ours.q_end, theirs.q_end),
+        (ours.u_end, theirs.u_end),
+        (ours.t_end, theirs.t_end),
+    ):
         assert_allclose(a, b, rtol=1e-10, atol=1e-10)
     if ours.work is not None:
         assert_allclose(ours.work, theirs.work, rtol=1e-10, atol=1e-10)
@@ -57,7 +67,9 @@ LEAN[[3, 40, 77]] = 1.7, np.nan, np.inf  # some fall, one begins beyond the even
 def ended(lean, solver):
     """What a disc is seen to do."""
     start = {"lean": lean, "yaw_rate": 0.5 + lean, "lean_rate": 0.2, "spin_rate": -3 + 2 * lean}
-    motion = jj.simulate(DISC, start, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-6, atol=1e-6, max_steps=1000, solver=solver)
+    motion = jj.simulate(
+        DISC, start, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-6, atol=1e-6, max_steps=1000, solver=solver
+    )
     return motion.q, motion.u_end, motion.t_end, motion.result
 
 
@@ -81,7 +93,9 @@ def test_a_lane_does_not_depend_on_its_company(solver):
 
 @every_solver
 def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(solver, monkeypatch):
-    """Of effort, what `conftest.py` takes for granted: tests run code made with little, users run code made with more."""
+    """Of effort, what `conftest.py` takes for granted: tests run code made with little, users run code made
+    with more.
+    """
     leans, lanes = jnp.tile(LEAN, 13), jax.jit(jax.vmap(lambda lean: ended(lean, solver)))
     expected = lanes(leans)
     for effort, threads in ((0, 1), (2, 5)):
@@ -96,14 +110,19 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_thr
 
 def test_lanes_of_a_rollout_are_those_of_xla_step_by_step():
     disc = jj.models.TiltingDisc()
-    starts = {"lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]), "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
+    starts = {
+        "lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]),
+        "spin_rate": jnp.linspace(-4.0, 0.0, 9),
+    }
     ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], backend=backend) for backend in ("native", "xla"))
     assert_array_equal(ours.result, theirs.result)
     assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
     assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
     assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
     for name in ("q", "u", "u_end", "t_end", "smallest_pivot"):
-        of_ours, of_theirs = (getattr(each.lanes, name)[each.result == results.SUCCESS] for each in (ours, theirs))
+        of_ours, of_theirs = (
+            getattr(each.lanes, name)[each.result == results.SUCCESS] for each in (ours, theirs)
+        )
         assert_allclose(of_ours, of_theirs, rtol=1e-10, atol=1e-10)
 
 
@@ -112,7 +131,10 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     assert set_up(disc).reason_against_machine_code == ""
     assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was requested"
     assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
-    assert "scalar program" in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
+    assert (
+        "scalar program"
+        in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
+    )
     assert set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code == ""
     with_its_own_rule = set_up(board, inputs={"steer_torque": lambda t: jax.nn.softplus(t)})
     assert "without scalar form" in with_its_own_rule.reason_against_machine_code
@@ -158,6 +180,9 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
 
 
 def test_a_stiff_motion_stays_with_the_backend_that_was_asked_for():
-    native, default = (jj.simulate(Following(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend, retry=True) for backend in ("native", "auto"))
+    native, default = (
+        jj.simulate(Following(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend, retry=True)
+        for backend in ("native", "auto")
+    )
     assert (native.result, native.fallback) == (results.MAX_STEPS, results.AS_ASKED)
     assert (default.result, default.fallback) == (results.SUCCESS, results.IMPLICIT)

@@ -60,7 +60,9 @@ def test_a_folder_that_is_switched_off_is_no_error(monkeypatch):
 
 
 def test_files_that_are_exchanged_are_made_again(folder):
-    """Also those of another kind, or what another version made: the digest at the beginning is that of name, maker and code."""
+    """Also those of another kind, or what another version made: the digest at the beginning is that of name,
+    maker and code.
+    """
     names = "abc"
     right = _all_kept(*names)
     whole = {name: (folder / f"{name}.o").read_bytes() for name in names}
@@ -137,9 +139,13 @@ def test_a_link_or_a_pipe_in_place_of_a_file_is_not_read(folder, tmp_path):
 @pytest.mark.parametrize("place", ["JOURDAIN_JAX_CACHE", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"])
 def test_the_owner_is_asked_of_every_folder(tmp_path, monkeypatch, place):
     """Of JAX's shared cache and of the user's too."""
-    monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "jourdain_jax") if place == "JOURDAIN_JAX_CACHE" else "")
+    monkeypatch.setenv(
+        "JOURDAIN_JAX_CACHE", str(tmp_path / "jourdain_jax") if place == "JOURDAIN_JAX_CACHE" else ""
+    )
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    config = SimpleNamespace(jax_compilation_cache_dir=str(tmp_path) if place == "JAX_COMPILATION_CACHE_DIR" else None)
+    config = SimpleNamespace(
+        jax_compilation_cache_dir=str(tmp_path) if place == "JAX_COMPILATION_CACHE_DIR" else None
+    )
     monkeypatch.setattr(host, "jax", SimpleNamespace(config=config))
     host._warn.cache_clear()
     (code,) = _all_kept("a")
@@ -170,9 +176,13 @@ def _kept_by_a_process(folder, seed, names):
 
 
 @machine_code.needed
-@pytest.mark.parametrize("names", [("skate",), ("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback")])
+@pytest.mark.parametrize(
+    "names", [("skate",), ("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback")]
+)
 def test_every_process_writes_the_same_programs(tmp_path, names):
-    """Files are named by their programs' text: an order of sets of texts, which differs from process to process, would give others."""
+    """Files are named by their programs' text: an order of sets of texts, which differs from process to
+    process, would give others.
+    """
     first = _kept_by_a_process(tmp_path / "kept", 1, names)
     assert len(first) >= 3 * len(names)
     assert all(name.startswith("jourdain_jax_") for name in first)
@@ -205,7 +215,11 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
     assert name() == usual
     names = [usual, name("another"), name(effort=1)]
     flat = SimpleNamespace(flatten=lambda: "-avx")
-    for what, value in (("get_host_cpu_name", lambda: "another"), ("llvm_version_info", (1, 2, 3)), ("get_host_cpu_features", lambda: flat)):
+    for what, value in (
+        ("get_host_cpu_name", lambda: "another"),
+        ("llvm_version_info", (1, 2, 3)),
+        ("get_host_cpu_features", lambda: flat),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(host.llvm, what, value)
             names.append(name())

@@ -1,4 +1,6 @@
-"""Derivatives by machine code of our own: against closed forms, against those of XLA, of lanes that end in all ways, and when they are left to XLA."""
+"""Derivatives by machine code of our own: against closed forms, against those of XLA, of lanes that end in
+all ways, and when they are left to XLA.
+"""
 
 import ctypes
 
@@ -40,7 +42,9 @@ def _ends(x, backend="native", events=False, **options):
     """Two states on the way and at the end, the time of the end."""
     scene = Oscillator(mass=x[0], stiffness=x[1], wall=x[2])
     options = {"ts": jnp.array([0.0, 0.3, 0.9]), "t1": 3.0, "rtol": 1e-11, "atol": 1e-11} | options
-    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, backend=backend, events=events, **options)
+    motion = jj.simulate(
+        scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, backend=backend, events=events, **options
+    )
     return jnp.stack([motion.q[1, 0], motion.u[2, 0], motion.q_end[0], motion.u_end[0], motion.t_end])
 
 
@@ -52,7 +56,9 @@ def _exact(x, events=False):
     def at(t):
         return centre + a * jnp.cos(w * t) + b * jnp.sin(w * t), w * (b * jnp.cos(w * t) - a * jnp.sin(w * t))
 
-    end = (jnp.arctan2(b, a) + jnp.arccos(-(x[2] + centre) / jnp.hypot(a, b))) / w if events else 3.0 + 0.0 * w
+    end = (
+        (jnp.arctan2(b, a) + jnp.arccos(-(x[2] + centre) / jnp.hypot(a, b))) / w if events else 3.0 + 0.0 * w
+    )
     return jnp.stack([at(0.3)[0], at(0.9)[1], *at(end), end])
 
 
@@ -90,7 +96,11 @@ def test_cotangents_of_a_lane_do_not_depend_on_its_company():
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_derivatives_pass_through_motions_one_after_the_other(derivative):
     """One compiled step, called with numbers of which other ones vary each time."""
-    step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, inputs={"push": X[5]}, rtol=1e-11, atol=1e-11).end)
+    step = jax.jit(
+        lambda scene, state, until: (
+            jj.simulate(scene, state, t1=until, inputs={"push": X[5]}, rtol=1e-11, atol=1e-11).end
+        )
+    )
 
     def late(stiffness):
         scene = Oscillator(mass=X[0], stiffness=stiffness, wall=10.0)
@@ -110,7 +120,11 @@ def test_cotangents_of_a_program_are_those_of_jax(seed):
     nodes = list(inputs)
     for _ in range(40):
         a, b = (int(nodes[i]) for i in random.integers(len(nodes), size=2))
-        op = str(random.choice(["add", "sub", "mul", "div", "sin", "cos", "tanh", "sqrt", "neg", "atan2", "max", "select"]))
+        op = str(
+            random.choice(
+                ["add", "sub", "mul", "div", "sin", "cos", "tanh", "sqrt", "neg", "atan2", "max", "select"]
+            )
+        )
         if op == "select":
             nodes.append(graph.call("select", graph.call("lt", a, b), a, b))
         elif op == "div":
@@ -118,11 +132,17 @@ def test_cotangents_of_a_program_are_those_of_jax(seed):
         elif op == "sqrt":
             nodes.append(graph.call("sqrt", graph.add(graph.one, graph.mul(a, a))))
         else:
-            nodes.append(graph.call(op, a, b) if op in ("add", "sub", "mul", "atan2", "max") else graph.call(op, a))
+            nodes.append(
+                graph.call(op, a, b) if op in ("add", "sub", "mul", "atan2", "max") else graph.call(op, a)
+            )
     outputs, weights = nodes[-5:], [graph.input(f"w{i}", True) for i in range(5)]
     at, g = jnp.split(jnp.asarray(random.normal(size=9)), [4])
     _, back = jax.vjp(lambda x: jnp.stack(emit.run(graph, outputs, dict(zip(inputs, x, strict=True)))), at)
-    found = emit.run(graph, cotangents(graph, outputs, weights, inputs), dict(zip([*inputs, *weights], [*at, *g], strict=True)))
+    found = emit.run(
+        graph,
+        cotangents(graph, outputs, weights, inputs),
+        dict(zip([*inputs, *weights], [*at, *g], strict=True)),
+    )
     assert_allclose(np.array(found, float), back(g)[0], rtol=1e-11, atol=1e-13)
 
 
@@ -143,7 +163,9 @@ def _counted(alignment, size):
     return _taken(alignment, size)
 
 
-_taken = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)(("aligned_alloc", ctypes.CDLL(None)))
+_taken = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)(
+    ("aligned_alloc", ctypes.CDLL(None))
+)
 
 
 def _largest_record(memory, lanes):
@@ -152,10 +174,18 @@ def _largest_record(memory, lanes):
 
     def seen(lean, radius):
         start = {"lean": lean, "yaw_rate": 1.0, "spin_rate": 5.0}
-        return jnp.sin(jj.simulate(model.replace(radius=radius), start, ts=jnp.linspace(0.1, 4.0, 40), rtol=1e-10, atol=1e-10).q).sum()
+        return jnp.sin(
+            jj.simulate(
+                model.replace(radius=radius), start, ts=jnp.linspace(0.1, 4.0, 40), rtol=1e-10, atol=1e-10
+            ).q
+        ).sum()
 
     RECORDS.clear()
-    each = jax.vmap(jax.grad(seen, (0, 1))) if lanes > 1 else lambda *x: jax.grad(seen, (0, 1))(*(x[0] for x in x))
+    each = (
+        jax.vmap(jax.grad(seen, (0, 1)))
+        if lanes > 1
+        else lambda *x: jax.grad(seen, (0, 1))(*(x[0] for x in x))
+    )
     found = jax.block_until_ready(jax.jit(each)(jnp.linspace(0.1, 0.4, lanes), jnp.linspace(0.3, 0.6, lanes)))
     return np.asarray(found), max(RECORDS)
 

@@ -1,4 +1,6 @@
-"""Inputs that are functions of time, in machine code: motions and derivatives are those of closed forms and of XLA."""
+"""Inputs that are functions of time, in machine code: motions and derivatives are those of closed forms and
+of XLA.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -20,14 +22,20 @@ both_modes = pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 
 
 class Pushed(OnPlane):
-    """x'' = force - k x, and beside it y'' = aside; it stops where x has come to the wall, which the force moves."""
+    """x'' = force - k x, and beside it y'' = aside; it stops where x has come to the wall, which the force
+    moves.
+    """
 
     k: float = jj.parameter(4.0)
     wall: float = jj.parameter(9.0)
     inputs = jj.inputs("force aside")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside
+            ),
+        )
 
     def events(self, motion):
         return {"wall": self.wall - motion.q.x - 0.1 * motion.inputs.force}
@@ -62,7 +70,13 @@ def test_lanes_have_functions_of_their_own():
     a = jnp.linspace(-1.0, 1.0, 11)
     found = jax.jit(jax.vmap(lambda a: motion(**X | {"a": a})["x"]))(a)
     assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
-    lanes = jj.rollout(Pushed(), {"x": jnp.linspace(0.1, 0.5, 5)}, ts=TS, inputs={"force": lambda t: 0.8 * jnp.sin(1.3 * t)}, **TIGHT).lanes
+    lanes = jj.rollout(
+        Pushed(),
+        {"x": jnp.linspace(0.1, 0.5, 5)},
+        ts=TS,
+        inputs={"force": lambda t: 0.8 * jnp.sin(1.3 * t)},
+        **TIGHT,
+    ).lanes
     assert lanes.reduction.endswith("machine code")
     expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(jnp.linspace(0.1, 0.5, 5))
     assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
@@ -79,7 +93,9 @@ def test_functions_samples_and_numbers_stand_side_by_side(derivative):
     slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f)["y"])(f))(0.7)
     assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
     of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record)["x"])(a))(0.8)
-    assert_allclose(of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9)
+    assert_allclose(
+        of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9
+    )
 
 
 @both_modes
@@ -101,7 +117,10 @@ def test_an_event_may_depend_on_a_function_of_time(derivative):
 
 def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_closes_over_nothing():
     def ends(amplitudes):
-        inputs = {"force": lambda t: amplitudes @ jnp.stack([jnp.sin(1.3 * t), jnp.sin(0.5 * t)]), "aside": lambda t: 2.0 * t}
+        inputs = {
+            "force": lambda t: amplitudes @ jnp.stack([jnp.sin(1.3 * t), jnp.sin(0.5 * t)]),
+            "aside": lambda t: 2.0 * t,
+        }
         return jj.simulate(Pushed(), {"x": 0.3}, ts=TS, inputs=inputs, **TIGHT)
 
     found, amplitudes = ends(jnp.array([0.8, 0.1])), jnp.array([0.8, 0.1])
@@ -117,7 +136,9 @@ def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
         """A scene of which nothing is known yet."""
 
     def end(_):
-        return np.asarray(jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"])
+        return np.asarray(
+            jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"]
+        )
 
     with ThreadPoolExecutor(2) as threads:
         assert_array_equal(*threads.map(end, range(2)))

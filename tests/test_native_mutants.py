@@ -1,6 +1,8 @@
-"""Deliberate errors of one line in what writes machine code: each must be caught by a check that passes without it.
+"""Deliberate errors of one line in what writes machine code: each must be caught by a check that passes
+without it.
 
-The checks know closed forms alone, of a bead on a spring that a growing force pushes, x'' = t - k x, and of beads at constant speed; and differences.
+The checks know closed forms alone, of a bead on a spring that a growing force pushes, x'' = t - k x, and of
+beads at constant speed; and differences.
 """
 
 import functools
@@ -19,7 +21,15 @@ from test_mutants import Mutant
 
 import jourdain_jax as jj
 from jourdain_jax.integrate import event_search, state_projection
-from jourdain_jax.integrate.loop import adjoint, loop, native_motion, projection_kernel, rate_functions, step, transitions
+from jourdain_jax.integrate.loop import (
+    adjoint,
+    loop,
+    native_motion,
+    projection_kernel,
+    rate_functions,
+    step,
+    transitions,
+)
 from jourdain_jax.motion import integration
 from jourdain_jax.motion.simulate import set_up
 
@@ -78,7 +88,9 @@ class Strip(OnLine):
     width: float = jj.parameter(0.02)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)),)
+        return (
+            jj.generalized_force(motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)),
+        )
 
     def events(self, motion):
         return {"window": jnp.abs(motion.q.x - 1.2) - self.width + 0.02}
@@ -103,7 +115,9 @@ START = {"x": 0.7, "v": 0.4, "k": 4.0}
 
 def motion(scene: jj.Scene, values: dict, *, first: float | None = None, **options):
     """What machine code returns of a motion, and its start as a state."""
-    setup = jax.tree.map(lambda x: x if isinstance(x, bool) else jnp.asarray(x), set_up(scene, values, work=False, **options))
+    setup = jax.tree.map(
+        lambda x: x if isinstance(x, bool) else jnp.asarray(x), set_up(scene, values, work=False, **options)
+    )
     assert not setup.reason_against_machine_code, setup.reason_against_machine_code
     setup = setup if first is None else setup._replace(dt0=jnp.asarray(first) * jnp.sign(setup.t1 - setup.t0))
     return setup.integrator.solved(setup.fitting(), integration._begin(setup))
@@ -118,7 +132,9 @@ def motions_follow_the_closed_form():
     found = jax.jit(lambda: pushed(**START))()
     assert_allclose(found.ys.q[:, 0], pushed_position(TIMES, **START), **CLOSE, err_msg="closed form")
     assert int(found.rejected) > 0, "no step was rejected, as this check needs it"
-    assert int(found.accepted + found.rejected) < 30, f"{found.accepted} and {found.rejected} steps: too many for the order"
+    assert int(found.accepted + found.rejected) < 30, (
+        f"{found.accepted} and {found.rejected} steps: too many for the order"
+    )
 
 
 def lanes_of_a_batch_follow_their_own():
@@ -137,7 +153,9 @@ def an_event_is_found():
 
 
 def an_event_within_a_step_is_found():
-    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], first=1.0, max_step=jnp.inf))()
+    found = jax.jit(
+        lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], first=1.0, max_step=jnp.inf)
+    )()
     assert found.code == results.EVENT, "the event was passed over"
     assert abs(found.t_end - 0.51) < 1e-9, "time of the event"
 
@@ -148,7 +166,9 @@ def steps_are_no_longer_than_allowed():
 
 
 def series_are_no_longer_than_allowed():
-    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], solver=jj.Taylor(), max_step=0.25))()
+    found = jax.jit(
+        lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], solver=jj.Taylor(), max_step=0.25)
+    )()
     assert found.accepted == 8, "the longest step"
 
 
@@ -161,7 +181,9 @@ def a_motion_leaves_an_event_at_which_it_starts():
     rising = jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.7, "x_rate": 5.0}, ts=TIMES))()
     assert rising.code == results.EVENT, "leaves"
     assert 0.5 < rising.t_end < 1.5, "leaves"
-    assert float(jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.7, "x_rate": -5.0}, ts=TIMES))().t_end) == 0.0, "leaves"
+    assert (
+        float(jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.7, "x_rate": -5.0}, ts=TIMES))().t_end) == 0.0
+    ), "leaves"
 
 
 def a_strip_is_met():
@@ -188,7 +210,11 @@ def an_event_where_a_relation_changes_is_found():
 
 
 def a_bead_stays_on_its_circle():
-    found = jax.jit(lambda: motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, first=0.1))()
+    found = jax.jit(
+        lambda: motion(
+            Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, first=0.1
+        )
+    )()
     assert_allclose(jnp.sum(found.ys.q**2, axis=1), 1.0, atol=1e-13, err_msg="circle")
     assert int(found.accepted) < 60, "too many steps"
 
@@ -200,7 +226,9 @@ def a_start_is_put_onto_its_rows():
     t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
     q_near, _ = jax.jit(lambda q: state_projection.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
     assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
-    u_near, _ = jax.jit(lambda u: state_projection.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual))(u)
+    u_near, _ = jax.jit(
+        lambda u: state_projection.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual)
+    )(u)
     assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
 
 
@@ -214,13 +242,15 @@ def saved_by_closed_form(x):
 
 def end_by_closed_form(x):
     """A number made of the time and the speed at which the bead comes down to the level."""
-    step = lambda _, t: t - (pushed_position(t, **x) + 0.1) / jax.grad(pushed_position)(t, **x)  # noqa: E731
-    t = jax.lax.fori_loop(0, 6, step, 1.125)  # steps of Newton's method: the last two have the first two derivatives of the root
+    step = lambda _, t: t - (pushed_position(t, **x) + 0.1) / jax.grad(pushed_position)(t, **x)
+    t = jax.lax.fori_loop(
+        0, 6, step, 1.125
+    )  # steps of Newton's method: the last two have the first two derivatives of the root
     return t + 0.3 * jax.grad(pushed_position)(t, **x)
 
 
 def seen_by_closed_form(x):
-    position = lambda t: pushed_position(t, x["x"], 0.4, x["k"])  # noqa: E731
+    position = lambda t: pushed_position(t, x["x"], 0.4, x["k"])
     return WEIGHTS @ (position(x["ts"]) + 0.3 * jax.vmap(jax.grad(position))(x["ts"]))
 
 
@@ -271,7 +301,13 @@ def _differentiated_twice(of: Callable, end: Callable, closed: Callable, at: dic
     found = jax.jit(of(end))(at)
     for name, row in expected(jax.hessian, closed).items():
         for other, value in row.items():
-            assert_allclose(found[name][other], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name} and {other}")
+            assert_allclose(
+                found[name][other],
+                value,
+                rtol=0,
+                atol=1e-7,
+                err_msg=f"derivative with respect to {name} and {other}",
+            )
 
 
 def forward_mode_to_an_event_twice():
@@ -287,17 +323,27 @@ THROWN = {"x": 0.1, "v": 1.1, "kept": 0.8, "pull": 0.5, "level": 0.4}
 
 def _thrown_back(x):
     """A number made of the position at 1 s and of the time of the event."""
-    found = motion(Moving(x["kept"], x["pull"], x["level"]), {"x": x["x"], "x_rate": x["v"]}, ts=np.array([1.0]))
+    found = motion(
+        Moving(x["kept"], x["pull"], x["level"]), {"x": x["x"], "x_rate": x["v"]}, ts=np.array([1.0])
+    )
     return found.ys.q[0, 0] + 0.3 * found.passed.ts[0]
 
 
 def thrown_back_by_closed_form(x):
     t = (x["level"] - x["x"]) / (x["v"] - 0.05)
-    return x["level"] + 0.05 * t + (0.1 * t - x["kept"] * x["v"]) * (1.0 - t) + 0.5 * x["pull"] * (1.0 - t) ** 2 + 0.3 * t
+    return (
+        x["level"]
+        + 0.05 * t
+        + (0.1 * t - x["kept"] * x["v"]) * (1.0 - t)
+        + 0.5 * x["pull"] * (1.0 - t) ** 2
+        + 0.3 * t
+    )
 
 
 def _through_a_transition(derivative: Callable) -> None:
-    (found, value), (right, right_value) = (with_value(derivative, f)(THROWN) for f in (_thrown_back, thrown_back_by_closed_form))
+    (found, value), (right, right_value) = (
+        with_value(derivative, f)(THROWN) for f in (_thrown_back, thrown_back_by_closed_form)
+    )
     assert_allclose(value, right_value, **CLOSE, err_msg="state after an event")
     for of_found, of_right in zip(jax.tree.leaves(found), jax.tree.leaves(right), strict=True):
         assert_allclose(of_found, of_right, rtol=0, atol=1e-7, err_msg=WRONG)
@@ -335,7 +381,15 @@ def reverse_mode_back_over_projections():
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
     def weighed(rate):
-        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, first=100.0, max_step=jnp.inf)
+        found = motion(
+            Round(),
+            {"x": 1.0, "y": 0.0, "y_rate": rate},
+            ts=[2.0, 4.0],
+            rtol=1e3,
+            atol=1e3,
+            first=100.0,
+            max_step=jnp.inf,
+        )
         return jnp.sum(found.ys.q @ jnp.array([0.4, 0.9])) + found.y_end.v[0], found.accepted
 
     h = 1e-3
@@ -346,40 +400,150 @@ def reverse_mode_back_over_projections():
     assert_allclose(found, expected, rtol=0, atol=1e-7, err_msg="derivative with respect to the rate")
 
 
-FORM, LANES, CIRCLE = motions_follow_the_closed_form, lanes_of_a_batch_follow_their_own, a_bead_stays_on_its_circle
+FORM, LANES, CIRCLE = (
+    motions_follow_the_closed_form,
+    lanes_of_a_batch_follow_their_own,
+    a_bead_stays_on_its_circle,
+)
 EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_is_put_onto_its_rows
-BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved_times, reverse_mode_with_respect_to_times
-EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
+BACK, ALONG, TIME = (
+    reverse_mode_through_saved_times,
+    forward_mode_through_saved_times,
+    reverse_mode_with_respect_to_times,
+)
+EVENT_BACK, EVENT_ALONG, EVENT_TWICE = (
+    reverse_mode_to_an_event,
+    forward_mode_to_an_event,
+    forward_mode_to_an_event_twice,
+)
 BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
 LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
 LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
 STRIP, STICKS, WINDOW = a_strip_is_met, friction_at_rest_sticks, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
-ON, ON_BACK, ON_TWICE = forward_mode_through_a_transition, reverse_mode_through_a_transition, a_hessian_through_a_transition
+ON, ON_BACK, ON_TWICE = (
+    forward_mode_through_a_transition,
+    reverse_mode_through_a_transition,
+    a_hessian_through_a_transition,
+)
 TRIED, WRONG = "tried_by_stages", "derivative with respect to"
 MUTANTS = [
-    Mutant("a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"),
-    Mutant("the whole step for its error", step, TRIED, "weighted(w, weights, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
+    Mutant(
+        "a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"
+    ),
+    Mutant(
+        "the whole step for its error",
+        step,
+        TRIED,
+        "weighted(w, weights, k",
+        "weighted(w, method.b, k",
+        FORM,
+        "too many|closed form",
+    ),
     Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", FORM, "closed form"),
-    Mutant("rows of the tableau too small", step, "stages", "*method.A[1:n, :n],", "*(0.999 * method.A[1:n, :n]),", FORM, "closed form|too many"),
-    Mutant("stages at the first time", step, "stages", "w.fma(step, c[i], t)", "t", FORM, "closed form|too many"),
-    Mutant("a rejected step takes time", step, "taken", '"t": w.where(accept, aim.t_1, p["t"])', '"t": aim.t_1', FORM, "closed form"),
-    Mutant("a rejected step is taken", step, "take", "w.where(accept, w.load(y1, i), w.load(y, i))", "w.load(y1, i)", FORM, "closed"),
+    Mutant(
+        "rows of the tableau too small",
+        step,
+        "stages",
+        "*method.A[1:n, :n],",
+        "*(0.999 * method.A[1:n, :n]),",
+        FORM,
+        "closed form|too many",
+    ),
+    Mutant(
+        "stages at the first time", step, "stages", "w.fma(step, c[i], t)", "t", FORM, "closed form|too many"
+    ),
+    Mutant(
+        "a rejected step takes time",
+        step,
+        "taken",
+        '"t": w.where(accept, aim.t_1, p["t"])',
+        '"t": aim.t_1',
+        FORM,
+        "closed form",
+    ),
+    Mutant(
+        "a rejected step is taken",
+        step,
+        "take",
+        "w.where(accept, w.load(y1, i), w.load(y, i))",
+        "w.load(y1, i)",
+        FORM,
+        "closed",
+    ),
     Mutant("a goal that stays", loop, "_save", "number, last)", "number, saved)", FORM, "closed form"),
     Mutant("starts of another lane", loop, "_starts", "given, lane)", "given, 0 * lane)", LANES, "lanes"),
     Mutant("goals of another lane", loop, "goal_of", "lane).place(", "0 * lane).place(", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "every, number)", "every, 0 * number)", LANES, "lanes"),
-    Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
-    Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
-    Mutant("no start at an event", event_search, "at_start", "rises = ((rate > 0.0)", "rises = ((rate > 1e9)", LEAVES, "leaves"),
-    Mutant("every start at an event", event_search, "at_start", "& (w.magnitude(a) <= noise * rate)", "", LEAVES_BELOW, "below"),
-    Mutant("another side at the start", step, "first_sides", "w.where(x < 0.0, -1.0", "w.where(x < 0.0, 1.0", STRIP, "strip|crossings"),
-    Mutant("no side at the start", step, "first_sides", "w.where(fresh, side,", "w.where(fresh, 0.0,", WINDOW, "passed over|place"),
-    Mutant("friction that is pushed back", event_search, "pass_event", "~rests & (rate < 0.0)", "~rests & (rate > 0.0)", STICKS, "sticks"),
+    Mutant(
+        "no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"
+    ),
+    Mutant(
+        "no bound of series",
+        step,
+        "_tried_by_series",
+        'rows), p["longest"])',
+        "rows), math.inf)",
+        SERIES_LONGEST,
+        "the longest step",
+    ),
+    Mutant(
+        "no start at an event",
+        event_search,
+        "at_start",
+        "rises = ((rate > 0.0)",
+        "rises = ((rate > 1e9)",
+        LEAVES,
+        "leaves",
+    ),
+    Mutant(
+        "every start at an event",
+        event_search,
+        "at_start",
+        "& (w.magnitude(a) <= noise * rate)",
+        "",
+        LEAVES_BELOW,
+        "below",
+    ),
+    Mutant(
+        "another side at the start",
+        step,
+        "first_sides",
+        "w.where(x < 0.0, -1.0",
+        "w.where(x < 0.0, 1.0",
+        STRIP,
+        "strip|crossings",
+    ),
+    Mutant(
+        "no side at the start",
+        step,
+        "first_sides",
+        "w.where(fresh, side,",
+        "w.where(fresh, 0.0,",
+        WINDOW,
+        "passed over|place",
+    ),
+    Mutant(
+        "friction that is pushed back",
+        event_search,
+        "pass_event",
+        "~rests & (rate < 0.0)",
+        "~rests & (rate > 0.0)",
+        STICKS,
+        "sticks",
+    ),
     Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
-    Mutant("a bracket with the wrong end", event_search, "_follow", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
+    Mutant(
+        "a bracket with the wrong end",
+        event_search,
+        "_follow",
+        "w.where(same, old.t[1], old.t[0])",
+        "old.t[0]",
+        EVENT,
+        "event",
+    ),
     Mutant(
         "rows by half",
         projection_kernel,
@@ -400,7 +564,15 @@ MUTANTS = [
     ),
     Mutant("weights of the first stage", adjoint, "step_back", "* b[stage]", "* b[0]", BACK, WRONG),
     Mutant("no later stages", adjoint, "step_back", "columns[stage][j], total", "0.0, total", BACK, WRONG),
-    Mutant("cotangents not scaled by the step", adjoint, "step_back", "return h * total", "return total", BACK, WRONG),
+    Mutant(
+        "cotangents not scaled by the step",
+        adjoint,
+        "step_back",
+        "return h * total",
+        "return total",
+        BACK,
+        WRONG,
+    ),
     Mutant(
         "slopes of another stage",
         adjoint,
@@ -410,18 +582,114 @@ MUTANTS = [
         BACK,
         WRONG,
     ),
-    Mutant("parameters of the last step", adjoint, "step_back", "w.load(by_known, i) + w.where(took", "w.where(took", BACK, WRONG),
-    Mutant("saved states forgotten", adjoint, "_write_added", 'w.load(place, type="double") + more', "more", BACK, WRONG),
-    Mutant("no projection on the way back", adjoint, "step_back", 'w.run("project_back", state, t + h, at, g1, added)', "None", PROJECTED_BACK, WRONG),
-    Mutant("an event at a number for a time", adjoint, "event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
-    Mutant("the level of an event forgotten", adjoint, "event_back", "w.where(usable, more, 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
-    Mutant("tangents of states alone", rate_functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
-    Mutant("the time of an event fixed", event_search, "put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
-    Mutant("the wrong way from an event", event_search, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
-    Mutant("tangents of an event by rates of before it moved", event_search, "put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
-    Mutant("the tangent at the time of an event", adjoint, "event_back", "dt * w.load(f, i)", "0.0 * dt", BENT, WRONG),
-    Mutant("the tangent of an event forgotten", adjoint, "_moved_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
-    Mutant("an event that stays while its tangent moves", adjoint, "_moved_back", "w.load(added, asked)", "0.0 * g_dt", BENT, WRONG),
+    Mutant(
+        "parameters of the last step",
+        adjoint,
+        "step_back",
+        "w.load(by_known, i) + w.where(took",
+        "w.where(took",
+        BACK,
+        WRONG,
+    ),
+    Mutant(
+        "saved states forgotten",
+        adjoint,
+        "_write_added",
+        'w.load(place, type="double") + more',
+        "more",
+        BACK,
+        WRONG,
+    ),
+    Mutant(
+        "no projection on the way back",
+        adjoint,
+        "step_back",
+        'w.run("project_back", state, t + h, at, g1, added)',
+        "None",
+        PROJECTED_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "an event at a number for a time",
+        adjoint,
+        "event_back",
+        "-total / rate",
+        "total / rate",
+        EVENT_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "the level of an event forgotten",
+        adjoint,
+        "event_back",
+        "w.where(usable, more, 0.0)",
+        "w.number(0.0)",
+        EVENT_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "tangents of states alone",
+        rate_functions,
+        "outputs_of",
+        "| {len(y) + i: n for i, n in known[k].items()}",
+        "",
+        ALONG,
+        WRONG,
+    ),
+    Mutant(
+        "the time of an event fixed",
+        event_search,
+        "put_tangents",
+        "-dc / slope",
+        "0.0 * dc",
+        EVENT_ALONG,
+        WRONG,
+    ),
+    Mutant(
+        "the wrong way from an event",
+        event_search,
+        "_move_rows",
+        "w.fma(w.load(k, i + rates), dt, before)",
+        "before",
+        EVENT_ALONG,
+        WRONG,
+    ),
+    Mutant(
+        "tangents of an event by rates of before it moved",
+        event_search,
+        "put_tangents",
+        "if part > 1:",
+        "if part > 9:",
+        EVENT_TWICE,
+        WRONG,
+    ),
+    Mutant(
+        "the tangent at the time of an event",
+        adjoint,
+        "event_back",
+        "dt * w.load(f, i)",
+        "0.0 * dt",
+        BENT,
+        WRONG,
+    ),
+    Mutant(
+        "the tangent of an event forgotten",
+        adjoint,
+        "_moved_back",
+        "w.where(usable, w.load(out, i), 0.0)",
+        "w.number(0.0)",
+        BENT,
+        WRONG,
+    ),
+    Mutant(
+        "an event that stays while its tangent moves",
+        adjoint,
+        "_moved_back",
+        "w.load(added, asked)",
+        "0.0 * g_dt",
+        BENT,
+        WRONG,
+    ),
     Mutant(
         "cotangents of states for those of tangents",
         native_motion,
@@ -431,17 +699,97 @@ MUTANTS = [
         TIMES_BENT,
         WRONG,
     ),
-    Mutant("a state that comes late to an event", transitions, "reset_program", "graph.add(along[n], graph.mul(rate, dt))", "along[n]", ON, WRONG),
-    Mutant("a state that leaves an event late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON, WRONG),
+    Mutant(
+        "a state that comes late to an event",
+        transitions,
+        "reset_program",
+        "graph.add(along[n], graph.mul(rate, dt))",
+        "along[n]",
+        ON,
+        WRONG,
+    ),
+    Mutant(
+        "a state that leaves an event late",
+        transitions,
+        "reset_program",
+        "graph.sub(dx, graph.mul(rate, dt))",
+        "dx",
+        ON,
+        WRONG,
+    ),
     Mutant("a jump at a fixed time", transitions, "reset_program", "{t: dt}", "{t: graph.zero}", ON, WRONG),
-    Mutant("a mode that stays", event_search, "pass_event", 'w.at(after, of["mode"].start), modes', "modes, modes", ON, "state after"),
-    Mutant("rates after an event in the mode before", adjoint, "reset_back", 'w.at(after, of["mode"].start), modes', "modes, modes", ON_BACK, WRONG),
-    Mutant("rates after an event forgotten", adjoint, "reset_back", "w.load(g, i) * w.load(f_after, i)", "0.0 * w.load(g, i)", ON_BACK, WRONG),
-    Mutant("what moves an event forgotten", adjoint, "reset_back", "w.load(out, i) + w.load(by_event, i)", "w.load(out, i)", ON_BACK, WRONG),
-    Mutant("cotangents of another event's time", adjoint, "_write_transition_back", '"passed", lane) - 1.0', '"passed", lane)', ON_BACK, WRONG),
-    Mutant("a transition whose tangent leaves late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON_TWICE, WRONG),
-    Mutant("goals that do not move cotangents", native_motion, "moved", "jax.vjp(rates, z)[1](g)[0]", "0 * g", TIMES_BENT, WRONG),
-    Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
+    Mutant(
+        "a mode that stays",
+        event_search,
+        "pass_event",
+        'w.at(after, of["mode"].start), modes',
+        "modes, modes",
+        ON,
+        "state after",
+    ),
+    Mutant(
+        "rates after an event in the mode before",
+        adjoint,
+        "reset_back",
+        'w.at(after, of["mode"].start), modes',
+        "modes, modes",
+        ON_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "rates after an event forgotten",
+        adjoint,
+        "reset_back",
+        "w.load(g, i) * w.load(f_after, i)",
+        "0.0 * w.load(g, i)",
+        ON_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "what moves an event forgotten",
+        adjoint,
+        "reset_back",
+        "w.load(out, i) + w.load(by_event, i)",
+        "w.load(out, i)",
+        ON_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "cotangents of another event's time",
+        adjoint,
+        "_write_transition_back",
+        '"passed", lane) - 1.0',
+        '"passed", lane)',
+        ON_BACK,
+        WRONG,
+    ),
+    Mutant(
+        "a transition whose tangent leaves late",
+        transitions,
+        "reset_program",
+        "graph.sub(dx, graph.mul(rate, dt))",
+        "dx",
+        ON_TWICE,
+        WRONG,
+    ),
+    Mutant(
+        "goals that do not move cotangents",
+        native_motion,
+        "moved",
+        "jax.vjp(rates, z)[1](g)[0]",
+        "0 * g",
+        TIMES_BENT,
+        WRONG,
+    ),
+    Mutant(
+        "goals that do not move states",
+        native_motion,
+        "moved",
+        "jnp.sum(scaled(rates(z), g))",
+        "0 * jnp.sum(g)",
+        TIME,
+        WRONG,
+    ),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
 KEPT = (loop.kernel, adjoint.kernel_back, state_projection._kernel, rate_functions.reason_against_derivatives)

@@ -1,4 +1,6 @@
-"""Single operations by machine code against XLA, the functions of C and mpmath, also of numbers that are no usual ones."""
+"""Single operations by machine code against XLA, the functions of C and mpmath, also of numbers that are no
+usual ones.
+"""
 
 import functools
 
@@ -19,10 +21,48 @@ from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed
 
-ONE = ["neg", "sqrt", "sin", "cos", "tan", "exp", "log", "tanh", "sinh", "cosh", "abs", "sign", "asin", "acos", "atan", "asinh", "acosh", "atanh"]
+ONE = [
+    "neg",
+    "sqrt",
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "tanh",
+    "sinh",
+    "cosh",
+    "abs",
+    "sign",
+    "asin",
+    "acos",
+    "atan",
+    "asinh",
+    "acosh",
+    "atanh",
+]
 ONE += ["exp2", "expm1", "log1p", "cbrt", "floor", "ceil", "round", "logistic", "is_finite"]
 TWO = ["add", "sub", "mul", "div", "atan2", "pow", "rem", "max", "min", "lt", "le", "gt", "ge", "eq", "ne"]
-SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e308, -1e308, 1e-300, 710.0, -745.2, 3.5e5, 1e6, 1e22]
+SPECIAL = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    0.5,
+    2.5,
+    -2.5,
+    np.inf,
+    -np.inf,
+    np.nan,
+    1e308,
+    -1e308,
+    1e-300,
+    710.0,
+    -745.2,
+    3.5e5,
+    1e6,
+    1e22,
+]
 EXACT = {"neg", "sqrt", "abs", "sign", "floor", "ceil", "round", "is_finite", *TWO} - {"atan2", "pow"}
 
 
@@ -41,19 +81,32 @@ def of_both(points):
     """Each operation with its values by machine code and by XLA."""
     graph, outputs, inputs = _all_operations()
     found = np.asarray(evaluated_natively.function(graph, outputs, inputs)(points))
-    return zip(ONE + TWO, found.T, emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True))), strict=True)
+    return zip(
+        ONE + TWO,
+        found.T,
+        emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True))),
+        strict=True,
+    )
 
 
 def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
     random = np.random.default_rng(0)
     points = np.array([(x, y) for x in SPECIAL for y in SPECIAL])
-    points = np.concatenate([points, random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)), random.uniform(-3, 3, size=(1002, 2))])
+    points = np.concatenate(
+        [
+            points,
+            random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)),
+            random.uniform(-3, 3, size=(1002, 2)),
+        ]
+    )
     for op, ours, theirs in of_both(points):
         theirs = np.asarray(theirs, float)
         if op in ("sin", "cos"):  # those of `emit` are right for multiples of pi/2 of 20 bits
             ours, theirs = ours[np.abs(points[:, 0]) < 5e5], theirs[np.abs(points[:, 0]) < 5e5]
         with np.errstate(all="ignore"):
-            close = np.abs(ours - theirs) <= (0.0 if op in EXACT else 2e-13) * np.abs(theirs)  # XLA's own functions are right to 1e-13
+            close = np.abs(ours - theirs) <= (0.0 if op in EXACT else 2e-13) * np.abs(
+                theirs
+            )  # XLA's own functions are right to 1e-13
         right = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs)) | close
         assert right.all(), (op, points[: len(ours)][~right][0], ours[~right][0], theirs[~right][0])
 
@@ -61,22 +114,54 @@ def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
 def test_numbers_below_the_normal_ones_count_as_zero_or_as_what_they_are():
     graph, outputs, inputs = _all_operations()
     small = [5e-324, -5e-324, 1e-310, -2e-308]
-    points = np.array([(x, y) for x in small for y in (0.0, 1.0, -2.5)] + [(y, x) for x in small for y in (0.0, 1.0, -2.5)])
+    points = np.array(
+        [(x, y) for x in small for y in (0.0, 1.0, -2.5)] + [(y, x) for x in small for y in (0.0, 1.0, -2.5)]
+    )
     function = evaluated_natively.function(graph, outputs, inputs)
-    found, at_zero = (np.asarray(function(x)) for x in (points, np.where(np.abs(points) < 2.0**-1022, np.copysign(0.0, points), points)))
+    found, at_zero = (
+        np.asarray(function(x))
+        for x in (points, np.where(np.abs(points) < 2.0**-1022, np.copysign(0.0, points), points))
+    )
     with np.errstate(all="ignore"):
         for op, ours, of_zero in zip(ONE + TWO, found.T, at_zero.T, strict=True):
             true = TABLE[op].value(*points[:, : 1 if op in ONE else 2].T).astype(float)
-            right = [(ours == x) | (np.isnan(ours) & np.isnan(x)) | (np.abs(ours - x) <= 1e-13 * np.abs(x) + 2.0**-1022) for x in (of_zero, true)]
+            right = [
+                (ours == x)
+                | (np.isnan(ours) & np.isnan(x))
+                | (np.abs(ours - x) <= 1e-13 * np.abs(x) + 2.0**-1022)
+                for x in (of_zero, true)
+            ]
             assert (right[0] | right[1]).all(), (op, points[~(right[0] | right[1])], ours, of_zero, true)
 
 
 def test_special_values_are_those_of_c_also_the_signs_of_zeros():
     graph, _, inputs = _all_operations()
-    ops = ["pow", "atan2", *(op for op in (*BY_POLYNOMIALS, "sin") if op in ONE and op not in ("log", "acos", "exp2"))]
+    ops = [
+        "pow",
+        "atan2",
+        *(op for op in (*BY_POLYNOMIALS, "sin") if op in ONE and op not in ("log", "acos", "exp2")),
+    ]
     outputs = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in ops]
     roots = [graph.call("pow", inputs[0], graph.const(y)) for y in (0.5, 1.5)]
-    values = [0.0, -0.0, 1.0, -1.0, 2.0, -3.0, 0.5, 1.5, -2.5, 4e15 + 1, -4e15 - 1, 1e300, 1e-300, -1e-300, np.inf, -np.inf, np.nan]
+    values = [
+        0.0,
+        -0.0,
+        1.0,
+        -1.0,
+        2.0,
+        -3.0,
+        0.5,
+        1.5,
+        -2.5,
+        4e15 + 1,
+        -4e15 - 1,
+        1e300,
+        1e-300,
+        -1e-300,
+        np.inf,
+        -np.inf,
+        np.nan,
+    ]
     points = np.array([(x, y) for x in values for y in values])
     found = np.asarray(evaluated_natively.function(graph, [*outputs, *roots], inputs)(points))
     with np.errstate(all="ignore"):
@@ -93,7 +178,9 @@ def test_numbers_in_single_precision_give_what_they_give_by_xla():
     points = np.array([(x, y) for x in values for y in values])
     with np.errstate(over="ignore"):
         for op, ours, theirs in of_both(points):
-            assert_allclose(ours.astype(np.float32), np.asarray(theirs, np.float32), rtol=1e-5, atol=2e-38, err_msg=op)
+            assert_allclose(
+                ours.astype(np.float32), np.asarray(theirs, np.float32), rtol=1e-5, atol=2e-38, err_msg=op
+            )
 
 
 GROWING = ("exp", "exp2", "expm1", "sinh", "cosh", "logistic")
@@ -106,7 +193,9 @@ def _functions(fused):
     graph = Graph()
     inputs = [graph.input("x", True), graph.input("y", True)]
     nodes = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in OWN]
-    return evaluated_natively.function(graph, [*nodes, graph.call("pow", inputs[0], graph.const(1.5))], inputs)
+    return evaluated_natively.function(
+        graph, [*nodes, graph.call("pow", inputs[0], graph.const(1.5))], inputs
+    )
 
 
 def _our_own(lanes, fused, x, y):
@@ -121,18 +210,43 @@ def _our_own(lanes, fused, x, y):
 def _arguments(op) -> tuple[np.ndarray, np.ndarray]:
     """Over the range in use, and near what a function does differently on either side."""
     random = np.random.default_rng(1)
-    uniform = lambda low, high: random.uniform(low, high, 500)  # noqa: E731
-    edges = np.array([0.5, 1.0, 2**0.5, 0.5**0.5, 2**0.5 - 1, 2**0.5 + 1, np.log(2) / 2, 1.5 * np.log(2), -0.5])
-    spread, near_one = random.normal(size=500) * 10.0 ** random.integers(-6, 6, size=500), 1 - 10 ** uniform(-16, -1)
-    angles = np.concatenate([random.normal(size=500) * 10.0 ** random.integers(-6, 20, size=500), uniform(-5e5, 5e5), np.arange(1, 200) * (np.pi / 2)])
+    uniform = lambda low, high: random.uniform(low, high, 500)
+    edges = np.array(
+        [0.5, 1.0, 2**0.5, 0.5**0.5, 2**0.5 - 1, 2**0.5 + 1, np.log(2) / 2, 1.5 * np.log(2), -0.5]
+    )
+    spread, near_one = (
+        random.normal(size=500) * 10.0 ** random.integers(-6, 6, size=500),
+        1 - 10 ** uniform(-16, -1),
+    )
+    angles = np.concatenate(
+        [
+            random.normal(size=500) * 10.0 ** random.integers(-6, 20, size=500),
+            uniform(-5e5, 5e5),
+            np.arange(1, 200) * (np.pi / 2),
+        ]
+    )
     more = dict.fromkeys(("sin", "cos", "tan"), angles) | dict.fromkeys(GROWING, uniform(-700, 709))
     more |= {"asin": near_one, "acos": [*near_one, *-near_one], "log1p": -near_one}
-    x = np.concatenate([spread, uniform(-3, 3), 10 ** uniform(-200, 200), *(edges * (1 + k * 2.0**-52) for k in range(-5, 6)), more.get(op, [])])
+    x = np.concatenate(
+        [
+            spread,
+            uniform(-3, 3),
+            10 ** uniform(-200, 200),
+            *(edges * (1 + k * 2.0**-52) for k in range(-5, 6)),
+            more.get(op, []),
+        ]
+    )
     y = np.resize(np.concatenate([uniform(-10, 10), spread, x[::-1]]), len(x))
     if op in ("pow", "x^1.5"):
         x = np.abs(x)
         y = np.where(np.abs(y * np.log(x)) < 700, y, 0.5)
-    domain = {"log": x > 0, "log1p": x > -1, "asin": np.abs(x) <= 1, "acos": np.abs(x) <= 1, "x^1.5": (x < 1e200) & (x > 1e-180)}
+    domain = {
+        "log": x > 0,
+        "log1p": x > -1,
+        "asin": np.abs(x) <= 1,
+        "acos": np.abs(x) <= 1,
+        "x^1.5": (x < 1e200) & (x > 1e-180),
+    }
     domain |= {"atan2": np.abs(x) > 1e-290 * np.abs(y)} | dict.fromkeys(GROWING, np.abs(x) < 709)
     domain |= {"acosh": x >= 1, "atanh": np.abs(x) < 1, "rem": (y != 0) & (np.abs(x) < 1e40 * np.abs(y))}
     inside = domain.get(op, np.isfinite(x))
@@ -148,8 +262,14 @@ def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
     found = _our_own(host.lanes(), fused, x, y)[op]
     function = (lambda x: mpmath.sqrt(x) * x) if op == "x^1.5" else in_mpmath(op)
     with mpmath.workdps(60):
-        exact = [function(*(mpmath.mpf(float(x)) for x in arguments)) for arguments in (zip(x, y, strict=True) if op in TWO else zip(x, strict=True))]
-        errors = [float(abs(mpmath.mpf(float(y)) - e)) / np.spacing(abs(float(e))) for e, y in zip(exact, found, strict=True)]
+        exact = [
+            function(*(mpmath.mpf(float(x)) for x in arguments))
+            for arguments in (zip(x, y, strict=True) if op in TWO else zip(x, strict=True))
+        ]
+        errors = [
+            float(abs(mpmath.mpf(float(y)) - e)) / np.spacing(abs(float(e)))
+            for e, y in zip(exact, found, strict=True)
+        ]
     assert len(x) > 500
     assert max(errors) < 0.9  # ulp
 
@@ -158,7 +278,14 @@ def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
 def test_functions_of_our_own_are_the_same_beside_any_others(fused):
     if fused and not host.fuses():
         pytest.skip("sums and products are rounded one after the other here")
-    x = np.concatenate([SPECIAL, [1e-310, -1e-310], np.random.default_rng(2).normal(size=400) * 10.0 ** np.random.default_rng(3).integers(-5, 7, size=400)])
+    x = np.concatenate(
+        [
+            SPECIAL,
+            [1e-310, -1e-310],
+            np.random.default_rng(2).normal(size=400)
+            * 10.0 ** np.random.default_rng(3).integers(-5, 7, size=400),
+        ]
+    )
     y = np.random.default_rng(4).permutation(x)
     expected = _our_own(2, fused, x, y)
     for lanes in (4, 8):

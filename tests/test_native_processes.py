@@ -56,7 +56,9 @@ def _calls(kind) -> tuple[Callable, jax.Array]:
     if kind == "single precision":  # converted where the call begins and ends
         graph = Graph()
         inputs = [graph.input(f"x{i}", True) for i in range(50)]
-        return jax.jit(nodes_called(graph, [graph.call("sin", x) for x in inputs], inputs)), jnp.ones(50, jnp.float32)
+        return jax.jit(nodes_called(graph, [graph.call("sin", x) for x in inputs], inputs)), jnp.ones(
+            50, jnp.float32
+        )
     disc = jj.models.TiltingDisc()
 
     def end(lean):
@@ -66,7 +68,9 @@ def _calls(kind) -> tuple[Callable, jax.Array]:
     return jax.jit(run), jnp.full(256 if kind == "batches" else (), 0.3)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="this system does not say how much memory a process has")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="this system does not say how much memory a process has"
+)
 @pytest.mark.parametrize("kind", ["motions", "gradients", "batches", "single precision"])
 def test_ten_thousand_calls_leave_nothing_behind(kind):
     run, x = _calls(kind)

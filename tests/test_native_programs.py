@@ -1,4 +1,6 @@
-"""Random programs of all operations of the table by machine code and by XLA, against mpmath: no value is further from the truth than its round-off allows."""
+"""Random programs of all operations of the table by machine code and by XLA, against mpmath: no value is
+further from the truth than its round-off allows.
+"""
 
 import functools
 from collections import Counter
@@ -19,7 +21,17 @@ from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed
 
-EXACT = {"neg", "abs", "sign", "floor", "ceil", "round", "max", "min", "rem"}  # without round-off of their own
+EXACT = {
+    "neg",
+    "abs",
+    "sign",
+    "floor",
+    "ceil",
+    "round",
+    "max",
+    "min",
+    "rem",
+}  # without round-off of their own
 ROUNDED = {"add", "sub", "mul", "div", "sqrt"}  # to the nearest double
 TWO = {"add", "sub", "mul", "div", "atan2", "pow", "rem", "max", "min", *COMPARED}
 POINTS, INPUTS, EACH = 8, 4, 6
@@ -27,13 +39,15 @@ Step = tuple[str, tuple[int, ...]]
 
 
 def drawn(seed) -> list[Step]:
-    """Operations in any order, each so many times, of numbers and truth values that are there: of inputs as often as of what was made of them."""
+    """Operations in any order, each so many times, of numbers and truth values that are there: of inputs as
+    often as of what was made of them.
+    """
     random = np.random.default_rng(seed)
     numbers, truths, steps = list(range(INPUTS)), [], []
     order = ["lt", *random.permutation([op for op in TABLE for _ in range(EACH)])]
     for node, op in enumerate(map(str, order), INPUTS):
-        number = lambda: int(random.choice(numbers if random.integers(2) else numbers[:INPUTS]))  # noqa: E731
-        truth = lambda: int(random.choice(truths))  # noqa: E731
+        number = lambda: int(random.choice(numbers if random.integers(2) else numbers[:INPUTS]))
+        truth = lambda: int(random.choice(truths))
         if op == "select":
             args = (truth(), number(), number())
         elif op in TRUTHS:
@@ -54,7 +68,9 @@ def true_values(steps: list[Step], point: np.ndarray, of_functions) -> list[Know
     """Of all steps."""
     known: list = [Known(mpmath.mpf(float(x)), mpmath.mpf(0)) for x in point]
     for op, args in steps:
-        far = op in ("sin", "cos") and known[args[0]] is not None and abs(known[args[0]].value) > 5e5  # XLA's multiples of pi/2 have 20 bits
+        far = (
+            op in ("sin", "cos") and known[args[0]] is not None and abs(known[args[0]].value) > 5e5
+        )  # XLA's multiples of pi/2 have 20 bits
         known.append(None if far else found(op, [known[a] for a in args], own_round_off(op, of_functions)))
     return known[INPUTS:]
 
@@ -62,14 +78,22 @@ def true_values(steps: list[Step], point: np.ndarray, of_functions) -> list[Know
 @functools.cache
 def programs(seed) -> tuple[list[Step], np.ndarray, np.ndarray, np.ndarray]:
     """Steps of a program, points, and its values at these by machine code and by XLA."""
-    steps, points = drawn(seed), np.random.default_rng(100 + seed).normal(size=(POINTS, INPUTS)) * [1.0, 2.0, 0.5, 5.0]
+    steps, points = (
+        drawn(seed),
+        np.random.default_rng(100 + seed).normal(size=(POINTS, INPUTS)) * [1.0, 2.0, 0.5, 5.0],
+    )
     graph = Graph()
     inputs = nodes = [graph.input(f"x{i}", True) for i in range(INPUTS)]
     for op, args in steps:
         nodes = [*nodes, graph.call(op, *(nodes[a] for a in args))]
     by_machine_code = np.asarray(evaluated_natively.function(graph, nodes[INPUTS:], inputs)(points))
     by_xla = emit.run(graph, nodes[INPUTS:], dict(zip(inputs, jnp.asarray(points.T), strict=True)))
-    return steps, points, by_machine_code, np.stack([np.broadcast_to(np.asarray(x, float), POINTS) for x in by_xla], axis=1)
+    return (
+        steps,
+        points,
+        by_machine_code,
+        np.stack([np.broadcast_to(np.asarray(x, float), POINTS) for x in by_xla], axis=1),
+    )
 
 
 @pytest.mark.parametrize(("way", "of_functions"), [("machine code", 2 * EPS), ("XLA", 500 * EPS)])
@@ -79,7 +103,9 @@ def test_values_are_those_of_mpmath_within_their_round_off(seed, way, of_functio
     values, settled = both[way == "XLA"], Counter()
     with mpmath.workdps(40):
         for point, row in zip(points, values, strict=True):
-            for (op, args), true, value in zip(steps, true_values(steps, point, of_functions), row, strict=True):
+            for (op, args), true, value in zip(
+                steps, true_values(steps, point, of_functions), row, strict=True
+            ):
                 if true is None:
                     continue
                 settled[op] += 1
@@ -87,7 +113,13 @@ def test_values_are_those_of_mpmath_within_their_round_off(seed, way, of_functio
                     assert value == true, (op, args, point)
                 else:
                     assert np.isfinite(value), (op, args, point, true)
-                    assert abs(mpmath.mpf(float(value)) - true.value) <= true.error, (op, args, point, true, value)
+                    assert abs(mpmath.mpf(float(value)) - true.value) <= true.error, (
+                        op,
+                        args,
+                        point,
+                        true,
+                        value,
+                    )
     assert set(settled) == set(TABLE)
     assert min(settled.values()) >= 4, settled
 
@@ -105,7 +137,11 @@ def test_no_bit_depends_on_which_values_wait_in_memory(monkeypatch):
         elif kind == 1:
             numbers.append(graph.call("select", graph.call("lt", a, b), b, c))
         else:
-            numbers.append(graph.add(graph.mul(graph.const(0.5), a), graph.mul(b, graph.call("sin", c))) if kind < 4 else graph.sub(a, b))
+            numbers.append(
+                graph.add(graph.mul(graph.const(0.5), a), graph.mul(b, graph.call("sin", c)))
+                if kind < 4
+                else graph.sub(a, b)
+            )
     outputs = [inputs[0], graph.const(3.0), *numbers[50::7], numbers[-1], numbers[-1]]
     points = random.normal(size=(19, 5))
     found = []

@@ -1,4 +1,6 @@
-"""Inputs given by samples, in machine code: against the loop of XLA, which takes the same steps, and against closed forms."""
+"""Inputs given by samples, in machine code: against the loop of XLA, which takes the same steps, and against
+closed forms.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,9 @@ class Pushed(OnLine):
 
     def loads(self, motion):
         f = motion.inputs
-        return (jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x),)
+        return (
+            jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x),
+        )
 
     def events(self, motion):
         return {"wall": self.wall - motion.q.x}
@@ -33,7 +37,10 @@ TIMES = np.array([-0.3, 0.1, 0.25, 0.4, 0.9, 1.3])
 
 def inputs(scale=1.0):
     """A record with a knot at a saved time, one before the start, and a jump; and a constant."""
-    return {"push": jj.Sampled(TIMES, scale * jnp.array([0.0, 2.0, -3.0, 5.0, 0.5, 1.0])), "pull": jj.Sampled([0.6, 0.601], [0.0, 0.4])}
+    return {
+        "push": jj.Sampled(TIMES, scale * jnp.array([0.0, 2.0, -3.0, 5.0, 0.5, 1.0])),
+        "pull": jj.Sampled([0.6, 0.601], [0.0, 0.4]),
+    }
 
 
 def numbers(motion):
@@ -42,13 +49,26 @@ def numbers(motion):
 
 @pytest.mark.parametrize(
     "more",
-    [{"events": False}, {}, {"t1": -1.7, "ts": -OPTIONS["ts"], "events": False}, {"rtol": 1e-5, "atol": 1e-5}],
+    [
+        {"events": False},
+        {},
+        {"t1": -1.7, "ts": -OPTIONS["ts"], "events": False},
+        {"rtol": 1e-5, "atol": 1e-5},
+    ],
     ids=["plain", "to a wall", "backwards", "loose"],
 )
 def test_steps_are_those_of_xla(more):
     options = OPTIONS | more
-    ours, theirs = (jj.simulate(Pushed(), {"x": 0.5, "x_rate": 0.2}, inputs=inputs(), backend=backend, **options) for backend in ("native", "xla"))
-    assert (ours.result, ours.accepted, ours.rejected, ours.event) == (theirs.result, theirs.accepted, theirs.rejected, theirs.event)
+    ours, theirs = (
+        jj.simulate(Pushed(), {"x": 0.5, "x_rate": 0.2}, inputs=inputs(), backend=backend, **options)
+        for backend in ("native", "xla")
+    )
+    assert (ours.result, ours.accepted, ours.rejected, ours.event) == (
+        theirs.result,
+        theirs.accepted,
+        theirs.rejected,
+        theirs.event,
+    )
     assert_allclose(numbers(ours), numbers(theirs), rtol=1e-13, atol=1e-13)
 
 
@@ -56,7 +76,16 @@ def test_a_record_far_from_time_zero_is_followed_as_at_zero():
     ends = []
     for t0 in (0.0, 2.0**30):  # a clock with three bits less than a microsecond
         record = jj.Sampled(t0 + np.arange(9) / 4, np.sin(np.arange(9.0)))
-        motion = jj.simulate(Pushed(), {"x": 0.5}, t0=t0, ts=[t0 + 0.75, t0 + 2.0], inputs={"pull": record}, rtol=1e-10, atol=1e-10, backend="native")
+        motion = jj.simulate(
+            Pushed(),
+            {"x": 0.5},
+            t0=t0,
+            ts=[t0 + 0.75, t0 + 2.0],
+            inputs={"pull": record},
+            rtol=1e-10,
+            atol=1e-10,
+            backend="native",
+        )
         ends.append(motion.q)
     assert_array_equal(*ends)
 
@@ -67,30 +96,51 @@ def test_derivatives_are_those_of_xla(derivative, events):
     def end(x, backend):
         scene, start = Pushed(mass=x[0], stiffness=x[1], wall=x[2]), {"x": x[3], "x_rate": x[4]}
         given = inputs() | {"pull": x[5]}
-        return jnp.sum(numbers(jj.simulate(scene, start, inputs=given, backend=backend, events=events, **OPTIONS)) ** 2)
+        return jnp.sum(
+            numbers(jj.simulate(scene, start, inputs=given, backend=backend, events=events, **OPTIONS)) ** 2
+        )
 
     x = jnp.array([1.5, 6.0, 0.8, 0.5, 0.2, 0.3])
-    ours, theirs = (jax.jit(jax.vmap(lambda x, backend=backend: derivative(end)(x, backend)))(jnp.stack([x, 1.01 * x])) for backend in ("native", "xla"))
+    ours, theirs = (
+        jax.jit(jax.vmap(lambda x, backend=backend: derivative(end)(x, backend)))(jnp.stack([x, 1.01 * x]))
+        for backend in ("native", "xla")
+    )
     assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
 def test_derivatives_with_respect_to_samples_are_refused_by_a_text_that_names_the_backend_that_has_them(mode):
     with pytest.raises(jj.DifferentiationModeError, match=r'samples of an input.*backend="xla"'):
-        mode(lambda scale: numbers(jj.simulate(Pushed(), {"x": 0.5}, inputs=inputs(scale), events=False, **OPTIONS))[-3])(1.3)
+        mode(
+            lambda scale: numbers(
+                jj.simulate(Pushed(), {"x": 0.5}, inputs=inputs(scale), events=False, **OPTIONS)
+            )[-3]
+        )(1.3)
 
 
 def test_a_blow_is_felt_and_one_sample_is_a_constant():
     blow = {"pull": jj.Sampled([0.5, 0.5005, 0.501], [0.0, 3000.0, 0.0])}  # 1.5 N s
     motion = jj.simulate(Pushed(), {"x": 0.0}, inputs=blow, t1=0.501, rtol=1e-9, atol=1e-9, backend="native")
     assert_allclose(motion.u_end, 1.0, rtol=1e-5)  # less what the spring has taken within the blow
-    constant, sampled = (jj.simulate(Pushed(), {"x": 0.3}, inputs={"pull": f}, backend="native", **OPTIONS) for f in (0.4, jj.Sampled([3.0], [0.4])))
+    constant, sampled = (
+        jj.simulate(Pushed(), {"x": 0.3}, inputs={"pull": f}, backend="native", **OPTIONS)
+        for f in (0.4, jj.Sampled([3.0], [0.4]))
+    )
     assert_array_equal(constant.q, sampled.q)
 
 
 def test_a_record_that_is_no_number_ends_its_lane_alone():
     values = jnp.ones((3, 6)).at[1, 3].set(jnp.nan)
-    run = jax.vmap(lambda v: jj.simulate(Pushed(), {"x": 0.3}, inputs={"push": jj.Sampled(TIMES, v)}, events=False, backend="native", **OPTIONS))
+    run = jax.vmap(
+        lambda v: jj.simulate(
+            Pushed(),
+            {"x": 0.3},
+            inputs={"push": jj.Sampled(TIMES, v)},
+            events=False,
+            backend="native",
+            **OPTIONS,
+        )
+    )
     motion = run(values)
     assert motion.result[1] not in (results.SUCCESS, results.EVENT)
     assert_array_equal(motion.q[0], motion.q[2])
@@ -106,7 +156,9 @@ class Until(Pushed):
 
 def test_inputs_that_machine_code_does_not_take_are_left_to_xla():
     def taken(scene, given):
-        return jax.eval_shape(lambda: jj.simulate(scene, {"x": 0.1}, inputs=given, t1=0.1)).reduction.endswith("machine code")
+        return jax.eval_shape(
+            lambda: jj.simulate(scene, {"x": 0.1}, inputs=given, t1=0.1)
+        ).reduction.endswith("machine code")
 
     assert taken(Pushed(), inputs())
     table = jnp.linspace(0.0, 1.0, 300)

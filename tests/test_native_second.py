@@ -1,4 +1,6 @@
-"""Second derivatives by machine code in all modes: closed forms, agreement of all modes, batches, what XLA takes, and what is refused."""
+"""Second derivatives by machine code in all modes: closed forms, agreement of all modes, batches, what XLA
+takes, and what is refused.
+"""
 
 import functools
 
@@ -28,7 +30,11 @@ class Falling(jj.Scene):
         return {"ball": jj.Particle(self.mass, [0.0, 0.0, q.z])}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, z_rate=-self.drag * (motion.u.z_rate - motion.inputs.wind) - 9.81 * self.mass),)
+        return (
+            jj.generalized_force(
+                motion, z_rate=-self.drag * (motion.u.z_rate - motion.inputs.wind) - 9.81 * self.mass
+            ),
+        )
 
     def events(self, motion):
         return {"ground": motion.q.z}
@@ -40,13 +46,21 @@ X = np.array([1.5, 0.4, 2.0, 3.0, 0.7, 0.1, 0.5])  # mass, drag, height, speed, 
 def _seen(x, events, **options):
     """States on the way, the end and its time."""
     start, options = {"z": x[2], "z_rate": x[3]}, {"rtol": 1e-11, "atol": 1e-11} | options
-    options |= {"inputs": {"wind": x[4]}, "events": events, "t0": x[5], "ts": x[5] + jnp.stack([0.3, x[6]]), "t1": x[5] ** 2 + (9.0 if events else 1.0)}
+    options |= {
+        "inputs": {"wind": x[4]},
+        "events": events,
+        "t0": x[5],
+        "ts": x[5] + jnp.stack([0.3, x[6]]),
+        "t1": x[5] ** 2 + (9.0 if events else 1.0),
+    }
     motion = jj.simulate(Falling(mass=x[0], drag=x[1]), start, **options)
     return jnp.concatenate([motion.q[:, 0], motion.u[1], motion.q_end, motion.u_end, motion.t_end[None]])
 
 
 def _exact(x, events):
-    """z = h + w t + (v - w) (1 - exp(-k t))/k with w the speed at which forces balance; the ground is met where Newton's method ends."""
+    """z = h + w t + (v - w) (1 - exp(-k t))/k with w the speed at which forces balance; the ground is met
+    where Newton's method ends.
+    """
     k, w = x[1] / x[0], x[4] - 9.81 * x[0] / x[1]
 
     def at(t):
@@ -71,10 +85,13 @@ def test_what_machine_code_does_not_serve_is_left_to_xla():
 
     def height(x):
         wind = jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2]))
-        start, options = {"z": 2.0, "z_rate": 1.0 + x}, {"events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10, "backend": "xla"}
+        start, options = (
+            {"z": 2.0, "z_rate": 1.0 + x},
+            {"events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10, "backend": "xla"},
+        )
         return jj.simulate(Falling(drag=0.4 * x), start, ts=[0.4], inputs={"wind": wind}, **options).q_end[0]
 
-    along = lambda f: lambda x: jax.jvp(f, (x,), (1.0,))  # noqa: E731
+    along = lambda f: lambda x: jax.jvp(f, (x,), (1.0,))
     derivatives, h = jax.jit(lambda x: jax.tree.leaves(along(along(along(height)))(x))), 1e-4
     (_, _, _, second, *_, third), after, before = (derivatives(x) for x in (1.0, 1.0 + h, 1.0 - h))
     for k, found in ((1, second), (3, third)):
@@ -96,20 +113,34 @@ MOTIONS = [
 
 @pytest.mark.parametrize(("mode", "events", "solver"), MOTIONS)
 def test_all_modes_are_those_of_the_closed_form(mode, events, solver):
-    """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
-    found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, max_steps=1357))))(LANES))
+    """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an
+    event.
+    """
+    found = np.asarray(
+        jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, max_steps=1357))))(LANES)
+    )
     assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
     assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
 
 
 def _lowest(x, wind, **options):
     """What is asked of one fall."""
-    motion = jj.simulate(Falling(mass=x[0], drag=x[1]), {"z": x[2], "z_rate": x[3]}, t1=9.0, inputs={"wind": wind}, rtol=1e-10, atol=1e-10, **options)
+    motion = jj.simulate(
+        Falling(mass=x[0], drag=x[1]),
+        {"z": x[2], "z_rate": x[3]},
+        t1=9.0,
+        inputs={"wind": wind},
+        rtol=1e-10,
+        atol=1e-10,
+        **options,
+    )
     return motion.t_end**2 + motion.u_end[0] * x[0]
 
 
 def test_hessians_of_sums_over_lanes_that_share_parameters():
-    """Newton's and Laplace's: of a loss over lanes of `rollout`, and the product with a vector of one over a batch."""
+    """Newton's and Laplace's: of a loss over lanes of `rollout`, and the product with a vector of one over a
+    batch.
+    """
     heights = jnp.array([1.0, 2.0, 3.5])
 
     def loss(x):
@@ -133,7 +164,9 @@ def test_hessians_under_an_input_that_is_samples():
     """Up to an event whose time such an input moves."""
     wind = jj.Sampled([0.0, 0.3, 0.8, 2.0], [0.0, 1.5, -2.0, 1.0])
     found = jax.jit(jax.hessian(lambda x: _lowest(x, wind)))(X)
-    assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind))))(X), rtol=1e-9, atol=1e-9)
+    assert_allclose(
+        found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind))))(X), rtol=1e-9, atol=1e-9
+    )
     assert np.all(np.asarray(found)[:4, :4] != 0)
 
 
@@ -158,9 +191,18 @@ def test_all_modes_of_a_model_agree(name, mode):
 
 
 def _height(x, **options):
-    wind = jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2])) if options.pop("samples", False) else 0.3
+    wind = (
+        jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2])) if options.pop("samples", False) else 0.3
+    )
     options = {"rtol": 1e-8, "atol": 1e-8} | options
-    return jj.simulate(Falling(drag=0.4 * x), {"z": 2.0, "z_rate": 1.0 + x}, ts=[0.4], inputs={"wind": wind}, events=False, **options).q_end[0]
+    return jj.simulate(
+        Falling(drag=0.4 * x),
+        {"z": 2.0, "z_rate": 1.0 + x},
+        ts=[0.4],
+        inputs={"wind": wind},
+        events=False,
+        **options,
+    ).q_end[0]
 
 
 @pytest.mark.parametrize(

@@ -31,12 +31,17 @@ def _near_rows(scene: jj.Scene, count) -> tuple[jax.Array, jax.Array]:
 
 def _put(native, held=()):
     """`(scene, q, u)` -> the nearest state on the rows."""
-    return lambda scene, q, u: jj.consistent(modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
+    return lambda scene, q, u: jj.consistent(
+        modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held
+    )
 
 
 def _by_both(scene: jj.Scene, q, u, **options):
     """States put onto the rows by machine code and by XLA, all lanes at once."""
-    return (eval_numpy(jax.vmap(lambda q, u, native=native: _put(native, **options)(scene, q, u)))(q, u) for native in (True, False))
+    return (
+        eval_numpy(jax.vmap(lambda q, u, native=native: _put(native, **options)(scene, q, u)))(q, u)
+        for native in (True, False)
+    )
 
 
 def _same(found, expected, tolerance=1e-11):
@@ -49,7 +54,10 @@ def _same(found, expected, tolerance=1e-11):
 def test_all_models_come_onto_the_rows_alike_and_lanes_do_not_see_each_other(name):
     scene = MODELS[name]()
     q, u = _near_rows(scene, 9)
-    ours, theirs = (jax.jit(jax.vmap(lambda q, u, native=native: _put(native)(scene, q, u)))(q, u) for native in (True, False))
+    ours, theirs = (
+        jax.jit(jax.vmap(lambda q, u, native=native: _put(native)(scene, q, u)))(q, u)
+        for native in (True, False)
+    )
     _same(ours, theirs)
     for lane in (0, 7):  # by itself, in narrow registers
         alone = jax.jit(lambda q, u: _put(True)(scene, q, u))(q[lane], u[lane])
@@ -70,14 +78,20 @@ def test_lanes_that_are_no_numbers_and_those_that_run_away():
     q = q.at[1].set(jnp.nan).at[2, 0].set(jnp.inf).at[4, 3].set(1e3)
     ours, theirs = _by_both(BICYCLE, q, u.at[3].set(jnp.nan))
     for found in (ours, theirs):
-        assert_array_equal(np.isfinite(found.q).all(axis=1) & np.isfinite(found.u).all(axis=1), [True, False, False, False, True])
+        assert_array_equal(
+            np.isfinite(found.q).all(axis=1) & np.isfinite(found.u).all(axis=1),
+            [True, False, False, False, True],
+        )
     _same([ours.q[0], ours.u[0]], [theirs.q[0], theirs.u[0]])
 
 
 @pytest.mark.parametrize(
     ("scene", "tolerance"),
     [
-        (linkages.Parallelogram(), 1e-9),  # positions on dependent rows are met to the root of the round-off of either
+        (
+            linkages.Parallelogram(),
+            1e-9,
+        ),  # positions on dependent rows are met to the root of the round-off of either
         (small_scenes.BeadOnTurningWire(), 1e-11),
         (small_scenes.AffineRows(), 1e-11),
         (rolling_scenes.RouthSphere(), 1e-11),
@@ -100,7 +114,9 @@ def test_what_is_held_does_not_move():
 
 
 class Driven(jj.Scene):
-    """A rod on a floor that moves, with a row that an input turns: rows of time and inputs, a quaternion, and a mass matrix that is full."""
+    """A rod on a floor that moves, with a row that an input turns: rows of time and inputs, a quaternion, and
+    a mass matrix that is full.
+    """
 
     length: float = jj.parameter(0.7, positive=True)
     moments: jnp.ndarray = jj.parameter(jnp.array([0.3, 0.5, 0.4]), unit="kg m^2")
@@ -110,7 +126,11 @@ class Driven(jj.Scene):
 
     def bodies(self, t, q):
         R = jj.quaternion_to_matrix(q.attitude)
-        return {"rod": jj.RigidBody(1.5, self.moments, jnp.stack([q.x, q.y, 0.3 * jnp.sin(t) * q.x]) + self.length * R[:, 2], R)}
+        return {
+            "rod": jj.RigidBody(
+                1.5, self.moments, jnp.stack([q.x, q.y, 0.3 * jnp.sin(t) * q.x]) + self.length * R[:, 2], R
+            )
+        }
 
     def geometric_constraints(self, pose):
         return {"height": pose["rod"].position[2] - 0.5 * jnp.cos(pose.t)}
@@ -131,14 +151,22 @@ def test_derivatives_of_starts_are_those_by_xla(scene):
 
     along = jax.tree.map(jnp.ones_like, point)
     for derivative in (jax.grad, lambda f: lambda x: jax.jvp(f, (x,), (along,))):
-        _same(*(eval_numpy(derivative(lambda x, native=native: end(native, x)))(point) for native in (True, False)), 1e-10)
+        _same(
+            *(
+                eval_numpy(derivative(lambda x, native=native: end(native, x)))(point)
+                for native in (True, False)
+            ),
+            1e-10,
+        )
 
 
 def test_where_machine_code_is_not_taken():
     scene = jj.models.TiltingDisc()
     started = jax.jit(lambda lean: jj.start(scene, lean=lean, spin_rate=-3.0).u)
     model = jj.build(scene, backend="xla")
-    exported = jax.export.export(jax.jit(lambda lean: jj.start(model, lean=lean, spin_rate=-3.0).u))(jax.ShapeDtypeStruct((), jnp.float64))
+    exported = jax.export.export(jax.jit(lambda lean: jj.start(model, lean=lean, spin_rate=-3.0).u))(
+        jax.ShapeDtypeStruct((), jnp.float64)
+    )
     with pytest.raises(RuntimeError, match=r'to be exported.*backend="xla"'):
         jax.export.export(started)(jax.ShapeDtypeStruct((), jnp.float64))
     assert "jourdain_jax_" in started.lower(0.3).as_text()

@@ -1,4 +1,6 @@
-"""Derivatives with respect to the times of a motion by machine code: against XLA and differences, up to events and of motions that fail."""
+"""Derivatives with respect to the times of a motion by machine code: against XLA and differences, up to
+events and of motions that fail.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,9 @@ MODES = "jacfwd", "jacrev"
 
 
 class Driven(OnLine):
-    """A particle on a spring whose push changes with time, by a formula and by an input, and a wall at x = -1.2."""
+    """A particle on a spring whose push changes with time, by a formula and by an input, and a wall at x =
+    -1.2.
+    """
 
     stiffness: float = jj.parameter(6.0, unit="N/m", positive=True)
     mass = 1.5
@@ -39,19 +43,29 @@ CASES = {
     "driven, up to a wall": (Driven(), None, {"inputs": {"push": PUSH}}),
     "driven, by Taylor series": (Driven(), None, {"solver": jj.Taylor()}),
     "disc that falls": (DISC, {"lean": 0.6, "spin_rate": -0.1}, {}),
-    "disc with a quaternion, projected": (jj.models.MODELS["tilting-disc-quaternion"](), None, {"formulation": jj.Formulation("full"), "events": False}),
+    "disc with a quaternion, projected": (
+        jj.models.MODELS["tilting-disc-quaternion"](),
+        None,
+        {"formulation": jj.Formulation("full"), "events": False},
+    ),
 }
 TIMES = np.array([0.2, 0.45, 0.71, 1.3])  # start, two that are saved, end
 BACK = np.array([2.0, 1.9, 1.2, 0.6])
 
 
 def _seen(name, times, backend="native", **options):
-    """What a motion from the first of the times to the last shows: states at those between, the end with its time and the work done until then."""
+    """What a motion from the first of the times to the last shows: states at those between, the end with its
+    time and the work done until then.
+    """
     scene, start, given = CASES[name]
     options = {"rtol": 1e-11, "atol": 1e-11} | given | options
     start = scene.example if start is None else start
     motion = jj.simulate(scene, start, t0=times[0], ts=times[1:-1], t1=times[-1], backend=backend, **options)
-    saved = jnp.where(motion.ts * jnp.sign(times[-1] - times[0]) <= motion.t_end * jnp.sign(times[-1] - times[0]), motion.q[:, 0], 0.0)
+    saved = jnp.where(
+        motion.ts * jnp.sign(times[-1] - times[0]) <= motion.t_end * jnp.sign(times[-1] - times[0]),
+        motion.q[:, 0],
+        0.0,
+    )
     work = jnp.zeros(0) if motion.work is None else motion.work[:1]
     return jnp.concatenate([saved, motion.u[:1, 0], work, motion.q_end, motion.u_end, motion.t_end[None]])
 

@@ -1,4 +1,6 @@
-"""Sigmas that nobody stated and robust losses, against closed forms: what the unknowns take of the samples, and intervals of Student's t."""
+"""Sigmas that nobody stated and robust losses, against closed forms: what the unknowns take of the samples,
+and intervals of Student's t.
+"""
 
 import numpy as np
 import pytest
@@ -38,7 +40,9 @@ def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression(
     assert_allclose(found.standard_errors, errors, rtol=1e-6)
     assert_allclose(found.high - found.values, stdtrit(count - 2, 0.975) * errors, rtol=1e-6)
     profile = found.profiles(data)["run 0: x_rate"]
-    assert profile.high - b[1] == pytest.approx(stdtrit(count - 2, 0.975) * errors[1], rel=0.02)  # ends of profiles are found to 1 % of the rise
+    assert profile.high - b[1] == pytest.approx(
+        stdtrit(count - 2, 0.975) * errors[1], rel=0.02
+    )  # ends of profiles are found to 1 % of the rise
 
 
 def test_a_channel_with_a_known_sigma_keeps_its_own_beside_one_that_has_none():
@@ -75,9 +79,14 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
     noise, runs, X = np.random.default_rng(2), [], []
     for k, count in enumerate((4, 6, 5)):
         ts = np.linspace(0.1, 1.0 + k, count)
-        values = {"far": 1.3 + 2 * ts + 0.1 * noise.normal(size=count), "near": 2.0 + 4 * ts + 0.05 * noise.normal(size=count)}
+        values = {
+            "far": 1.3 + 2 * ts + 0.1 * noise.normal(size=count),
+            "near": 2.0 + 4 * ts + 0.05 * noise.normal(size=count),
+        }
         sensors = {"far": Sensor("x", bias=jj.Estimate(0.1)), "near": Sensor("x", gain=2.0)}
-        runs.append(run(ts, values, None, ("x", *own)[k == 0 and not own :] if own else (), sensors=sensors, t0=0.0))
+        runs.append(
+            run(ts, values, None, ("x", *own)[k == 0 and not own :] if own else (), sensors=sensors, t0=0.0)
+        )
         rows = np.zeros((2, count, 1 + 3 * 2))
         rows[0, :, 0], rows[0, :, 1 + 2 * k], rows[0, :, 2 + 2 * k] = 1.0, 1.0, ts
         rows[1] = 2 * rows[0]
@@ -85,7 +94,10 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
         X.append(rows)
     found = jj.fit(Bead(), runs)
     columns = [0, 1, 2, 3, 4, 5, 6] if own else [0]
-    J = {"far": np.concatenate([x[0] for x in X])[:, columns], "near": np.concatenate([x[1] for x in X])[:, columns]}
+    J = {
+        "far": np.concatenate([x[0] for x in X])[:, columns],
+        "near": np.concatenate([x[1] for x in X])[:, columns],
+    }
     s = {name: float(found.sigma[name]) for name in J}
     C = np.linalg.inv(sum(J[name].T @ J[name] / s[name] ** 2 for name in J))
     doubt, more = 0.0, 0.0
@@ -98,7 +110,11 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
         # - sigma^4 d^2 C / d (sigma^2)^2, of C = (sum A)^-1
         more = more + 2 / left * 2 * np.diag(C @ A @ C - C @ A @ C @ A @ C) / np.diag(C)
     assert_allclose(found.standard_errors, np.sqrt(np.diag(C)), rtol=1e-6)
-    assert_allclose((found.high - found.values) / found.standard_errors, stdtrit(1 / doubt, 0.975) * np.sqrt(1 + more), rtol=1e-5)
+    assert_allclose(
+        (found.high - found.values) / found.standard_errors,
+        stdtrit(1 / doubt, 0.975) * np.sqrt(1 + more),
+        rtol=1e-5,
+    )
 
 
 def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
@@ -111,7 +127,9 @@ def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
     X = np.stack([np.ones(6), ts], axis=1)
     _, (rss,), *_ = np.linalg.lstsq(X, x)
     error = np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[0, 0])
-    assert float(found["run 0: x"].high - found["run 0: x"].value) == pytest.approx(stdtrit(4, 0.975) * error, rel=1e-5)
+    assert float(found["run 0: x"].high - found["run 0: x"].value) == pytest.approx(
+        stdtrit(4, 0.975) * error, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("loss", [huber(), student_t(4.0)])
@@ -119,13 +137,17 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
     noise, ts = np.random.default_rng(3), np.linspace(0.1, 1.0, 30)
     gain = {"x": Sensor("x", gain=jj.Estimate(1.0))}
     ys = [(1 + 2 * ts) * (1 + 0.05 * noise.normal()) + 0.1 * noise.normal(size=30) for _ in range(6)]
-    found = jj.fit(Bead(), [run(ts, {"x": y}, 0.02, (), sensors=gain, t0=0.0) for y in ys], errors="runs", loss=loss)
+    found = jj.fit(
+        Bead(), [run(ts, {"x": y}, 0.02, (), sensors=gain, t0=0.0) for y in ys], errors="runs", loss=loss
+    )
     slope, scores, bend, weights = (1 + 2 * ts) / 0.02, [], [], []
     for y in ys:
         r = (found.values[0] * (1 + 2 * ts) - y) / 0.02
         scores.append(np.sum(loss.weight(r) * r * slope))
         weights.append(loss.weight(r))
-        bend.append((np.abs(r) <= loss.parameter) if loss.kind == "huber" else 5 * (4 - r**2) / (4 + r**2) ** 2)
+        bend.append(
+            (np.abs(r) <= loss.parameter) if loss.kind == "huber" else 5 * (4 - r**2) / (4 + r**2) ** 2
+        )
     # H = J'J mean psi', with J'J from the weighted one
     H = sum(np.sum(w * slope**2) for w in weights) * np.mean(bend) / np.mean(weights)
     assert_allclose(found.standard_errors, [np.sqrt(np.sum(np.square(scores)) * 6 / 5) / H], rtol=1e-6)
@@ -146,7 +168,15 @@ def test_a_robust_loss_does_not_widen_what_a_prior_tells():
     assert p == pytest.approx(1.0, rel=1e-2)
     # Huber and Ronchetti (2009), section 7.6, of a mean; J'J from the weighted one
     K = 1 + p / 12 * np.var(slope) / np.mean(slope) ** 2
-    variance = K**2 * np.sum(psi**2) / (12 - p) / np.mean(slope) ** 2 * np.mean(5 / (4 + r**2)) / np.sum(5 / (4 + r**2)) * 0.05**2
+    variance = (
+        K**2
+        * np.sum(psi**2)
+        / (12 - p)
+        / np.mean(slope) ** 2
+        * np.mean(5 / (4 + r**2))
+        / np.sum(5 / (4 + r**2))
+        * 0.05**2
+    )
     assert found["run 0: x"].standard_error == pytest.approx(np.sqrt(variance), rel=1e-2)
 
 
@@ -155,14 +185,20 @@ def test_a_repeat_without_samples_has_not_converged(sigma):
     ts, y = lines()
     found = jj.fit_batch(Bead(), run(ts, {"x": np.stack([y, np.full(6, np.nan)])}, sigma))
     assert found.converged.tolist() == [True, False]
-    assert_allclose(found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6)
+    assert_allclose(
+        found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6
+    )
 
 
-@pytest.mark.parametrize(("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"])
+@pytest.mark.parametrize(
+    ("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"]
+)
 def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, sigma):
     ts, y = lines()
     y[2] = value
-    assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith("residuals overflow at the first guess")
+    assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith(
+        "residuals overflow at the first guess"
+    )
 
 
 def test_a_memory_needs_neighbours():
@@ -172,7 +208,9 @@ def test_a_memory_needs_neighbours():
 
 
 def line_with_slope():
-    """Times and a noisy straight line, the slope that fits it best, and its standard error for each sigma that may be stated."""
+    """Times and a noisy straight line, the slope that fits it best, and its standard error for each sigma
+    that may be stated.
+    """
     ts, y = lines()
     X = np.stack([np.ones(6), ts], axis=1)
     (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
@@ -188,7 +226,9 @@ def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_si
         data = run(ts, {"x": y}, sigma, {"x": None, "x_rate": jj.bounds(slope + 1e-3 * error, 9.0)})
         found = jj.fit(Bead(), data)
         assert found.at_bound.tolist() == [False, True]
-        assert float(found["run 0: x_rate"].high) - slope == pytest.approx(reach, rel=0.02)  # found to 2 % of the rise
+        assert float(found["run 0: x_rate"].high) - slope == pytest.approx(
+            reach, rel=0.02
+        )  # found to 2 % of the rise
         profile = found.profiles(data)["run 0: x_rate"]
         assert (profile.kind, profile.is_closed) == ("one-sided", (False, True))
         assert profile.high - slope == pytest.approx(reach, rel=0.02)

@@ -1,4 +1,6 @@
-"""Normal forces of contacts that are built into the coordinates: by the forces and moments of the bodies that they carry."""
+"""Normal forces of contacts that are built into the coordinates: by the forces and moments of the bodies that
+they carry.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -30,26 +32,48 @@ def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
         level, free = Cart(**made), CartOnRows(**made)
         o, i, radius = jnp.zeros(()), jnp.ones(()), level.radius
         balls = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), 3)
-        q, q_free = jnp.concatenate([jnp.zeros(3), balls]), jnp.concatenate([jnp.stack([o, o, radius, i, o, o, o]), balls])
+        q, q_free = (
+            jnp.concatenate([jnp.zeros(3), balls]),
+            jnp.concatenate([jnp.stack([o, o, radius, i, o, o, o]), balls]),
+        )
         turns = []
         for k in range(3):
             x, y = level.places[k]
             v = along + turn * jnp.stack([-y, x])
             turns += [-v[1] / radius, v[0] / radius, angular[k]]
         ball_u = jnp.stack(turns)
-        u, u_free = jnp.concatenate([along, turn[None], ball_u]), jnp.concatenate([along, jnp.stack([o, o, o, turn]), ball_u])
-        first, second = (contact_forces(s, 0.0, x, y, jj.accelerations(s, 0.0, x, y)) for s, x, y in ((level, q, u), (free, q_free, u_free)))
+        u, u_free = (
+            jnp.concatenate([along, turn[None], ball_u]),
+            jnp.concatenate([along, jnp.stack([o, o, o, turn]), ball_u]),
+        )
+        first, second = (
+            contact_forces(s, 0.0, x, y, jj.accelerations(s, 0.0, x, y))
+            for s, x, y in ((level, q, u), (free, q_free, u_free))
+        )
         press = [jnp.stack([found[f"ball{k}"].normal for k in range(3)]) for found in (first, second)]
         slide = [jnp.stack([found[f"ball{k}"].tangential for k in range(3)]) for found in (first, second)]
         known = jnp.stack([found[f"ball{k}"].determined for found in (first, second) for k in range(3)])
-        return press[0] - press[1], slide[0] - slide[1], press[1], known, velocity_residual(free, 0.0, q_free, u_free)
+        return (
+            press[0] - press[1],
+            slide[0] - slide[1],
+            press[1],
+            known,
+            velocity_residual(free, 0.0, q_free, u_free),
+        )
 
     n = 6
-    inputs = (random.normal(size=(n, 3)) * 0.1, random.normal(size=(n, 3)) * 5, random.uniform(-0.3, 0.3, n), random.normal(size=(n, 2)))
+    inputs = (
+        random.normal(size=(n, 3)) * 0.1,
+        random.normal(size=(n, 3)) * 5,
+        random.uniform(-0.3, 0.3, n),
+        random.normal(size=(n, 2)),
+    )
     inputs += (random.normal(size=n), random.normal(size=(n, 3)))
     press, slide, expected, known, residual = both(*(jnp.asarray(x) for x in inputs))
     assert np.max(np.abs(residual)) <= tolerance("round_off")
-    assert np.max(np.abs(press)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10  # ten: a system of 18 unknowns
+    assert (
+        np.max(np.abs(press)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10
+    )  # ten: a system of 18 unknowns
     assert np.max(np.abs(slide)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10
     assert np.all(known)
     assert np.ptp(expected) > 1.0
@@ -82,7 +106,9 @@ class TwoBalls(Cart):
 
 def test_a_moment_that_no_contact_can_bear_marks_the_shares_but_not_their_sum():
     # pushed upwards beside the line of its balls: a guide must keep it from tilting
-    cart = TwoBalls(places=((0.5, 0.0), (-0.5, 0.0)), load=(0.0, 0.1, 0.0), slope=0.0, push=(0.0, 0.0, 0.0), balls=2)
+    cart = TwoBalls(
+        places=((0.5, 0.0), (-0.5, 0.0)), load=(0.0, 0.1, 0.0), slope=0.0, push=(0.0, 0.0, 0.0), balls=2
+    )
     found = forces(cart)
     assert np.isclose(sum(float(force.normal) for force in found.values()), 12.0 * GRAVITY, rtol=1e-12)
     assert not any(bool(force.determined) for force in found.values())
@@ -103,10 +129,16 @@ class Robot(jj.Scene):
         frame, o = jj.rot_z(q.heading), 0.0 * q.x
         middle = jnp.stack([q.x, q.y, o + self.radius])
         turned = frame @ jj.rot_y(q.pitch)
-        made = {"body": jj.RigidBody(self.body, jnp.array([0.3, 0.25, 0.1]), middle + self.height * turned[:, 2], turned)}
+        made = {
+            "body": jj.RigidBody(
+                self.body, jnp.array([0.3, 0.25, 0.1]), middle + self.height * turned[:, 2], turned
+            )
+        }
         for name, side in (("left", 1.0), ("right", -1.0)):
             centre = middle + 0.5 * side * self.track * frame[:, 1]
-            made[name] = jj.RigidBody.thin_disc(self.wheel, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q[name]))
+            made[name] = jj.RigidBody.thin_disc(
+                self.wheel, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q[name])
+            )
         return made
 
     def loads(self, motion):
@@ -124,7 +156,8 @@ def test_the_wheels_of_a_robot_carry_half_of_it_and_lean_on_the_outer_one_in_a_t
     found = forces(robot, **rates)
     left, right = (float(found[name].normal) for name in ("left", "right"))
     weight = 12.0 * GRAVITY
-    # the body stands upright: its own pitch and the weight hold the balance; the centripetal forces and the wheels' momentum turn it outwards
+    # the body stands upright: its own pitch and the weight hold the balance; the centripetal forces and the
+    # wheels' momentum turn it outwards
     spin = 0.5 * 1.5 * 0.12**2 * turn * (rates["left_rate"] + rates["right_rate"])
     outwards = (9.0 * 0.52 + 3.0 * 0.12) * v * turn + spin
     assert np.isclose(left + right, weight, rtol=1e-9)

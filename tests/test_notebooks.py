@@ -1,4 +1,6 @@
-"""The notebooks run from their text sources, each to its checked number, and the executed copies beside them are of the same text."""
+"""The notebooks run from their text sources, each to its checked number, and the executed copies beside them
+are of the same text.
+"""
 
 import shutil
 from pathlib import Path
@@ -18,8 +20,16 @@ def test_a_notebook_runs_to_its_end(source, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel then shows its figures in the notebook
     shutil.copytree(FOLDER / "data", tmp_path / "data")
     notebook = jupytext.read(source)
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
-    pictures = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs if "image/png" in o.get("data", {})]
+    NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    pictures = [
+        o
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for o in cell.outputs
+        if "image/png" in o.get("data", {})
+    ]
     assert pictures
     assert any("assert" in cell.source for cell in notebook.cells)
 

@@ -1,4 +1,6 @@
-"""Times of stop events that were observed: of an oscillator let go at x0 > 0, which stops where x = 0 after t = pi / 2 sqrt(m / k)."""
+"""Times of stop events that were observed: of an oscillator let go at x0 > 0, which stops where x = 0 after t
+= pi / 2 sqrt(m / k).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +27,15 @@ def run(x0=0.3, events=None, values=None, **more) -> jj.Experiment:
     """A run of which no more than its event is known, unless values are given at ten times a second."""
     ts = np.array([1.0]) if values is None else 0.1 * np.arange(1, len(values) + 1)
     events = {"buffer": (STOP + 0.002, SIGMA)} if events is None else events
-    return jj.Experiment(ts, {} if values is None else {"x": values}, 0.005, start={"x": x0, "x_rate": 0.0}, t0=0.0, events=events, **more)
+    return jj.Experiment(
+        ts,
+        {} if values is None else {"x": values},
+        0.005,
+        start={"x": x0, "x_rate": 0.0},
+        t0=0.0,
+        events=events,
+        **more,
+    )
 
 
 def fit(*runs, **options) -> Fit:
@@ -39,7 +49,14 @@ def test_an_observed_time_tells_a_parameter_as_in_closed_form():
     assert_allclose(found["mass"].value, mass, rtol=1e-7)
     assert_allclose(found["mass"].standard_error, 2 * mass * SIGMA / (STOP + 0.002), rtol=1e-6)
     # samples may end long before it
-    early = jj.Experiment(np.array([0.05, 0.1]), {}, {}, start={"x": 0.3, "x_rate": 0.0}, t0=0.0, events={"buffer": (STOP + 0.002, SIGMA)})
+    early = jj.Experiment(
+        np.array([0.05, 0.1]),
+        {},
+        {},
+        start={"x": 0.3, "x_rate": 0.0},
+        t0=0.0,
+        events={"buffer": (STOP + 0.002, SIGMA)},
+    )
     assert_allclose(fit(early)["mass"].value, mass, rtol=1e-7)
     # to less than a round-off, whatever the amplitude
     assert_allclose(fit(run(0.6))["mass"].value, mass, rtol=1e-7)
@@ -65,7 +82,9 @@ def test_runs_with_and_without_an_event_are_fitted_together_and_samples_after_it
 
 def test_repeats_have_times_of_their_own():
     times = STOP + SIGMA * np.random.default_rng(1).normal(size=300)
-    found = jj.fit_batch(SCENE.replace(mass=1.5), run(events={"buffer": (times, SIGMA)}), ("mass",), rtol=1e-10, atol=1e-10)
+    found = jj.fit_batch(
+        SCENE.replace(mass=1.5), run(events={"buffer": (times, SIGMA)}), ("mass",), rtol=1e-10, atol=1e-10
+    )
     assert_allclose(found["mass"].value, 5.0 * (2 * times / np.pi) ** 2, rtol=1e-6)
 
 
@@ -79,11 +98,15 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
     assert_allclose(jax.jit(jax.jacfwd(told))(1.99), jax.grad(by_time)(1.99), rtol=1e-6)
     density = log_density(SCENE, run(), ("mass",), rtol=1e-10, atol=1e-10)
     z, log = density.unconstrain({"mass": 1.99}), np.log(1.99)  # flat in the mass, whose logarithm z is
-    assert_allclose(jax.jit(jax.grad(density))(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6)
+    assert_allclose(
+        jax.jit(jax.grad(density))(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6
+    )
 
 
 def test_a_motion_that_does_not_meet_the_event_is_named():
     other = fit(run(values=np.full(9, 0.3), events={"far": (0.9, SIGMA)}))
     assert not other.converged
-    assert "the motion of run 0 does not reach `far` before 4 times the observed time" in "".join(other.warnings)
+    assert "the motion of run 0 does not reach `far` before 4 times the observed time" in "".join(
+        other.warnings
+    )
     assert log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf

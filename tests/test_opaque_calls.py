@@ -1,4 +1,6 @@
-"""Loads and stop events with a part that has no scalar form: that part stays a call of JAX, everything else is lowered."""
+"""Loads and stop events with a part that has no scalar form: that part stays a call of JAX, everything else
+is lowered.
+"""
 
 from collections.abc import Callable
 
@@ -28,8 +30,12 @@ def by_table(force, numbers):
 
 def by_iteration(x, numbers):
     """The root of v^3 + v = x, by Newton's method."""
-    newton = lambda v: v - (v**3 + v - x) / (3 * v * v + 1)  # noqa: E731
-    return numbers[0] * jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 8 * jnp.finfo(v.dtype).eps * (1 + jnp.abs(v)), newton, jnp.zeros_like(x))
+    newton = lambda v: v - (v**3 + v - x) / (3 * v * v + 1)
+    return numbers[0] * jax.lax.while_loop(
+        lambda v: jnp.abs(newton(v) - v) > 8 * jnp.finfo(v.dtype).eps * (1 + jnp.abs(v)),
+        newton,
+        jnp.zeros_like(x),
+    )
 
 
 def by_recursion(x, numbers):
@@ -40,7 +46,9 @@ def by_recursion(x, numbers):
 def by_branches(x, numbers):
     """Another law on either side, and in every range."""
     side = jax.lax.cond(x > 0, lambda x: numbers[0] * x, lambda x: numbers[1] * x**2, x)
-    return jax.lax.switch(jnp.int32(2 + jnp.floor(side)), [lambda x: x, jnp.sin, lambda x: 2.0 * x, jnp.cos], side)
+    return jax.lax.switch(
+        jnp.int32(2 + jnp.floor(side)), [lambda x: x, jnp.sin, lambda x: 2.0 * x, jnp.cos], side
+    )
 
 
 def by_network(x, numbers):
@@ -62,7 +70,9 @@ def by_matrix(x, numbers):
 
 def by_asking(x, numbers):
     """A function in Python, of which no derivative is known."""
-    return jax.pure_callback(lambda x: -np.sin(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims")
+    return jax.pure_callback(
+        lambda x: -np.sin(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims"
+    )
 
 
 @jax.custom_jvp
@@ -87,18 +97,31 @@ class Acted(ChaplyginSleigh):
     def loads(self, motion):
         sleigh = motion["sleigh"]
         along = sleigh.orientation[:, 0]
-        return (jj.point_force(sleigh.point(jnp.zeros(3)), self.law(sleigh.velocity @ along, self.numbers) * along),)
+        return (
+            jj.point_force(
+                sleigh.point(jnp.zeros(3)), self.law(sleigh.velocity @ along, self.numbers) * along
+            ),
+        )
 
 
 LAWS = {
     "table": (Acted(), "the operation `scan`"),
     "iteration": (Acted(law=by_iteration, numbers=np.array([0.3])), "the operation `while`"),
     "recursion": (Acted(law=by_recursion, numbers=np.linspace(0.2, 0.5, 4)), "the operation `scan`"),
-    "branches": (Acted(law=by_branches, numbers=np.array([0.3, -0.2])), "an integer that depends on the state"),
-    "network": (Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)), "a matrix product with 1024 multiplications"),
+    "branches": (
+        Acted(law=by_branches, numbers=np.array([0.3, -0.2])),
+        "an integer that depends on the state",
+    ),
+    "network": (
+        Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)),
+        "a matrix product with 1024 multiplications",
+    ),
     "matrix": (Acted(law=by_matrix, numbers=np.array([2.0])), "a matrix product with 39999 multiplications"),
     "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
-    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a custom derivative"),
+    "callback with a rule": (
+        Acted(law=by_asking_with_rule, numbers=np.array([2.0])),
+        "`_asked`, which has a custom derivative",
+    ),
 }
 SMOOTH_ENOUGH = ["table", "callback with a rule", "network", "recursion", "branches"]
 
@@ -108,7 +131,9 @@ def rates_of(scene):
     program, rows = jj.lower(scene), jj.structure_of(scene).kept_rows
 
     def by_program(scene, q, y):
-        qdot, ydot, _ = program.rates(program.fixed_values(scene), jnp.zeros(()), tuple(q), tuple(y), jnp.zeros(0))
+        qdot, ydot, _ = program.rates(
+            program.fixed_values(scene), jnp.zeros(()), tuple(q), tuple(y), jnp.zeros(0)
+        )
         return jnp.stack([*qdot, *ydot])
 
     def dense(scene, q, y):
@@ -119,12 +144,17 @@ def rates_of(scene):
     return by_program, dense
 
 
-@pytest.mark.parametrize("law", [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x)], ids=["softplus", "sinc"])
+@pytest.mark.parametrize(
+    "law", [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x)], ids=["softplus", "sinc"]
+)
 def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
     scene = Acted(law=law)
     assert "which has a custom derivative" in jj.lower(scene).calls[0]
     (by_program, dense), (q, y) = rates_of(scene), (jnp.zeros(3), jnp.zeros(2))
-    first, second = ([jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)] for d in (jax.jacfwd, jax.hessian))
+    first, second = (
+        [jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)]
+        for d in (jax.jacfwd, jax.hessian)
+    )
     assert_allclose(*first, rtol=1e-12, atol=1e-12)
     assert_allclose(*second, rtol=1e-12, atol=1e-12)
 
@@ -144,7 +174,9 @@ def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_
     assert f"kept as a JAX call, without scalar form: {program.calls[0]}" in str(program)
     (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
     expected = jax.jit(jax.vmap(lambda q, y: dense(scene, q, y)))(q, y)
-    assert_allclose(jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(
+        jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12
+    )
     lanes_last = jax.jit(lambda q, y: by_program(scene, q, y))(q.T, y.T)
     assert_allclose(lanes_last.T, expected, rtol=1e-12, atol=1e-12)
 
@@ -157,9 +189,15 @@ def test_derivatives_through_a_call_are_those_of_the_dense_path(name):
     v = jnp.cos(jnp.arange(len(flat)))
 
     def derivatives(f):
-        of = lambda x: f(*rebuilt(x))  # noqa: E731
-        total = lambda x: jnp.sum(jnp.sin(of(x)))  # noqa: E731
-        return jax.jit(lambda x: (jax.jvp(of, (x,), (v,))[1], jax.grad(total)(x), jax.jvp(jax.grad(total), (x,), (v,))[1]))(flat)
+        of = lambda x: f(*rebuilt(x))
+        total = lambda x: jnp.sum(jnp.sin(of(x)))
+        return jax.jit(
+            lambda x: (
+                jax.jvp(of, (x,), (v,))[1],
+                jax.grad(total)(x),
+                jax.jvp(jax.grad(total), (x,), (v,))[1],
+            )
+        )(flat)
 
     (along, gradient, second), expected = map(derivatives, functions)
     assert_allclose(along, expected[0], rtol=1e-10, atol=1e-10)
@@ -171,7 +209,11 @@ def test_derivatives_through_a_call_are_those_of_the_dense_path(name):
 def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_densely_in_reverse():
     scene = LAWS["iteration"][0]
     (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 1)
-    assert_allclose(*(jax.jit(jax.jacfwd(lambda y, f=f: f(scene, q[0], y)))(y[0]) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
+    assert_allclose(
+        *(jax.jit(jax.jacfwd(lambda y, f=f: f(scene, q[0], y)))(y[0]) for f in (by_program, dense)),
+        rtol=1e-10,
+        atol=1e-10,
+    )
     for f in (by_program, dense):
         with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
             jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y)))(y[0])
@@ -190,7 +232,9 @@ def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
     assert_allclose(program.work, dense.work, atol=1e-9)
     lanes = jj.rollout(scene, START | {"heading_rate": np.linspace(0.9, 1.2, 11)}, **OPTIONS)
     assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
-    assert_allclose(lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8)
+    assert_allclose(
+        lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8
+    )
     assert np.all(np.diff(lanes.lanes.q_end[:, 2]) != 0)
 
 
@@ -201,14 +245,22 @@ class OnCam(jj.Scene):
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, [q.x, 0.0, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))])}
+        return {
+            "bead": jj.Particle(
+                self.mass, [q.x, 0.0, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))]
+            )
+        }
 
 
 class Mixed(OnCam):
     """A bead whose height is a product with a large matrix, which is one sine."""
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, [q.x, 0.0, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))])}
+        return {
+            "bead": jj.Particle(
+                self.mass, [q.x, 0.0, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]
+            )
+        }
 
 
 class Softly(OnCam):
@@ -220,15 +272,24 @@ class Softly(OnCam):
 
 @pytest.mark.parametrize(
     ("scene", "reason"),
-    [(Mixed(), "a matrix product with 1600 multiplications"), (Softly(), "`logaddexp`, which has a custom derivative,")],
+    [
+        (Mixed(), "a matrix product with 1600 multiplications"),
+        (Softly(), "`logaddexp`, which has a custom derivative,"),
+    ],
     ids=["product", "rule"],
 )
 def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, reason):
     assert set(jj.lower(scene).calls) == {reason}
     q, y = np.random.default_rng(4).uniform(-1.0, 1.0, (2, 6, 1)) + np.array([[[0.1]], [[2.0]]])
     by_program, dense = rates_of(scene)
-    for derivative in (lambda f: f, lambda f: jax.jacfwd(f, argnums=(1, 2)), lambda f: jax.jacrev(f, argnums=(1, 2))):
-        found, expected = (jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense))
+    for derivative in (
+        lambda f: f,
+        lambda f: jax.jacfwd(f, argnums=(1, 2)),
+        lambda f: jax.jacrev(f, argnums=(1, 2)),
+    ):
+        found, expected = (
+            jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense)
+        )
         jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
 
 
@@ -249,7 +310,14 @@ class FarWall(Effective):
     """A spring by a table that is flat in the whole domain, and not beyond."""
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=jnp.interp(motion.q.x, jnp.array([-20.0, -10.0, 10.0, 20.0]), jnp.array([50.0, 0.0, 0.0, -50.0]))),)
+        return (
+            jj.generalized_force(
+                motion,
+                x_rate=jnp.interp(
+                    motion.q.x, jnp.array([-20.0, -10.0, 10.0, 20.0]), jnp.array([50.0, 0.0, 0.0, -50.0])
+                ),
+            ),
+        )
 
 
 def test_what_a_call_depends_on_is_not_left_out_though_no_probe_shows_it():
@@ -265,10 +333,15 @@ def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources
     scene = LAWS["iteration"][0]
     program = jj.lower(scene)
     said = jj.report(scene).lowering
-    why = "the operation `while` has no scalar form: kept as a call; not to machine code: a part of it is kept as a JAX call"
+    why = (
+        "the operation `while` has no scalar form: kept as a call; not to machine code: a part of it is kept"
+        " as a JAX call"
+    )
     assert said == f"a scalar program of {program.operations} operations; {why}"
     for printed in (program.python_source, program.c_source):
-        with pytest.raises(ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as source"):
+        with pytest.raises(
+            ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as source"
+        ):
             printed()
 
 
@@ -285,7 +358,14 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
     assert program.operations == jj.lower(TiltingDisc()).operations
     assert program.calls == ("the operation `svd`",)
     (t,), (q,), (u,) = jj.sample_states(watched, 1)
-    values = program.values(program.events, program.fixed_values(watched), t, tuple(q), tuple(u[np.array(program.independent)]), jnp.zeros(0))
+    values = program.values(
+        program.events,
+        program.fixed_values(watched),
+        t,
+        tuple(q),
+        tuple(u[np.array(program.independent)]),
+        jnp.zeros(0),
+    )
     assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
     found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
     assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
@@ -298,7 +378,10 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
 
 def in_parts(f, *like):
     graph = Graph()
-    inputs = [Nodes(np.array([graph.input(f"{k}_{i}", True) for i in range(np.size(x))]).reshape(np.shape(x))) for k, x in enumerate(like)]
+    inputs = [
+        Nodes(np.array([graph.input(f"{k}_{i}", True) for i in range(np.size(x))]).reshape(np.shape(x)))
+        for k, x in enumerate(like)
+    ]
     return graph, [as_nodes(graph, x) for x in interpret_with_calls(graph, jax.make_jaxpr(f)(*like), inputs)]
 
 
@@ -318,7 +401,7 @@ def test_parts_that_are_apart_are_calls_of_their_own_in_the_right_order():
 
 def test_functions_that_differ_in_a_constant_are_not_one_call():
     def f(x):
-        table = lambda values: jnp.asarray(values)[jnp.int32(x)]  # noqa: E731
+        table = lambda values: jnp.asarray(values)[jnp.int32(x)]
         return table([1.0, 2.0, 3.0]) + 10 * table([1.0, 2.0, 4.0])
 
     graph, (node,) = in_parts(f, 0.0)

@@ -15,7 +15,9 @@ from jourdain_jax.program.polynomial import NormalForms
 
 
 def to_second_order(f, point):
-    """The value, all first and all second derivatives of f at a point, by the graph: on NumPy, and as JAX code."""
+    """The value, all first and all second derivatives of f at a point, by the graph: on NumPy, and as JAX
+    code.
+    """
     graph = Graph()
     x = [graph.input(name, True) for name in "xyz"[: len(point)]]
     (found,) = interpret(graph, jax.make_jaxpr(f)(jnp.asarray(point)), [Nodes(x)])
@@ -39,7 +41,9 @@ TRUTHS = {
     "sum": lambda x: (x[0] > 0) * 1.0 + (x[1] > 0) * 1.0,
     "difference": lambda x: (x[0] > 0) * x[1] - (x[1] > 3) * 1.0,
     "count": lambda x: 1.5 * jnp.stack([x[0] > 0, x[1] > 0, x[1] < 3]).astype(float).sum(),
-    "choice": lambda x: jnp.where(x[0] > 0, x[1] > 0, False) * 3.0 + jnp.where(x[0] < 0, x[1] > 0, True) * x[0],
+    "choice": lambda x: (
+        jnp.where(x[0] > 0, x[1] > 0, False) * 3.0 + jnp.where(x[0] < 0, x[1] > 0, True) * x[0]
+    ),
     "exactly one": lambda x: ((x[0] > 0) ^ (x[1] > 3)) * 2.0 + ((x[0] > 0) ^ (x[1] > 0)) * 5.0,
     "all and any": lambda x: jnp.all(x > 0) * 2.0 + jnp.any(x > 4) * 1.0 + jnp.all(x[:0] > 0) * 7.0,
     "numbers": lambda x: (x.astype(bool)).astype(float) @ jnp.array([1.0, 2.0]) * x[0],
@@ -54,20 +58,38 @@ def test_what_holds_is_a_number_where_one_is_asked_for(name, point):
     assert_allclose(to_second_order(TRUTHS[name], point), by_jax(TRUTHS[name], point), atol=1e-14)
 
 
-@pytest.mark.parametrize("f", [lambda n: n & 1, lambda n: n | 2, lambda n: ~n, lambda n: n // 2, lambda n: jnp.bitwise_and.reduce(n[None] | 4)])
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda n: n & 1,
+        lambda n: n | 2,
+        lambda n: ~n,
+        lambda n: n // 2,
+        lambda n: jnp.bitwise_and.reduce(n[None] | 4),
+    ],
+)
 def test_digits_of_integers_are_no_scalar_operation(f):
-    law = lambda x: jnp.float64(f(jnp.where(x[0] > 0, 3, 5)))  # noqa: E731
+    law = lambda x: jnp.float64(f(jnp.where(x[0] > 0, 3, 5)))
     with pytest.raises(Unsupported, match=r"integer|while"):
         to_second_order(law, (1.0,))
 
 
-@pytest.mark.parametrize("f", [lambda x: jnp.mean(jnp.float32(x > 0)) * x[1], lambda x: jnp.float32(x[0]) * x[1]])
+@pytest.mark.parametrize(
+    "f", [lambda x: jnp.mean(jnp.float32(x > 0)) * x[1], lambda x: jnp.float32(x[0]) * x[1]]
+)
 def test_single_precision_among_double_is_not_computed_in_double(f):
     with pytest.raises(Unsupported, match="float32"):
         to_second_order(f, (1.0, 2.0))
 
 
-@pytest.mark.parametrize("f", [lambda x: jnp.hypot(x[0], x[1]), lambda x: jnp.abs(x[1]) ** (2.0 + 0 * x[0]), lambda x: x[0] * jnp.abs(x[1]) ** 3])
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: jnp.hypot(x[0], x[1]),
+        lambda x: jnp.abs(x[1]) ** (2.0 + 0 * x[0]),
+        lambda x: x[0] * jnp.abs(x[1]) ** 3,
+    ],
+)
 @pytest.mark.parametrize("y", [0.0, 0.3, -0.3])
 def test_smooth_functions_of_a_magnitude_have_their_second_derivatives_at_zero(f, y):
     expected = by_jax(f, (1.2, y))
@@ -82,8 +104,8 @@ def test_the_derivative_of_a_magnitude_at_zero_is_that_of_jax():
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 1.5, 2.0, 2.5])
 @pytest.mark.parametrize("base", [0.0, 0.7])
 def test_powers_have_the_derivatives_of_jax(base, exponent):
-    constant = lambda x: x[0] ** exponent  # noqa: E731
-    of_both = lambda x: x[0] ** x[1]  # noqa: E731
+    constant = lambda x: x[0] ** exponent
+    of_both = lambda x: x[0] ** x[1]
     for f, point in ((constant, (base,)), (of_both, (base, exponent))):
         found, expected = to_second_order(f, point), by_jax(f, point)
         finite = ~np.isnan(expected)  # 0^(b-1) b at b = 0 and its like are NaN in JAX
@@ -92,7 +114,9 @@ def test_powers_have_the_derivatives_of_jax(base, exponent):
 
 
 @pytest.mark.parametrize("largest", [jnp.max, jnp.min])
-@pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, 1.0, 2.0), (1.0, 2.0, 2.0), (3.0, 1.0, 2.0), (0.1, 0.1, 0.1)])
+@pytest.mark.parametrize(
+    "point", [(1.0, 1.0, 1.0), (2.0, 1.0, 2.0), (1.0, 2.0, 2.0), (3.0, 1.0, 2.0), (0.1, 0.1, 0.1)]
+)
 def test_the_derivative_of_an_extreme_is_shared_by_all_that_reach_it(largest, point):
     for f in (lambda x: largest(x), lambda x: largest(jnp.stack([x[0], x[1], x[2], 1.0, x[0] * x[1]])) ** 2):
         assert_allclose(to_second_order(f, point), by_jax(f, point), rtol=1e-14, atol=1e-14)
@@ -127,7 +151,10 @@ def test_nothing_is_assumed_of_the_sign_of_a_parameter():
     probes = Probes(graph, {"p": np.linspace(1.0, 2.0, 8), "x": np.linspace(0.5, 1.0, 8)})
     forms = NormalForms(graph, 100, sign=probes.sign)
     c = graph.call("cos", x)
-    magnitude, root = graph.call("abs", graph.mul(p, c)), graph.call("sqrt", graph.mul(graph.mul(p, p), graph.mul(c, c)))
+    magnitude, root = (
+        graph.call("abs", graph.mul(p, c)),
+        graph.call("sqrt", graph.mul(graph.mul(p, p), graph.mul(c, c))),
+    )
     nodes = [graph.call("abs", p), graph.call("sqrt", graph.mul(p, p)), magnitude, root]
     found = [forms.rebuilt(forms.expanded(n)) for n in nodes]
     assert forms.guards == {c}

@@ -1,4 +1,5 @@
-"""Each closed form against the equations it claims to solve: Newton-Euler balances, constraint rows, multiplier models.
+"""Each closed form against the equations it claims to solve: Newton-Euler balances, constraint rows,
+multiplier models.
 
 Nothing of the package is used, so a failure here is a failure of the answer, not of the engine.
 """
@@ -68,7 +69,9 @@ def assert_same(value, expected, limit=ORACLE):
 def test_the_oracles_do_not_know_the_package():
     for path in (Path(__file__).parent / "oracles").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in getattr(node, "names", [])] if isinstance(node, ast.Import) else []
+            names = (
+                [alias.name for alias in getattr(node, "names", [])] if isinstance(node, ast.Import) else []
+            )
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             assert all(name.split(".")[0] != "jourdain_jax" for name in names), path
 
@@ -103,7 +106,12 @@ def axle(phi_rate):
 
     def rows(q):
         c, s = np.cos(q[6]), np.sin(q[6])
-        rolling = [[1, 0, -a * c, 0, 0, 0, 0], [0, 1, -a * s, 0, 0, 0, 0], [0, 0, 0, 1, 0, -a * c, 0], [0, 0, 0, 0, 1, -a * s, 0]]
+        rolling = [
+            [1, 0, -a * c, 0, 0, 0, 0],
+            [0, 1, -a * s, 0, 0, 0, 0],
+            [0, 0, 0, 1, 0, -a * c, 0],
+            [0, 0, 0, 0, 1, -a * s, 0],
+        ]
         return [*rolling, [0, 0, -a, 0, 0, a, p["length"]]]
 
     spin, push = p["rim_mass"] * a**2, m * p["gravity"] * np.sin(p["slope"])
@@ -111,7 +119,16 @@ def axle(phi_rate):
     c, s = a * np.cos(0.4), a * np.sin(0.4)
     q = columns(exact, "x1", "y1", "psi1", "x2", "y2", "psi2", "phi")
     v0 = [c * psi1, s * psi1, psi1, c * psi2, s * psi2, psi2, phi]
-    return q, {9: exact["psi1_rate"]}, times, rows, [m, m, spin, m, m, spin, spin], [push, 0, 0, push, 0, 0, 0], q[0], v0
+    return (
+        q,
+        {9: exact["psi1_rate"]},
+        times,
+        rows,
+        [m, m, spin, m, m, spin, spin],
+        [push, 0, 0, push, 0, 0, 0],
+        q[0],
+        v0,
+    )
 
 
 def heavy_axle(th_rate):
@@ -137,7 +154,16 @@ def on_a_slope():
     p, times = skate.RUN, np.linspace(0, 10, 9)
     q = columns(skate.motion(times, **p), "x", "y", "th")
     push = p["mass"] * p["gravity"] * np.sin(p["slope"])
-    return q, {}, times, edge(0.0), [p["mass"], p["mass"], p["inertia"]], [push, 0, 0], [0, 0, 0], [0, 0, p["th_rate"]]
+    return (
+        q,
+        {},
+        times,
+        edge(0.0),
+        [p["mass"], p["mass"], p["inertia"]],
+        [push, 0, 0],
+        [0, 0, 0],
+        [0, 0, p["th_rate"]],
+    )
 
 
 def sleigh(**change):
@@ -145,22 +171,48 @@ def sleigh(**change):
     exact = chaplygin_sleigh.motion(times, **p)
     q, masses = columns(exact, "x", "y", "th"), [p["mass"], p["mass"], p["inertia"]]
     c, s, v, w, a = np.cos(p["th0"]), np.sin(p["th0"]), p["v0"], p["w0"], p["a"]
-    return q, {5: exact["w"]}, times, edge(a), masses, [0, 0, 0], [0, 0, p["th0"]], [v * c - a * w * s, v * s + a * w * c, w]
+    return (
+        q,
+        {5: exact["w"]},
+        times,
+        edge(a),
+        masses,
+        [0, 0, 0],
+        [0, 0, p["th0"]],
+        [v * c - a * w * s, v * s + a * w * c, w],
+    )
 
 
 def particle(oracle, rows, end, **change):
     p, times = {**oracle.RUN, **change}, np.linspace(0, end, 9)
     exact = oracle.motion(times, **p)
     q, rates = columns(exact, "x", "y", "z"), [exact[name] for name in ("xdot", "ydot", "zdot")]
-    return q, dict(enumerate(rates, 3)), times, rows, [1, 1, 1], [0, 0, 0], [p["x0"], p["y0"], p["z0"]], [rate[0] for rate in rates]
+    return (
+        q,
+        dict(enumerate(rates, 3)),
+        times,
+        rows,
+        [1, 1, 1],
+        [0, 0, 0],
+        [p["x0"], p["y0"], p["z0"]],
+        [rate[0] for rate in rates],
+    )
 
 
 ON_ROWS = {
     **{f"axle turned at {rate}": partial(axle, rate) for rate in (1.1, -2.0, 1e-3, 0.0)},
     **{f"heavy axle turned at {rate}": partial(heavy_axle, rate) for rate in (1.1, 0.0)},
     "skate": on_a_slope,
-    **{f"sleigh {change}": partial(sleigh, **change) for change in ({}, {"w0": -0.9}, {"v0": 1.0, "th0": 0.5}, {"w0": 0.0})},
-    **{f"Rosenberg's particle, b = {b}": partial(particle, rosenberg_particle, lambda q: [[-q[1], 0, 1]], 5, b=b) for b in (0.8, -0.3, 0.0)},
+    **{
+        f"sleigh {change}": partial(sleigh, **change)
+        for change in ({}, {"w0": -0.9}, {"v0": 1.0, "th0": 0.5}, {"w0": 0.0})
+    },
+    **{
+        f"Rosenberg's particle, b = {b}": partial(
+            particle, rosenberg_particle, lambda q: [[-q[1], 0, 1]], 5, b=b
+        )
+        for b in (0.8, -0.3, 0.0)
+    },
     "Heisenberg's particle": partial(particle, heisenberg_particle, lambda q: [[-q[1], q[0], 1]], 10),
 }
 
@@ -188,7 +240,9 @@ def test_vertical_disc_rolls_and_its_multipliers_push_it(phi_rate):
 # Balls and particles
 
 
-@pytest.mark.parametrize("run", [ball_on_turntable.RUN, ball_on_turntable.RUN_FLAT, {**ball_on_turntable.RUN, "turn_rate": 0.0}])
+@pytest.mark.parametrize(
+    "run", [ball_on_turntable.RUN, ball_on_turntable.RUN_FLAT, {**ball_on_turntable.RUN, "turn_rate": 0.0}]
+)
 def test_ball_rolls_on_the_turning_plane_with_newton_and_euler(run):
     grid = Interpolant(3.0)
     exact = ball_on_turntable.motion(grid.times, **run)
@@ -242,11 +296,15 @@ def test_suslov_attitude_turns_with_the_angular_velocity():
     rotation = free_rigid_body.rotation(suslov.attitude(grid.times, **suslov.RUN))
     spin = np.swapaxes(rotation, -1, -2) @ grid.derivative(rotation)
     w = suslov.motion(grid.times, **suslov.RUN)
-    assert_same(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1), columns(w, "w1", "w2", "w3"), DIFFERENCE)
+    assert_same(
+        np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], -1), columns(w, "w1", "w2", "w3"), DIFFERENCE
+    )
 
 
 @pytest.mark.parametrize("inertia", [(1.0, 2.0, 3.5), (3.5, 1.0, 2.0), (2.0, 1.0, 3.5), (1.0, 3.5, 2.0)])
-@pytest.mark.parametrize("w0", [(0.9, 0.4, -0.7), (-0.9, 0.4, 0.1), (0.1, 0.2, 0.8), (0.3, -0.9, 0.2), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize(
+    "w0", [(0.9, 0.4, -0.7), (-0.9, 0.4, 0.1), (0.1, 0.2, 0.8), (0.3, -0.9, 0.2), (0.0, 0.0, 1.0)]
+)
 def test_elliptic_functions_solve_eulers_equations(inertia, w0):
     i1, i2, i3 = inertia
     times = np.linspace(0, 20, 9)
@@ -321,7 +379,9 @@ def test_rolling_disc_starts_with_the_rates_given():
 def test_rolling_disc_keeps_energy_and_the_legendre_constants(inertia):
     times = np.linspace(0, 10, 15)
     exact = rolling_disc.motion_yaw_lean_spin(times, **rolling_disc.RUN, inertia=inertia)
-    first, second = rolling_disc.legendre_constants(exact["theta"], exact["w2"], exact["w3"], mass=1.0, radius=0.5, inertia=inertia)
+    first, second = rolling_disc.legendre_constants(
+        exact["theta"], exact["w2"], exact["w3"], mass=1.0, radius=0.5, inertia=inertia
+    )
     for constant in (first, second, exact["energy"]):
         assert_same(constant, np.full(15, constant[0]), 1e-13)
 
@@ -333,7 +393,10 @@ def test_rolling_disc_circles_steadily():
     times = np.linspace(0, 2 * np.pi / yaw_rate, 7)
     exact = rolling_disc.motion(times, **body, theta=theta, w1=0.0, w2=circle["w2"], w3=circle["w3"])
     assert_same(exact["theta"], np.full(7, theta))
-    assert_same(np.hypot(exact["x"] + 0, exact["y"] - circle["contact_radius"] * -1), np.full(7, abs(circle["contact_radius"])))
+    assert_same(
+        np.hypot(exact["x"] + 0, exact["y"] - circle["contact_radius"] * -1),
+        np.full(7, abs(circle["contact_radius"])),
+    )
 
 
 def test_rolling_disc_thresholds_of_the_uniform_disc():
@@ -341,12 +404,16 @@ def test_rolling_disc_thresholds_of_the_uniform_disc():
     assert_same(rolling_disc.rolling_threshold(**body) ** 2, 9.81 / 1.5)
     assert_same(rolling_disc.spinning_threshold(**body) ** 2, 4 * 9.81 / 2.5)
     assert_same(rolling_disc.upright_rolling_frequency_squared(3.0, **body), 12 / 5 * 9 - 4 * 9.81 / 2.5)
-    assert_same(rolling_disc.upright_rolling_frequency_squared(rolling_disc.rolling_threshold(**body), **body), 0.0)
+    assert_same(
+        rolling_disc.upright_rolling_frequency_squared(rolling_disc.rolling_threshold(**body), **body), 0.0
+    )
 
 
 def test_rolling_disc_swings_round_when_it_nearly_falls():
     body = {key: rolling_disc.NEAR_FALL[key] for key in ("mass", "radius", "gravity")}
-    exact = rolling_disc.motion(np.array([0.0, 2 * 0.153997]), **body, theta=rolling_disc.NEAR_FALL["theta0"], w1=0.0, w2=1e-3, w3=0.0)
+    exact = rolling_disc.motion(
+        np.array([0.0, 2 * 0.153997]), **body, theta=rolling_disc.NEAR_FALL["theta0"], w1=0.0, w2=1e-3, w3=0.0
+    )
     assert abs(exact["psi"][-1] - 7.0272) < 2e-3  # from and to rest, by the literature
 
 
@@ -472,7 +539,9 @@ def test_hitch_angle_solves_its_equation(v, w):
 def test_a_chain_of_trailers_settles_on_its_circles():
     lengths, v, w = (0.5, 0.4, 0.3), 1.0, 0.8
     times = np.array([0.0, 10.0, 20.0])
-    chain = trailers.chain(times, lengths=lengths, speed=lambda t: v, yaw_rate=lambda t: w, headings0=[0, 0, 0, 0])
+    chain = trailers.chain(
+        times, lengths=lengths, speed=lambda t: v, yaw_rate=lambda t: w, headings0=[0, 0, 0, 0]
+    )
     first = trailers.hitch_angle(times, length=0.5, v=v, w=w, gamma0=0.0)
     assert_same(chain["headings"][:, 0] - chain["headings"][:, 1], first)
     assert abs(first[-1] - trailers.steady_hitch_angle(0.5, v, w)) < 1e-9
@@ -498,7 +567,9 @@ def test_the_appendix_gives_every_printed_digit(forty_digits):
         for i in range(2):
             for j in range(2):
                 printed = mpmath.mpf(text[i][j])
-                assert abs(forty_digits[name][i][j] - printed) <= mpmath.mpf("1e-21") * max(1, abs(printed)), (name, i, j)
+                assert abs(forty_digits[name][i][j] - printed) <= mpmath.mpf("1e-21") * max(
+                    1, abs(printed)
+                ), (name, i, j)
 
 
 def test_the_appendix_in_double_precision():
@@ -510,7 +581,9 @@ def test_the_appendix_in_double_precision():
 def test_the_forty_four_eigenvalues(forty_digits):
     gravity = mpmath.mpf("9.81")
     for v, printed in whipple_bicycle.EIGENVALUES.items():
-        roots = np.array([complex(z) for z in whipple_bicycle.exact_eigenvalues(mpmath.mpf(v), forty_digits, gravity)])
+        roots = np.array(
+            [complex(z) for z in whipple_bicycle.exact_eigenvalues(mpmath.mpf(v), forty_digits, gravity)]
+        )
         for value in printed:
             assert np.min(np.abs(roots - value)) <= 1e-14 * max(1, abs(value)), (v, value)
         double = np.linalg.eigvals(whipple_bicycle.state_matrix(v))

@@ -1,4 +1,6 @@
-"""What other systems and processors lack, one by one, as if it were lacking here; and machine code for ARM, which is made here and not run."""
+"""What other systems and processors lack, one by one, as if it were lacking here; and machine code for ARM,
+which is made here and not run.
+"""
 
 import ast
 import ctypes
@@ -75,10 +77,16 @@ def test_an_llvmlite_that_is_too_old_or_too_new_has_no_machine_code(lacking, mon
         raise RuntimeError("LLVM IR parsing error\n<string>:1:8: expected type")
 
     monkeypatch.setattr(host.llvm, lacking, refused)
-    assert re.fullmatch(r"llvmlite's LLVM [\d.]+ does not work here \(LLVM IR parsing error\)", host.reason_against.__wrapped__())
+    assert re.fullmatch(
+        r"llvmlite's LLVM [\d.]+ does not work here \(LLVM IR parsing error\)",
+        host.reason_against.__wrapped__(),
+    )
 
 
-@pytest.mark.parametrize(("error", "said"), [(OSError("no libllvmlite.so"), "cannot be imported (no libllvmlite.so)"), (None, "is not installed")])
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(OSError("no libllvmlite.so"), "cannot be imported (no libllvmlite.so)"), (None, "is not installed")],
+)
 def test_an_llvmlite_that_cannot_be_imported_is_as_none(error, said, monkeypatch):
     class Broken:
         """A module whose parts cannot be loaded."""
@@ -105,7 +113,11 @@ def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(m
     monkeypatch.setattr(host, "lanes", lambda: 2)
     monkeypatch.setattr(host, "threads", lambda: 3)
     asked = []
-    monkeypatch.setattr(value_kernels, "write_rows", lambda *given, write=value_kernels.write_rows: asked.append(given[0].threads) or write(*given))
+    monkeypatch.setattr(
+        value_kernels,
+        "write_rows",
+        lambda *given, write=value_kernels.write_rows: asked.append(given[0].threads) or write(*given),
+    )
     graph = Graph()
     x = graph.input("x", True)
     sine = value_kernels.nodes_called(graph, [graph.call("sin", x)], [x])
@@ -121,7 +133,9 @@ def test_threads_are_as_many_as_the_machine_has_cores_where_a_process_cannot_cho
 
 
 @needs_machine_code
-@pytest.mark.parametrize(("triple", "cpu"), [("arm64-apple-macosx14.0.0", "apple-m1"), ("aarch64-unknown-linux-gnu", "generic")])
+@pytest.mark.parametrize(
+    ("triple", "cpu"), [("arm64-apple-macosx14.0.0", "apple-m1"), ("aarch64-unknown-linux-gnu", "generic")]
+)
 def test_machine_code_for_arm_calls_nothing_that_is_not_there(triple, cpu, kernels):
     llvm = host.llvm
     llvm.initialize_all_targets()
@@ -135,13 +149,20 @@ def test_machine_code_for_arm_calls_nothing_that_is_not_there(triple, cpu, kerne
         module.triple = triple
         assembly = machine.emit_assembly(module)
         own = re.findall(rf"^{before}(\w+):", assembly, re.M)
-        all_called |= {a or b for a, b in re.findall(rf"\bbl?\s+{before}([a-z]\w*)$|\b{before}([a-z]\w*)@GOTPAGE\b", assembly, re.M)}.difference(own)
+        all_called |= {
+            a or b
+            for a, b in re.findall(
+                rf"\bbl?\s+{before}([a-z]\w*)$|\b{before}([a-z]\w*)@GOTPAGE\b", assembly, re.M
+            )
+        }.difference(own)
     assert {"aligned_alloc", "pthread_create"} <= all_called <= there
 
 
 @pytest.fixture(scope="module")
 def kernels():
-    """Modules of motions with a stop event, by steps of Runge and Kutta forth and back and by Taylor series, in two lanes."""
+    """Modules of motions with a stop event, by steps of Runge and Kutta forth and back and by Taylor series,
+    in two lanes.
+    """
     texts: list[str] = []
 
     class Disc(jj.models.TiltingDisc):
@@ -177,7 +198,9 @@ def test_what_is_kept_has_no_place_where_a_user_has_no_home(monkeypatch):
 
 def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkeypatch):
     def refused(*_):
-        raise PermissionError(13, "The process cannot access the file because it is being used by another process")
+        raise PermissionError(
+            13, "The process cannot access the file because it is being used by another process"
+        )
 
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path))
     monkeypatch.setattr(os, "replace", refused)
@@ -189,7 +212,11 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(os, "O_BINARY", 0x8000, raising=False)
     monkeypatch.setitem(sys.modules, "fcntl", None)
-    monkeypatch.setattr(os, "open", lambda path, flags, *mode, open=os.open: asked.append(flags) or open(path, flags & ~0x8000, *mode))
+    monkeypatch.setattr(
+        os,
+        "open",
+        lambda path, flags, *mode, open=os.open: asked.append(flags) or open(path, flags & ~0x8000, *mode),
+    )
     runpy.run_path(whole_files.__file__)["write_whole"](tmp_path / "a", b"1\n2")
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
@@ -198,7 +225,9 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
         pass
 
 
-def test_a_study_takes_an_empty_folder_also_where_a_folder_cannot_take_the_place_of_another(tmp_path, monkeypatch):
+def test_a_study_takes_an_empty_folder_also_where_a_folder_cannot_take_the_place_of_another(
+    tmp_path, monkeypatch
+):
     def rename(old, new, rename=os.rename):
         if Path(new).exists():
             raise FileExistsError(17, "Cannot create a file when that file already exists")
@@ -218,15 +247,26 @@ def _read_as_text(tree: ast.AST) -> Iterator[ast.Call]:
         of_os = isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "os"
         modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
         own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of `calculus/files.py`
-        if (name in ("read_text", "write_text") and not own) or (name == "open" and not of_os and not any("b" in mode for mode in modes)):
+        if (name in ("read_text", "write_text") and not own) or (
+            name == "open" and not of_os and not any("b" in mode for mode in modes)
+        ):
             yield call
 
 
 def test_every_text_file_has_an_encoding_that_does_not_depend_on_the_system():
     texts = {file: file.read_text(encoding="utf-8") for file in SOURCE.rglob("*.py")}
-    calls = [(file.name, call) for file, text in texts.items() if re.search(r"(open|_text)\(", text) for call in _read_as_text(ast.parse(text))]
+    calls = [
+        (file.name, call)
+        for file, text in texts.items()
+        if re.search(r"(open|_text)\(", text)
+        for call in _read_as_text(ast.parse(text))
+    ]
     assert len(calls) > 4
-    assert not [(name, call.lineno) for name, call in calls if "encoding" not in [keyword.arg for keyword in call.keywords]]
+    assert not [
+        (name, call.lineno)
+        for name, call in calls
+        if "encoding" not in [keyword.arg for keyword in call.keywords]
+    ]
 
 
 # studies
@@ -244,7 +284,9 @@ def test_workers_share_threads_also_where_a_process_cannot_choose_its_cores(monk
 @pytest.mark.parametrize("text", ["all", "0", "-1", "2.0", "1_0", "\u0662", "1025", "100000", "9" * 5000, ""])
 def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text):
     monkeypatch.setenv("JOURDAIN_JAX_THREADS", text)
-    with pytest.raises(ValueError, match=r"JOURDAIN_JAX_THREADS is `.*`, expected a whole number from 1 to 1024") as error:
+    with pytest.raises(
+        ValueError, match=r"JOURDAIN_JAX_THREADS is `.*`, expected a whole number from 1 to 1024"
+    ) as error:
         host.threads()
     assert len(str(error.value)) < 200
 
@@ -257,7 +299,9 @@ def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monk
 
 
 def test_a_study_whose_workers_cannot_begin_says_so(tmp_path, monkeypatch):
-    sent = b"\x80\x04\x8c\x08__main__\x8c\x04Mine\x93."  # a class of the program that was started, which a worker does not have
+    sent = (  # a class of the program that was started, which a worker does not have
+        b"\x80\x04\x8c\x08__main__\x8c\x04Mine\x93."
+    )
     store = Store.make(tmp_path / "study", {"samples": 4, "chunk": 2, "block": 2}, {}, {}, {})
     monkeypatch.setattr(workers, "sent_to_others", lambda _: sent)
     found = workers.in_processes(object.__new__(workers.Task), 1)(store, [0, 1], lambda: False)

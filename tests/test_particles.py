@@ -71,7 +71,9 @@ def test_spring_and_rod_follow_newtons_equations(damping):
 
 def test_the_rods_multiplier_is_its_thrust():
     scene, start, run = _rod_run()
-    found = spring_and_rod.motion(np.array([0.0, 0.4]), **run)  # neither level nor upright: all rates may be privileged
+    found = spring_and_rod.motion(
+        np.array([0.0, 0.4]), **run
+    )  # neither level nor upright: all rates may be privileged
     q, u, _ = scene.named(**dict(zip(start, np.ravel([found["r"][1], found["v"][1]]), strict=True)))
     tension = found["tensions"][1, 0]
     for name, solved in solved_by_every_reduction(scene, q, u).items():
@@ -91,4 +93,16 @@ def test_the_force_that_keeps_the_speed_lies_along_the_velocity():
 def test_the_particle_of_constant_speed_turns_downwards():
     run = isokinetic_particle.RUN
     scene = IsokineticParticle(speed=run["speed"], gravity=run["gravity"])
-    assert end_error(scene, {"x_rate": run["speed"]}, isokinetic_particle.motion, run, x="x", z="y", x_rate="vx", z_rate="vy") <= CLOSED_FORM
+    assert (
+        end_error(
+            scene,
+            {"x_rate": run["speed"]},
+            isokinetic_particle.motion,
+            run,
+            x="x",
+            z="y",
+            x_rate="vx",
+            z_rate="vy",
+        )
+        <= CLOSED_FORM
+    )

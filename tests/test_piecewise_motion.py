@@ -1,4 +1,6 @@
-"""What moves along samples exerts a force of inertia, or is refused: a piecewise linear motion has no second derivative where anyone looks."""
+"""What moves along samples exerts a force of inertia, or is refused: a piecewise linear motion has no second
+derivative where anyone looks.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -58,30 +60,40 @@ def ladder(t):
 def gathered(t):
     k = jnp.clip(jnp.searchsorted(jnp.asarray(TS), t) - 1, 0, len(TS) - 2)
     h = TS[1] - TS[0]
-    return jnp.asarray(DRIVE)[k] + (t - jnp.asarray(TS)[k]) / h * (jnp.asarray(DRIVE)[k + 1] - jnp.asarray(DRIVE)[k])
+    return jnp.asarray(DRIVE)[k] + (t - jnp.asarray(TS)[k]) / h * (
+        jnp.asarray(DRIVE)[k + 1] - jnp.asarray(DRIVE)[k]
+    )
 
 
 KINKED = {
     "jnp.interp": lambda t: jnp.interp(t, jnp.asarray(TS), jnp.asarray(DRIVE)),
     "few samples": lambda t: jnp.interp(t, jnp.array([0.0, 1.3, 2.0]), jnp.array([0.0, 1.0, 1.2])),
     "a ladder of branches": ladder,
-    "jnp.piecewise": lambda t: jnp.piecewise(t, [t < 0.5, t >= 0.5], [lambda t: 0.2 * t, lambda t: 0.3 - 0.4 * t]),
+    "jnp.piecewise": lambda t: jnp.piecewise(
+        t, [t < 0.5, t >= 0.5], [lambda t: 0.2 * t, lambda t: 0.3 - 0.4 * t]
+    ),
     "a gather": gathered,
     "steps": lambda t: 0.01 * jnp.floor(20.0 * t),
     "rounded": lambda t: jnp.round(5.0 * t) / 50.0,
     "a saw": lambda t: 0.1 * jnp.mod(t, 0.7),
     "a triangle": lambda t: 0.1 * jnp.abs(jnp.mod(t, 0.5) - 0.25),
     "a late start": lambda t: 0.3 * jnp.maximum(t - 1.7, 0.0),
-    "jnp.interp inside a sine": lambda t: 0.1 * jnp.sin(jnp.interp(t, jnp.asarray(TS), jnp.asarray(10.0 * DRIVE))),
+    "jnp.interp inside a sine": lambda t: (
+        0.1 * jnp.sin(jnp.interp(t, jnp.asarray(TS), jnp.asarray(10.0 * DRIVE)))
+    ),
     "a loop": lambda t: jax.lax.fori_loop(1, 5, lambda i, x: jnp.minimum(x, 0.1 * i + 0.1 * t), 0.5 * t),
     "far times": lambda t: jnp.interp(t, jnp.asarray(TS) + 3.0, jnp.asarray(DRIVE)),
 }
 SMOOTH = {
-    "a ramp with a smooth step": lambda t: 0.3 * jnp.clip(t, 0.0, 1.0) ** 3 * (10 - 15 * jnp.clip(t, 0.0, 1.0) + 6 * jnp.clip(t, 0.0, 1.0) ** 2),
+    "a ramp with a smooth step": lambda t: (
+        0.3 * jnp.clip(t, 0.0, 1.0) ** 3 * (10 - 15 * jnp.clip(t, 0.0, 1.0) + 6 * jnp.clip(t, 0.0, 1.0) ** 2)
+    ),
     "truncated powers": lambda t: 0.2 * jnp.maximum(t - 0.7, 0.0) ** 3,
     "pieces with equal slopes": lambda t: jnp.where(t < 1.0, t**2, 2.0 * t - 1.0),
     "a guarded quotient": lambda t: jnp.where(t == 0.0, 1.0, jnp.sin(t) / jnp.where(t == 0.0, 1.0, t)),
-    "a root by iteration": lambda t: jax.lax.fori_loop(0, 30, lambda i, x: x - (x - 0.3 * jnp.sin(x) - t) / (1 - 0.3 * jnp.cos(x)), t),
+    "a root by iteration": lambda t: jax.lax.fori_loop(
+        0, 30, lambda i, x: x - (x - 0.3 * jnp.sin(x) - t) / (1 - 0.3 * jnp.cos(x)), t
+    ),
     "steep": lambda t: 1e-3 * jnp.tanh(200.0 * (t - 1.0)) + 0.0 * jnp.abs(t),
     "a spline": jj.Spline(TS, DRIVE),
 }
@@ -142,7 +154,9 @@ class Road(jj.Scene):
 
 
 def test_a_road_by_linear_interpolation_is_refused():
-    with pytest.raises(ValueError, match=r"the pose of body `mass` of `Road` is not smooth.*at several places"):
+    with pytest.raises(
+        ValueError, match=r"the pose of body `mass` of `Road` is not smooth.*at several places"
+    ):
         jj.simulate(Road(), {"x_rate": 1.0}, t1=1.0)
 
 
@@ -177,7 +191,11 @@ def test_a_spline_exerts_the_force_of_inertia_of_what_it_goes_through(kind):
     scene = kind(curve=jj.Spline(TS, DRIVE))
     for t, angle in ((0.3, 0.2), (1.1, -0.7), (1.7031, 1.0)):
         x, xdot = 0.1 * np.sin(3.0 * t), 0.3 * np.cos(3.0 * t)
-        q, u = (jnp.array([angle]), jnp.array([0.4])) if kind is Driven else (jnp.array([x, angle]), jnp.array([xdot, 0.4]))
+        q, u = (
+            (jnp.array([angle]), jnp.array([0.4]))
+            if kind is Driven
+            else (jnp.array([x, angle]), jnp.array([xdot, 0.4]))
+        )
         found = jj.accelerations(scene, t, q, u)
         assert found.udot[-1] == pytest.approx(accelerations_at(t, angle, -0.9 * np.sin(3.0 * t)), abs=1e-3)
 
@@ -195,7 +213,9 @@ def test_a_spline_is_cubic_and_twice_continuously_differentiable(n):
     cubic, t = np.poly1d(generator.normal(size=min(n, 4))), np.linspace(ts[0], ts[-1], 2 * n + 1)
     expected = [cubic(t), cubic.deriv()(t), cubic.deriv(2)(t)]
     found = with_derivatives(jj.Spline(ts, cubic(ts)), t)
-    assert np.allclose(found[:2, 1:-1], np.array(expected)[:2, 1:-1], atol=1e-9)  # polynomials up to the third degree are met exactly
+    assert np.allclose(
+        found[:2, 1:-1], np.array(expected)[:2, 1:-1], atol=1e-9
+    )  # polynomials up to the third degree are met exactly
     assert np.allclose(found[2, 1:-1], expected[2][1:-1], atol=1e-8)
     values = generator.normal(size=n)
     spline = jj.Spline(ts, values)
@@ -204,21 +224,29 @@ def test_a_spline_is_cubic_and_twice_continuously_differentiable(n):
     at = np.concatenate([inside - 1e-9, inside + 1e-9, outside])
     below, above, ends = np.split(with_derivatives(spline, at)[:, : 2 * n], [n - 2, 2 * n - 4], axis=1)
     assert np.allclose(below, above, rtol=1e-5, atol=1e-5)
-    assert np.allclose(ends[0, 2:], [ends[0, 0] - ends[1, 0], ends[0, 1] + 2.0 * ends[1, 1]], atol=1e-6)  # along the tangents
+    assert np.allclose(
+        ends[0, 2:], [ends[0, 0] - ends[1, 0], ends[0, 1] + 2.0 * ends[1, 1]], atol=1e-6
+    )  # along the tangents
 
 
 def test_a_spline_differentiates_with_respect_to_its_values():
     def acceleration(values):
-        return jj.accelerations(Driven(curve=jj.Spline(TS[::40], values)), 0.71, jnp.array([0.2]), jnp.array([0.4])).udot[0]
+        return jj.accelerations(
+            Driven(curve=jj.Spline(TS[::40], values)), 0.71, jnp.array([0.2]), jnp.array([0.4])
+        ).udot[0]
 
     values, direction = jnp.asarray(DRIVE[::40]), jnp.cos(jnp.arange(11.0))
     slopes = jax.jit(jax.grad(acceleration))(values)
-    both = jax.jit(jax.vmap(acceleration))(jnp.stack([values + direction, values - direction]))  # linear in the values
+    both = jax.jit(jax.vmap(acceleration))(
+        jnp.stack([values + direction, values - direction])
+    )  # linear in the values
     assert float(slopes @ direction) == pytest.approx(float(both[0] - both[1]) / 2.0, rel=1e-9)
 
 
 class OnBelt(jj.Scene):
-    """A skate on a belt, and a wheel in it that no row holds: it turns back where the belt jerks the skate. `way`: how the belt runs."""
+    """A skate on a belt, and a wheel in it that no row holds: it turns back where the belt jerks the skate.
+    `way`: how the belt runs.
+    """
 
     coordinates = jj.coordinates("x wheel")
     way: object = None
@@ -239,13 +267,17 @@ WITHOUT_JERK = {
     "a ramp": lambda motion: motion.u.x_rate - jnp.clip(motion.t, 1.0, 2.0),
     "a row that sets in": lambda motion: jnp.where(motion.t < 1.0, 0.0, motion.u.x_rate - 1.0),
     "a row that sets in early": lambda motion: jnp.where(motion.t < 0.003, 0.0, motion.u.x_rate - 1.0),
-    "a row that becomes another": lambda motion: jnp.where(motion.t < 1.0, motion.u.x_rate - 1.0, motion.u.wheel_rate),
+    "a row that becomes another": lambda motion: jnp.where(
+        motion.t < 1.0, motion.u.x_rate - 1.0, motion.u.wheel_rate
+    ),
 }
 
 
 @pytest.mark.parametrize("way", JERKS)
 def test_a_velocity_row_that_jumps_in_time_is_refused(way):
-    with pytest.raises(ValueError, match=r"constraint `grip` of `OnBelt` jumps at t = .* s: speeds would have to jump"):
+    with pytest.raises(
+        ValueError, match=r"constraint `grip` of `OnBelt` jumps at t = .* s: speeds would have to jump"
+    ):
         jj.simulate(OnBelt(way=JERKS[way]), {"x_rate": 1.0}, t1=2.0)
 
 

@@ -1,4 +1,5 @@
-"""Numbers as people write them (plain, of NumPy, in lists and tuples) serve wherever the package takes a number or a vector.
+"""Numbers as people write them (plain, of NumPy, in lists and tuples) serve wherever the package takes a
+number or a vector.
 
 The run-time checks of `conftest.py` are on here: what an annotation forbids fails.
 """
@@ -11,10 +12,29 @@ from small_scenes import BeadOnTurningWire
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations import constraint_rows, gibbs_equations, lagrange_equations, partial_velocities, unconstrained_equations
+from jourdain_jax.equations import (
+    constraint_rows,
+    gibbs_equations,
+    lagrange_equations,
+    partial_velocities,
+    unconstrained_equations,
+)
 
-TWO = {"int": 2, "float": 2.0, "float32": np.float32(2), "float64": np.float64(2), "int64": np.int64(2), "0-d array": np.array(2.0), "jax": jnp.asarray(2.0)}
-THREE = {"list": [1, 0.0, 2], "tuple": (1, 0, 2), "array of integers": np.array([1, 0, 2]), "jax": jnp.array([1.0, 0.0, 2.0])}
+TWO = {
+    "int": 2,
+    "float": 2.0,
+    "float32": np.float32(2),
+    "float64": np.float64(2),
+    "int64": np.int64(2),
+    "0-d array": np.array(2.0),
+    "jax": jnp.asarray(2.0),
+}
+THREE = {
+    "list": [1, 0.0, 2],
+    "tuple": (1, 0, 2),
+    "array of integers": np.array([1, 0, 2]),
+    "jax": jnp.array([1.0, 0.0, 2.0]),
+}
 
 
 def _unit(v):
@@ -30,7 +50,10 @@ class Slider(jj.Scene):
     inputs = jj.inputs("push")
 
     def bodies(self, t, q):
-        return {"block": jj.RigidBody(3, [1, 1, 2], (q.x, 0, 0), jj.rot_z(q.angle)), "bead": jj.Particle(1, [0, q.x, 1])}
+        return {
+            "block": jj.RigidBody(3, [1, 1, 2], (q.x, 0, 0), jj.rot_z(q.angle)),
+            "bead": jj.Particle(1, [0, q.x, 1]),
+        }
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.push, angle_rate=1),)
@@ -75,7 +98,10 @@ BUILT = [
 ]
 
 
-@pytest.mark.parametrize(("number", "vector"), [*((number, "list") for number in TWO), *(("int", vector) for vector in list(THREE)[1:])])
+@pytest.mark.parametrize(
+    ("number", "vector"),
+    [*((number, "list") for number in TWO), *(("int", vector) for vector in list(THREE)[1:])],
+)
 def test_every_builder_takes_plain_numbers_and_gives_the_same_floats(number, vector):
     for name in BUILT:
         given = ((TWO[number], THREE[vector]), (jnp.asarray(2.0), jnp.array([1.0, 0.0, 2.0])))
@@ -115,7 +141,14 @@ def test_a_state_may_be_a_list(call):
         assert np.array_equal(f(q, u), expected)
 
 
-EQUATIONS = (jj.accelerations, unconstrained_equations, constraint_rows, partial_velocities, lagrange_equations, gibbs_equations)
+EQUATIONS = (
+    jj.accelerations,
+    unconstrained_equations,
+    constraint_rows,
+    partial_velocities,
+    lagrange_equations,
+    gibbs_equations,
+)
 
 
 def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_compiled(compilations):
@@ -130,7 +163,9 @@ def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_
         found = jax.tree.leaves(equations(sleigh, 0.0, start.q, start.u))
         assert len(compilations) <= 20, equations.__name__  # not one for every operation
         assert all(isinstance(x, jax.Array) for x in found)
-        traced = jax.jit(lambda q, u, equations=equations: jax.tree.leaves(equations(sleigh, 0.0, q, u)))(start.q, start.u)
+        traced = jax.jit(lambda q, u, equations=equations: jax.tree.leaves(equations(sleigh, 0.0, q, u)))(
+            start.q, start.u
+        )
         for value, expected in zip(found, traced, strict=True):
             np.testing.assert_allclose(value, expected, rtol=tolerance("round_off"), atol=1e-13)
 
@@ -138,7 +173,10 @@ def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_
 def test_samples_in_single_precision_are_those_in_double():
     times, pushes = [0.0, 1.0, 2.0], [0.0, 1.0, -2.0]
     single = jj.Sampled(np.array(times, np.float32), jnp.array(pushes, jnp.float32))
-    ends = [jj.simulate(Slider(), t1=3.0, inputs={"push": samples}).q_end for samples in (single, jj.Sampled(times, pushes))]
+    ends = [
+        jj.simulate(Slider(), t1=3.0, inputs={"push": samples}).q_end
+        for samples in (single, jj.Sampled(times, pushes))
+    ]
     assert jnp.all(ends[0] == ends[1])
 
 
@@ -152,22 +190,38 @@ def test_a_state_in_single_precision_moves_in_double(backend):
 
 
 @pytest.mark.parametrize(("precision", "backend"), [(jnp.float32, "xla"), (jnp.bfloat16, "auto")])
-def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_numbers_in_double_precision(precision, backend):
+def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_numbers_in_double_precision(
+    precision, backend
+):
     def end(rate):
-        return jj.simulate(BeadOnTurningWire(rate=rate), {"r": 0.5}, ts=[0.7], rtol=1e-11, atol=1e-11, work=False, backend=backend).q_end[0]
+        return jj.simulate(
+            BeadOnTurningWire(rate=rate),
+            {"r": 0.5},
+            ts=[0.7],
+            rtol=1e-11,
+            atol=1e-11,
+            work=False,
+            backend=backend,
+        ).q_end[0]
 
     given = precision(1.3)
     value, slope = jax.value_and_grad(end)(given)
     assert float(value) == pytest.approx(0.5 * np.cosh(0.7 * float(given)), rel=1e-10)  # r'' = rate^2 r
     assert slope.dtype == precision
-    assert float(slope) == pytest.approx(0.35 * np.sinh(0.7 * float(given)), rel=float(jnp.finfo(precision).eps))
+    assert float(slope) == pytest.approx(
+        0.35 * np.sinh(0.7 * float(given)), rel=float(jnp.finfo(precision).eps)
+    )
 
 
 @pytest.mark.parametrize("precision", [jnp.float32, jnp.bfloat16])
-def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_same_number_in_double_precision(precision):
+def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_same_number_in_double_precision(
+    precision,
+):
     def end(rate):
         return jj.simulate(Slider(), {"x": 0.0}, ts=[1.0], inputs={"push": lambda t: rate * t}).q_end[0]
 
     given = precision(1.3)
-    assert float(end(given)) == pytest.approx(float(given) / 24, rel=1e-6)  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
+    assert float(end(given)) == pytest.approx(
+        float(given) / 24, rel=1e-6
+    )  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
     assert float(jax.grad(end)(given)) == pytest.approx(1 / 24, rel=float(jnp.finfo(precision).eps) + 1e-6)

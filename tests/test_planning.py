@@ -1,4 +1,6 @@
-"""What planned runs will tell: against the covariance of a fit, closed forms, and differences of the start and the inputs."""
+"""What planned runs will tell: against the covariance of a fit, closed forms, and differences of the start
+and the inputs.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +17,17 @@ TS = np.linspace(0.1, 3.0, 16)
 
 
 def plan(x=0.3, force=0.0, unknown=()):
-    return jj.Experiment(TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"push": force}, t0=0.0)
+    return jj.Experiment(
+        TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"push": force}, t0=0.0
+    )
 
 
 def test_planned_covariance_is_that_of_a_fit():
     unknown = {"x": jj.Estimate(prior=Normal(0.3, 0.005))}
     values = {"x": jj.simulate(Cart(damping=0.0), {"x": 0.3}, t0=0.0, ts=TS, inputs={"push": 0.4})["x"]}
-    run = jj.Experiment(TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"push": 0.4}, t0=0.0)
+    run = jj.Experiment(
+        TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"push": 0.4}, t0=0.0
+    )
     fit = jj.fit(Cart(damping=0.0), run, ("mass", "stiffness"))
     found = planned_information(Cart(damping=0.0), plan(force=0.4, unknown=unknown), ("mass", "stiffness"))
     assert found.labels == fit.labels == ("mass", "stiffness", "run 0: x")
@@ -41,7 +47,9 @@ def test_what_a_plan_will_not_tell_is_named():
 
 
 def test_a_plan_is_one_program_which_serves_other_numbers(compilations):
-    told = lambda mass, x: float(planned_information(Cart(mass=mass, damping=0.0), plan(x), ("stiffness",)).log_det())  # noqa: E731
+    told = lambda mass, x: float(
+        planned_information(Cart(mass=mass, damping=0.0), plan(x), ("stiffness",)).log_det()
+    )
     first = told(1.5, 0.2)
     assert len(compilations) <= 8
     compilations.clear()
@@ -67,7 +75,9 @@ def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     knots = jnp.linspace(0.0, 3.0, 5)
 
     def told(values):
-        return planned_information(Cart(damping=0.0), plan(0.1, jj.Sampled(knots, values)), ("mass", "stiffness"), backend="xla").log_det()
+        return planned_information(
+            Cart(damping=0.0), plan(0.1, jj.Sampled(knots, values)), ("mass", "stiffness"), backend="xla"
+        ).log_det()
 
     values, way = jnp.array([0.0, 0.5, -0.3, 0.8, 0.1]), jnp.array([0.3, -1.0, 0.5, 0.2, 0.0])
     _, slope = jax.jit(lambda v, w: jax.jvp(told, (v,), (w,)))(values, way)

@@ -1,4 +1,6 @@
-"""Numbers that no body and no moving plane can have are refused by name where they are known, and left alone where they are traced."""
+"""Numbers that no body and no moving plane can have are refused by name where they are known, and left alone
+where they are traced.
+"""
 
 from collections.abc import Callable
 
@@ -29,12 +31,18 @@ def test_a_rod_can_be():
 
 def test_traced_parameters_are_not_judged_by_the_numbers_that_stand_in_for_them():
     # the stand-in of `product` is 0.1, that of a scene without defaults could be anything
-    slope = jax.grad(lambda p: jnp.sum(jj.simulate(Top(moments=(0.05, 0.05, 0.05), product=p), {"turn_rate": 1.0}, t1=0.1).q_end))(0.01)
+    slope = jax.grad(
+        lambda p: jnp.sum(
+            jj.simulate(Top(moments=(0.05, 0.05, 0.05), product=p), {"turn_rate": 1.0}, t1=0.1).q_end
+        )
+    )(0.01)
     assert np.isfinite(slope)
 
 
 class BallOnPlate(jj.Scene):
-    """A ball on a plate that rises and tilts as given functions of time, its motion stated again as velocities."""
+    """A ball on a plate that rises and tilts as given functions of time, its motion stated again as
+    velocities.
+    """
 
     rise: object = jj.parameter(0.0)
     stated_rise: object = jj.parameter(0.0)
@@ -45,16 +53,27 @@ class BallOnPlate(jj.Scene):
     domain = {"x": (-1.0, 1.0), "y": (-1.0, 1.0), "z": (0.0, 1.0)}
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude)
+            )
+        }
 
     def contacts(self, pose):
         o = 0.0 * pose.t
         velocity = jnp.stack([o, o + self.belt, o + self.stated_rise])
-        plate = jj.Plane(jnp.stack([o, o, self.rise * pose.t]), self.turn * pose.t, velocity, jnp.stack([o, o + self.stated_turn, o]))
+        plate = jj.Plane(
+            jnp.stack([o, o, self.rise * pose.t]),
+            self.turn * pose.t,
+            velocity,
+            jnp.stack([o, o + self.stated_turn, o]),
+        )
         return {"plate": jj.ball_contact(pose["ball"], 0.1, ground=plate, height="row")}
 
 
-@pytest.mark.parametrize("motion", [{}, {"belt": 1.0}, {"rise": 0.3, "stated_rise": 0.3}, {"turn": 0.2, "stated_turn": 0.2}])
+@pytest.mark.parametrize(
+    "motion", [{}, {"belt": 1.0}, {"rise": 0.3, "stated_rise": 0.3}, {"turn": 0.2, "stated_turn": 0.2}]
+)
 def test_a_moving_plane_whose_velocities_are_the_rates_of_its_pose_is_accepted(motion):
     assert jj.structure_of(BallOnPlate(**motion)).faults == ()
 
@@ -68,7 +87,9 @@ class OnSledge(jj.Scene):
     def bodies(self, t, q):
         o = 0.0 * q.x
         return {
-            "sledge": jj.RigidBody.box(2.0, (1.0, 0.3, 0.1), position=[q.sledge, o, o], orientation=jnp.eye(3)),
+            "sledge": jj.RigidBody.box(
+                2.0, (1.0, 0.3, 0.1), position=[q.sledge, o, o], orientation=jnp.eye(3)
+            ),
             "post": jj.Particle(1.0, jnp.zeros(3)),
             "ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, o, o + 0.15], orientation=jj.rot_y(q.roll)),
         }
@@ -81,8 +102,12 @@ class OnSledge(jj.Scene):
 @pytest.mark.parametrize(
     "ground",
     [
-        lambda pose, back: jj.Plane(pose["post"].position + jnp.array([0.0, 0.0, 0.05])),  # a body that stands still
-        lambda pose, back: jj.Plane(pose["ball"].position - jnp.array([0.0, 0.0, 0.1])),  # the plane that touches, where the coordinates know it
+        lambda pose, back: jj.Plane(
+            pose["post"].position + jnp.array([0.0, 0.0, 0.05])
+        ),  # a body that stands still
+        lambda pose, back: jj.Plane(
+            pose["ball"].position - jnp.array([0.0, 0.0, 0.1])
+        ),  # the plane that touches, where the coordinates know it
         lambda pose, back: jj.Plane(back, velocity=(0.3, 0.0, 0.0)),  # its velocity is stated
     ],
 )
@@ -91,7 +116,9 @@ def test_a_ground_that_no_other_body_carries_unsaid_is_accepted(ground):
 
 
 class OnLift(OnSledge):
-    """The ball on a sledge that is lifted or tilted, on a ground that is built of the coordinate that does it, not of the sledge's pose."""
+    """The ball on a sledge that is lifted or tilted, on a ground that is built of the coordinate that does
+    it, not of the sledge's pose.
+    """
 
     coordinates = jj.coordinates("sledge x roll rise")
     domain = {"rise": (-0.3, 0.3)}
@@ -104,7 +131,11 @@ class OnLift(OnSledge):
         return made | {"ball": jj.RigidBody.ball(1.0, 0.1, position=at, orientation=jj.rot_y(q.roll))}
 
     def contacts(self, pose):
-        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0, 0.0, pose.q.rise])))}
+        return {
+            "back": jj.ball_contact(
+                pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0, 0.0, pose.q.rise]))
+            )
+        }
 
 
 def test_a_check_names_grounds_and_bodies_and_passes_all_models():

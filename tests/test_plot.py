@@ -37,7 +37,13 @@ def overlap(figure, *artists):
 
 @pytest.mark.parametrize(
     ("name", "unit", "size"),
-    [("heading", "deg", 180 / np.pi), ("heading_rate", "rpm", 30 / np.pi), ("x", "cm", 100.0), ("x_rate", "km/h", 3.6), ("energy", "mJ", 1000.0)],
+    [
+        ("heading", "deg", 180 / np.pi),
+        ("heading_rate", "rpm", 30 / np.pi),
+        ("x", "cm", 100.0),
+        ("x_rate", "km/h", 3.6),
+        ("energy", "mJ", 1000.0),
+    ],
 )
 def test_values_are_drawn_in_the_units_that_are_asked_for(motions, name, unit, size):
     figure, axes = jj.plot(motions[0], name, units={name: unit, "t": "ms"})
@@ -82,7 +88,11 @@ def test_of_a_rollout_bands_hold_the_parts_that_are_asked_for(lanes):
         at_end = band[np.isclose(band[:, 0], 1.0), 1]
         expected = np.rad2deg(np.quantile(lanes["heading"][:, -1], [(1 - part) / 2, (1 + part) / 2]))
         assert_allclose([at_end.min(), at_end.max()], expected, atol=1e-9)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["90 % of lanes", "50 % of lanes", "median"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "90 % of lanes",
+        "50 % of lanes",
+        "median",
+    ]
     assert axes[0].get_title(loc="left") == "21 lanes; 0 stopped at an event, 0 failed"
     assert not overlap(figure, figure.legends[0], axes[0].title, *axes)
 

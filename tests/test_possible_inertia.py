@@ -36,7 +36,7 @@ def test_every_cloud_of_points_has_its_numbers():
 
 def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
     numbers = log_cholesky([0.5, 0.8, 0.6])
-    six = lambda x: inertia_from_log_cholesky(x)[np.triu_indices(3)]  # noqa: E731
+    six = lambda x: inertia_from_log_cholesky(x)[np.triu_indices(3)]
     J = jax.jacfwd(six)(numbers)
     assert np.linalg.matrix_rank(J) == 6
     assert_allclose(J @ jax.jacfwd(lambda v: log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
@@ -44,7 +44,9 @@ def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
 
 def of(v):
     """A symmetric matrix of its upper triangle."""
-    return jnp.stack([jnp.stack([v[0], v[1], v[2]]), jnp.stack([v[1], v[3], v[4]]), jnp.stack([v[2], v[4], v[5]])])
+    return jnp.stack(
+        [jnp.stack([v[0], v[1], v[2]]), jnp.stack([v[1], v[3], v[4]]), jnp.stack([v[2], v[4], v[5]])]
+    )
 
 
 class Turning(jj.Scene):
@@ -105,7 +107,11 @@ NUMBERS_OF = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "body", "names", "count"), NUMBERS_OF, ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else None)
+@pytest.mark.parametrize(
+    ("scene", "body", "names", "count"),
+    NUMBERS_OF,
+    ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else None,
+)
 def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, body, names, count):
     unknowns = unknowns_of(scene, [], {body: possible_inertia()})
     layout = unknowns.layout
@@ -121,7 +127,9 @@ def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, b
         least, middle, largest = np.linalg.eigvalsh(I)
         assert least > 0
         assert largest <= (least + middle) * (1 + 1e-12)
-        assert_allclose(np.concatenate(layout.bodies[0].numbers(moved)), shared, rtol=1e-6, atol=1e-6)  # as many as there are parameters
+        assert_allclose(
+            np.concatenate(layout.bodies[0].numbers(moved)), shared, rtol=1e-6, atol=1e-6
+        )  # as many as there are parameters
 
 
 def test_a_batch_of_numbers_makes_a_batch_of_parameters():

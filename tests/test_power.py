@@ -10,12 +10,20 @@ from tolerances import relative_error, tolerance
 import jourdain_jax as jj
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations import coordinate_rates, kinetic_energy, potential_energy, unconstrained_equations
-from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
+from jourdain_jax.models import (
+    BallOnTurntable,
+    ChaplyginSleigh,
+    IsokineticParticle,
+    TiltingDisc,
+    TwoWheelAxleCoordinates,
+)
 from jourdain_jax.program.eager import eval_numpy
 
 
 def energy_rate_and_power(scene, t, q, u):
-    """`d(T + V)/dt` along the motion by jvp, the power that should equal it, and the size of the powers at hand."""
+    """`d(T + V)/dt` along the motion by jvp, the power that should equal it, and the size of the powers at
+    hand.
+    """
     found = jj.accelerations(scene, t, q, u)
 
     def energy(t, q, u):
@@ -24,7 +32,9 @@ def energy_rate_and_power(scene, t, q, u):
 
     _, (dT, dV) = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), found.udot))
     equations = unconstrained_equations(scene, t, q, u)
-    size = jnp.abs(u) @ (jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)) + jnp.abs(dV)
+    size = jnp.abs(u) @ (
+        jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)
+    ) + jnp.abs(dV)
     return dT + dV, power(scene, jj.motion_at(scene, t, q, u), found).total, size
 
 
@@ -43,7 +53,9 @@ SCENES = [
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
 def test_energy_changes_by_the_power_of_what_has_no_potential(scene):
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 20)]
-    rate, supplied, size = eval_numpy(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(*states)
+    rate, supplied, size = eval_numpy(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(
+        *states
+    )
     assert jnp.all(jnp.abs(rate - supplied) <= tolerance("round_off") * size)
 
 
@@ -113,7 +125,9 @@ def test_the_work_that_time_does_is_integrated_and_is_that_of_the_closed_form(ca
     assert motion.energies().kind == "T + V less the work done"
     assert relative_error(motion.work, scene.work(ts)) <= tolerance("closed_form")
     balance = motion.energies().balance
-    assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), float(jnp.max(jnp.abs(motion.work)))) <= tolerance("closed_form")
+    assert relative_error(
+        balance, jnp.broadcast_to(balance[0], ts.shape), float(jnp.max(jnp.abs(motion.work)))
+    ) <= tolerance("closed_form")
 
 
 class PulledBead(small.BeadOnTurningWire):
@@ -129,7 +143,9 @@ def test_the_work_along_driven_poses_is_part_of_the_scalar_program(backend):
     motion = jj.simulate(PulledBead(), {"r": 0.5}, t1=1.5, rtol=1e-11, atol=1e-11, backend=backend)
     assert ("lowered" in motion.reduction) == (backend == "auto")
     balance = motion.energies().balance
-    assert relative_error(balance, jnp.full(balance.shape, balance[0]), float(jnp.max(motion.work))) <= tolerance("closed_form")
+    assert relative_error(
+        balance, jnp.full(balance.shape, balance[0]), float(jnp.max(motion.work))
+    ) <= tolerance("closed_form")
 
 
 def test_work_that_is_left_out_is_no_fault():

@@ -61,13 +61,35 @@ def test_only_operations_on_varying_quantities_count(graph):
 
 
 FUNCTIONS = {
-    "smooth": lambda x, y: jnp.stack([jnp.sin(x) * jnp.exp(-y) + x / (1 + y * y), jnp.sqrt(1 + x * x) * jnp.tanh(y), jnp.arctan2(x, y) ** 3]),
-    "kinked": lambda x, y: jnp.stack([jnp.abs(x) * y, jnp.maximum(x, y) - jnp.minimum(x, y), jnp.where(x > y, x * x, y)]),
-    "matrices": lambda x, y: (jnp.array([[1.0, x], [y, 2.0]]) @ jnp.stack([x, y]))[::-1].at[0].add(y).at[1].set(x * y),
-    "powers": lambda x, y: jnp.stack([x**3, y**-2, jnp.prod(jnp.stack([x, y])), x**1.5, (-y) ** x, x**2.0, jnp.cbrt(y), jnp.exp2(y)]),
-    "inverses": lambda x, y: jnp.stack([jnp.asinh(y), jnp.acosh(1.0 + x), jnp.atanh(0.4 * y), jnp.asin(0.4 * x), jnp.acos(0.4 * x)]),
+    "smooth": lambda x, y: jnp.stack(
+        [
+            jnp.sin(x) * jnp.exp(-y) + x / (1 + y * y),
+            jnp.sqrt(1 + x * x) * jnp.tanh(y),
+            jnp.arctan2(x, y) ** 3,
+        ]
+    ),
+    "kinked": lambda x, y: jnp.stack(
+        [jnp.abs(x) * y, jnp.maximum(x, y) - jnp.minimum(x, y), jnp.where(x > y, x * x, y)]
+    ),
+    "matrices": lambda x, y: (
+        (jnp.array([[1.0, x], [y, 2.0]]) @ jnp.stack([x, y]))[::-1].at[0].add(y).at[1].set(x * y)
+    ),
+    "powers": lambda x, y: jnp.stack(
+        [x**3, y**-2, jnp.prod(jnp.stack([x, y])), x**1.5, (-y) ** x, x**2.0, jnp.cbrt(y), jnp.exp2(y)]
+    ),
+    "inverses": lambda x, y: jnp.stack(
+        [jnp.asinh(y), jnp.acosh(1.0 + x), jnp.atanh(0.4 * y), jnp.asin(0.4 * x), jnp.acos(0.4 * x)]
+    ),
     "near one": lambda x, y: jnp.stack([jnp.log1p(x), jnp.expm1(y), jax.lax.logistic(x * y)]),
-    "steps": lambda x, y: jnp.stack([jnp.floor(3 * x) * y, jnp.ceil(3 * x) * y, jnp.round(3 * y) * x, jnp.mod(3 * y, x), jnp.fmod(3 * x, y)]),
+    "steps": lambda x, y: jnp.stack(
+        [
+            jnp.floor(3 * x) * y,
+            jnp.ceil(3 * x) * y,
+            jnp.round(3 * y) * x,
+            jnp.mod(3 * y, x),
+            jnp.fmod(3 * x, y),
+        ]
+    ),
 }
 
 
@@ -89,13 +111,24 @@ def _derivative_at(f, value):
     graph = Graph()
     (x,) = _x(graph, "x")
     (found,) = interpret(graph, jax.make_jaxpr(f)(1.0), [Nodes(x)])
-    return Probes(graph, {"x": np.array([value])})(derivatives(graph, [int(as_nodes(graph, found)[()])], {x: graph.one}))[0, 0]
+    return Probes(graph, {"x": np.array([value])})(
+        derivatives(graph, [int(as_nodes(graph, found)[()])], {x: graph.one})
+    )[0, 0]
 
 
 def test_derivatives_of_powers_at_zero_of_saturated_functions_and_where_branches_meet():
-    exponent, ramp = jnp.asarray(1.5), lambda x: jnp.maximum(x, 0.0) - jnp.minimum(1.0, jnp.maximum(-x, 0.0)) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+    exponent, ramp = (
+        jnp.asarray(1.5),
+        lambda x: (
+            jnp.maximum(x, 0.0) - jnp.minimum(1.0, jnp.maximum(-x, 0.0)) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+        ),
+    )
     assert _derivative_at(ramp, 0.0) == pytest.approx(float(jax.grad(ramp)(0.0)), abs=1e-15)
-    for f, at in ((lambda x: x**1.5, 0.0), (lambda x: jnp.power(x, exponent * (1 + 0 * x)), 0.0), (lambda x: jnp.power(x + 2.0, x), 0.0)):
+    for f, at in (
+        (lambda x: x**1.5, 0.0),
+        (lambda x: jnp.power(x, exponent * (1 + 0 * x)), 0.0),
+        (lambda x: jnp.power(x + 2.0, x), 0.0),
+    ):
         assert _derivative_at(f, at) == pytest.approx(float(jax.grad(f)(at)), abs=1e-15)
     for at in (-800.0, 800.0):
         assert _derivative_at(jax.lax.logistic, at) == 0.0
@@ -104,7 +137,11 @@ def test_derivatives_of_powers_at_zero_of_saturated_functions_and_where_branches
 def test_an_operation_without_scalar_form_is_named(graph):
     (x,) = _x(graph, "x")
     with pytest.raises(Unsupported, match="while"):
-        interpret(graph, jax.make_jaxpr(lambda x: jax.lax.while_loop(lambda v: v < 10.0, lambda v: 2 * v, x))(1.0), [Nodes(x)])
+        interpret(
+            graph,
+            jax.make_jaxpr(lambda x: jax.lax.while_loop(lambda v: v < 10.0, lambda v: 2 * v, x))(1.0),
+            [Nodes(x)],
+        )
     with pytest.raises(Unsupported, match="depends on the state"):
         interpret(graph, jax.make_jaxpr(lambda x: jnp.arange(3.0)[jnp.int32(x)])(1.0), [Nodes(x)])
 
@@ -128,7 +165,10 @@ def test_a_form_does_not_depend_on_what_was_simplified_before(graph):
     generator, nodes, forms = np.random.default_rng(4), [x, y, graph.one], NormalForms(graph, 400)
     for op in ("sin", "sqrt", "cos", "abs", "sin") * 3:
         f, g, h = (nodes[i] for i in generator.integers(len(nodes), size=3))
-        nodes += [graph.call(op, graph.add(f, graph.mul(g, h))), graph.div(graph.mul(f, f), graph.add(g, graph.mul(h, h)))]
+        nodes += [
+            graph.call(op, graph.add(f, graph.mul(g, h))),
+            graph.div(graph.mul(f, f), graph.add(g, graph.mul(h, h))),
+        ]
         product = graph.mul(graph.mul(nodes[-2], nodes[-1]), graph.mul(nodes[-2], f))
         expected = NormalForms(graph, 400).simplified(product)
         assert forms.simplified(product) == expected
@@ -150,7 +190,13 @@ def test_an_expansion_that_grows_is_left_alone(graph):
 
 def test_sine_and_cosine_are_right_to_the_last_digits():
     mpmath = pytest.importorskip("mpmath")
-    x = np.concatenate([np.random.default_rng(0).uniform(-1e3, 1e3, 400), np.arange(-20, 21) * (np.pi / 4), [0.0, 1e-300, 1e-9, 1e5]])
+    x = np.concatenate(
+        [
+            np.random.default_rng(0).uniform(-1e3, 1e3, 400),
+            np.arange(-20, 21) * (np.pi / 4),
+            [0.0, 1e-300, 1e-9, 1e5],
+        ]
+    )
     s, c = jax.jit(sine_and_cosine)(x)
     exact = np.array([[float(mpmath.sin(mpmath.mpf(v))), float(mpmath.cos(mpmath.mpf(v)))] for v in x])
     assert np.max(np.abs(np.stack([s, c], 1) - exact)) < 2.3e-16
@@ -170,7 +216,24 @@ def test_sine_and_cosine_differentiate_to_second_order_in_both_modes():
 
 def _every_function(graph):
     x, y, a = *_x(graph, "x", "y"), graph.input("a", False)
-    of_one = ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "atanh", "exp", "exp2", "expm1", "log", "log1p"]
+    of_one = [
+        "sin",
+        "cos",
+        "tan",
+        "asin",
+        "acos",
+        "atan",
+        "sinh",
+        "cosh",
+        "tanh",
+        "asinh",
+        "atanh",
+        "exp",
+        "exp2",
+        "expm1",
+        "log",
+        "log1p",
+    ]
     of_one += ["logistic", "sqrt", "cbrt", "floor", "ceil", "round", "abs"]
     return {"x": x, "y": y, "a": a}, [
         *(graph.call(name, x) for name in of_one),
@@ -188,20 +251,33 @@ def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path):
     sympy = pytest.importorskip("sympy")
     names, outputs = _every_function(graph)
     expected = Probes(graph, {k: np.array([v]) for k, v in VALUES.items()})(outputs)[:, 0]
-    assert_allclose(run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15)
+    assert_allclose(
+        run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15
+    )
     lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, PYTHON)
     scope = {"math": math}
     exec("def f(x, y, a):\n" + "\n".join([*lines, f"    return {', '.join(last)}"]), scope)
     assert_allclose(scope["f"](**VALUES), expected, rtol=1e-15)
     symbols = sympy_expressions(graph, outputs, {n: k for k, n in names.items()})
-    symbols = [e.replace(lambda f: str(getattr(f, "func", "")) == "round", lambda f: sympy.Integer(round(f.args[0].subs(VALUES)))) for e in symbols]
+    symbols = [
+        e.replace(
+            lambda f: str(getattr(f, "func", "")) == "round",
+            lambda f: sympy.Integer(round(f.args[0].subs(VALUES))),
+        )
+        for e in symbols
+    ]
     assert_allclose([float(e.subs(VALUES)) for e in symbols], expected, rtol=1e-14)
     lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, C)
     body = "\n".join([*lines, *(f'    printf("%.17g\\n", {e});' for e in last)])
-    source = f"#include <math.h>\n#include <stdio.h>\nint main(void) {{ const double x = 0.7, y = -1.3, a = 2.5;\n{body}\n return 0; }}\n"
+    source = (
+        "#include <math.h>\n#include <stdio.h>\nint main(void) { const double x = 0.7, y = -1.3, a ="
+        f" 2.5;\n{body}\n return 0; }}\n"
+    )
     (tmp_path / "f.c").write_text(source)
     try:
-        subprocess.run(["cc", str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True, capture_output=True)
+        subprocess.run(
+            ["cc", str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True, capture_output=True
+        )
     except FileNotFoundError:
         pytest.skip("no C compiler")
     out = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
@@ -214,7 +290,10 @@ def test_operations_of_two_nodes_are_compared_by_what_they_do_not_share():
         graph = Graph()
         nodes = [graph.input(f"x{i}", i > 0) for i in range(4)]
         for _ in range(generator.integers(2, 40)):
-            op, (a, b) = str(generator.choice(["add", "sub", "mul", "div", "sin", "cos", "neg"])), generator.choice(nodes, 2).tolist()
+            op, (a, b) = (
+                str(generator.choice(["add", "sub", "mul", "div", "sin", "cos", "neg"])),
+                generator.choice(nodes, 2).tolist(),
+            )
             nodes.append(graph.call(op, a) if op in ("sin", "cos", "neg") else graph.call(op, a, b))
         a, b = generator.choice(nodes, 2).tolist()
         assert graph.more_operations(a, b) == graph.operations([a]) - graph.operations([b])
@@ -244,21 +323,38 @@ def test_a_computation_of_too_many_scalars_is_refused_before_it_is_built(monkeyp
 @pytest.mark.parametrize("name", TABLE)
 def test_an_operation_has_one_value_one_derivative_and_a_bound_of_its_round_off(graph, name):
     operation = TABLE[name]
-    arity = 3 if name == "select" else len(inspect.signature(operation.value).parameters) if name == "logistic" else operation.value.nin
+    arity = (
+        3
+        if name == "select"
+        else len(inspect.signature(operation.value).parameters)
+        if name == "logistic"
+        else operation.value.nin
+    )
     points = np.random.default_rng(3).uniform(0.2, 0.9, (arity, 20)) + (1.0 if name == "acosh" else 0.0)
     names = ["x", "y", "z"][:arity]
     variables = _x(graph, *names)
     node = graph.call(name, *variables)
-    flags = [operation.kind == "choice" and name != "is_finite" and (name != "select" or k == 0) for k in range(arity)]
+    flags = [
+        operation.kind == "choice" and name != "is_finite" and (name != "select" or k == 0)
+        for k in range(arity)
+    ]
     given = [x > 0.5 if flag else x for x, flag in zip(points, flags, strict=True)]
 
     def in_jax(*moving):
-        return operation.in_jax(*(fixed if flag else x for fixed, x, flag in zip(given, moving, flags, strict=True))) * 1.0
+        return (
+            operation.in_jax(
+                *(fixed if flag else x for fixed, x, flag in zip(given, moving, flags, strict=True))
+            )
+            * 1.0
+        )
 
     value, rate = jax.jvp(in_jax, tuple(points), tuple(0.3 * points))
     probes = Probes(graph, dict(zip(names, given, strict=True)))
     assert_allclose(probes([node])[0], value, rtol=1e-14)
-    direction = {x: graph.zero if flag else graph.mul(graph.const(0.3), x) for x, flag in zip(variables, flags, strict=True)}
+    direction = {
+        x: graph.zero if flag else graph.mul(graph.const(0.3), x)
+        for x, flag in zip(variables, flags, strict=True)
+    }
     assert_allclose(probes(derivatives(graph, [node], direction))[0], rate, rtol=1e-12, atol=1e-14)
     if operation.bounded:
         single = [np.concatenate([x.astype(np.float32).astype(float), 6e-8 * np.abs(x)]) for x in points]

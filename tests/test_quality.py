@@ -27,7 +27,9 @@ def test_types_hold():
 
 
 def test_the_list_of_slow_tests_names_tests_that_exist():
-    lines = [line for line in (ROOT / "tests" / "slow.txt").read_text().splitlines() if not line.startswith("#")]
+    lines = [
+        line for line in (ROOT / "tests" / "slow.txt").read_text().splitlines() if not line.startswith("#")
+    ]
     assert len(set(lines)) == len(lines)
     for line in lines:
         file, _, name = line.partition("::")
@@ -40,14 +42,25 @@ OF_NUMPY = r"\b(?:jnp\.round_|j?np\.(?:in1d|row_stack|trapz))\b"
 EXPERIMENTAL = r"\bjax\.experimental(?:\.| import )(?:host_callback|maps)\b"
 OF_CORE = r"\bjax\.core(?:\.| import )(?!Tracer\b)"  # it keeps little else that is public
 PATTERN = re.compile(
-    rf"^\s*(?:import|from) {MODULES}|\bjax(?:\.| import ){OF_JAX}|{OF_NUMPY}|{EXPERIMENTAL}|{OF_CORE}|\butcnow\b|\bpkgutil\.ImpImporter\b", re.MULTILINE
+    rf"^\s*(?:import|from) {MODULES}|\bjax(?:\.| import"
+    rf" ){OF_JAX}|{OF_NUMPY}|{EXPERIMENTAL}|{OF_CORE}|\butcnow\b|\bpkgutil\.ImpImporter\b",
+    re.MULTILINE,
 )
 
 
 def test_no_source_uses_what_newer_versions_lack():
-    sources = [path for folder in ("src", "tests", "bench", "notebooks") for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
+    sources = [
+        path
+        for folder in ("src", "tests", "bench", "notebooks")
+        for path in (ROOT / folder).rglob("*.py")
+        if path != Path(__file__)
+    ]
     assert sources
-    assert [(path.name, found[0]) for path in sources for found in PATTERN.finditer(path.read_text(encoding="utf-8"))] == []
+    assert [
+        (path.name, found[0])
+        for path in sources
+        for found in PATTERN.finditer(path.read_text(encoding="utf-8"))
+    ] == []
 
 
 @pytest.mark.parametrize(
@@ -64,4 +77,6 @@ def test_no_source_uses_what_newer_versions_lack():
 )
 def test_the_reader_sees_what_is_removed(text):
     assert PATTERN.search(text)
-    assert not PATTERN.search("jax.tree.map(f, x); isinstance(x, jax.core.Tracer); jax.tree_util; np.trapezoid(y)")
+    assert not PATTERN.search(
+        "jax.tree.map(f, x); isinstance(x, jax.core.Tracer); jax.tree_util; np.trapezoid(y)"
+    )

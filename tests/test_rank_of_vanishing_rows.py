@@ -1,4 +1,6 @@
-"""A row that vanishes at a configuration is lost there, in whatever unit it is written; and the conditioning says so beforehand."""
+"""A row that vanishes at a configuration is lost there, in whatever unit it is written; and the conditioning
+says so beforehand.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +75,9 @@ def test_verifying_at_a_loss_of_rank_raises_no_false_alarm():
 
 
 class HangingPlate(jj.Scene):
-    """A plate that hangs from three equal parallel rods and swings without turning; turned round, the three rods would hold it still."""
+    """A plate that hangs from three equal parallel rods and swings without turning; turned round, the three
+    rods would hold it still.
+    """
 
     coordinates = jj.coordinates("x z turned")
     example = {"x": 0.3, "z": -0.4}
@@ -85,7 +89,9 @@ class HangingPlate(jj.Scene):
         return (jj.gravity(motion, 9.81),)
 
     def geometric_constraints(self, pose):
-        hooks = {name: jnp.array([x, 0.0, 0.0]) for name, x in {"left": -0.4, "middle": 0.0, "right": 0.4}.items()}
+        hooks = {
+            name: jnp.array([x, 0.0, 0.0]) for name, x in {"left": -0.4, "middle": 0.0, "right": 0.4}.items()
+        }
         return {name: jj.rod(hook, pose["plate"].place(hook), 0.5) for name, hook in hooks.items()}
 
 
@@ -135,7 +141,10 @@ def bounds(scene) -> np.ndarray:
 def test_probed_configurations_are_on_the_rows_and_in_the_domain(name):
     scene, _ = LINKAGES[name]
     found, (low, high) = structure_of(scene), bounds(scene)
-    closures = [np.max(np.abs(position_residual(scene, t, q))) for t, q in zip(found.times[:8], found.coordinates[:8], strict=True)]
+    closures = [
+        np.max(np.abs(position_residual(scene, t, q)))
+        for t, q in zip(found.times[:8], found.coordinates[:8], strict=True)
+    ]
     assert max(closures) < 1e-11
     outside = np.maximum(low - found.coordinates, found.coordinates - high) / (high - low)
     assert found.random >= 4
@@ -152,18 +161,24 @@ def test_sampled_states_are_on_the_rows_and_in_the_domain(name):
 
 
 def _swinging():
-    """Two windows of rods with all speeds in the state, which pass two positions where one freedom becomes three."""
+    """Two windows of rods with all speeds in the state, which pass two positions where one freedom becomes
+    three.
+    """
     return jj.build(FourBars(), jj.Formulation(state="full"))
 
 
 def _start(rate):
     upright = {f"x{i}": float(i) for i in range(3)} | {f"z{i}": 1.0 for i in range(3)}
-    return {name: jnp.broadcast_to(value, jnp.shape(rate)) for name, value in upright.items()} | {f"x{i}_rate": rate for i in range(3)}
+    return {name: jnp.broadcast_to(value, jnp.shape(rate)) for name, value in upright.items()} | {
+        f"x{i}_rate": rate for i in range(3)
+    }
 
 
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
 def test_losses_of_rank_are_passed_at_every_tolerance(tolerance):
-    """Saved times lie at all distances from them; `3 a'' = 3.5 g sin a` for the angle of the cranks from upright."""
+    """Saved times lie at all distances from them; `3 a'' = 3.5 g sin a` for the angle of the cranks from
+    upright.
+    """
     ts, rates = np.linspace(0.0, 2.0, 101), jnp.append(jnp.linspace(0.6, 1.9, 15), 1.0)
     found = jj.rollout(_swinging(), _start(rates), ts=ts, rtol=tolerance, atol=tolerance)
     assert np.all(found.result == 0)

@@ -27,7 +27,9 @@ def _saved(motion, time):
 
 @pytest.fixture(scope="module")
 def motion():
-    """20 s of the published motion, saved at whole seconds and about its first reversal. Errors grow by 6e3 in the first second: hence the tolerances."""
+    """20 s of the published motion, saved at whole seconds and about its first reversal. Errors grow by 6e3
+    in the first second: hence the tolerances.
+    """
     return jj.simulate(STONE, RUN, ts=TIMES, rtol=1e-13, atol=1e-13)
 
 
@@ -46,7 +48,9 @@ def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
     squares = np.array([oracle.RUN[axis] ** 2 for axis in "abc"])
     for down in np.random.default_rng(3).normal(size=(10, 3)):
         down /= np.linalg.norm(down)
-        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array([0.0, 0.0, oracle.RUN["h"]])  # from the ellipsoid's centre
+        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array(
+            [0.0, 0.0, oracle.RUN["h"]]
+        )  # from the ellipsoid's centre
         normal = point / squares
         assert abs(point @ normal - 1) <= tolerance("round_off")
         assert relative_error(normal / np.linalg.norm(normal), down) <= tolerance("round_off")
@@ -68,7 +72,15 @@ def test_the_derivative_of_a_long_motion_at_round_off_is_right(backend):
 
     def turned(factor):
         begun = eqx.tree_at(lambda s: s.u, start, factor * start.u)
-        motion = jj.simulate(STONE, begun, ts=[2.0], rtol=1e-13, atol=1e-13, formulation=jj.Formulation(stabilisation=None), backend=backend)
+        motion = jj.simulate(
+            STONE,
+            begun,
+            ts=[2.0],
+            rtol=1e-13,
+            atol=1e-13,
+            formulation=jj.Formulation(stabilisation=None),
+            backend=backend,
+        )
         return jnp.sum(motion.q_end), motion.accepted
 
     found, steps = jax.grad(turned, has_aux=True)(1.0)
@@ -99,5 +111,7 @@ def test_units_do_not_matter():
 
 def test_the_normal_force_at_rest_is_the_weight():
     q, u, _ = STONE.named()
-    force = jax.jit(lambda q, u: jj.newton_residual(STONE, 0.0, q, u, jj.accelerations(STONE, 0.0, q, u).udot).linear[0])(q, u)
+    force = jax.jit(
+        lambda q, u: jj.newton_residual(STONE, 0.0, q, u, jj.accelerations(STONE, 0.0, q, u).udot).linear[0]
+    )(q, u)
     assert relative_error(force, [0.0, 0.0, float(STONE.mass * STONE.gravity)]) <= tolerance("round_off")

@@ -1,4 +1,6 @@
-"""Constraint forces by row and by body, and contact forces, against statics, closed forms and the principle of virtual power."""
+"""Constraint forces by row and by body, and contact forces, against statics, closed forms and the principle
+of virtual power.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +43,9 @@ def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene)
         partial, motion = partial_velocities(scene, t, q, u), jj.motion_at(scene, t, q, u)
         turned = jnp.stack([body.orientation for body in motion.bodies.values()])
         gamma = jnp.einsum("bij,bjk->bik", turned, partial.angular)  # space axes
-        power = jnp.einsum("sbi,bik->k", rows.force, partial.linear) + jnp.einsum("sbi,bik->k", rows.torque, gamma)
+        power = jnp.einsum("sbi,bik->k", rows.force, partial.linear) + jnp.einsum(
+            "sbi,bik->k", rows.torque, gamma
+        )
         return power + jnp.sum(rows.direct, axis=0), found.constraint_force
 
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 10)]
@@ -65,30 +69,45 @@ def test_the_forces_of_a_blade_act_sideways_at_the_blade():
     )
     # the blade is `offset` behind the mass centre: torque = -offset * sideways force
     assert jnp.abs(force @ forward) <= tolerance("round_off")
-    assert jnp.allclose(torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=tolerance("round_off"))
+    assert jnp.allclose(
+        torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=tolerance("round_off")
+    )
 
 
 def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
     _, rows = at_a_state(TwoWheelAxleRedundant())
     unique = dict(zip(rows.row_names, rows.determined.tolist(), strict=True))
-    # across the axle wheels and axle share the load as they like; the heights and the common heading are each their own
-    assert {row for row, alone in unique.items() if alone} == {"one heading", "wheel1 height", "wheel2 height"}
+    # across the axle wheels and axle share the load as they like; the heights and the common heading are each
+    # their own
+    assert {row for row, alone in unique.items() if alone} == {
+        "one heading",
+        "wheel1 height",
+        "wheel2 height",
+    }
 
 
 def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_turn():
     # B4: multipliers -m w_heading R w_spin (sin heading, -cos heading); N = m g
     scene = VerticalDisc(mass=1.4, radius=0.7)
-    q, u, _ = scene.named(heading=0.4, heading_rate=2.0, roll_rate=1.5, x_rate=1.05 * jnp.cos(0.4), y_rate=1.05 * jnp.sin(0.4))
+    q, u, _ = scene.named(
+        heading=0.4, heading_rate=2.0, roll_rate=1.5, x_rate=1.05 * jnp.cos(0.4), y_rate=1.05 * jnp.sin(0.4)
+    )
     contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
     centripetal = 1.4 * 2.0 * 0.7 * 1.5
     assert jnp.allclose(contact.normal, 1.4 * 9.81, rtol=tolerance("round_off"))
-    assert jnp.allclose(contact.tangential, centripetal * jnp.array([-jnp.sin(0.4), jnp.cos(0.4)]), rtol=tolerance("round_off"))
+    assert jnp.allclose(
+        contact.tangential,
+        centripetal * jnp.array([-jnp.sin(0.4), jnp.cos(0.4)]),
+        rtol=tolerance("round_off"),
+    )
     assert jnp.allclose(contact.friction_needed, centripetal / (1.4 * 9.81), rtol=tolerance("round_off"))
     assert contact.determined
     assert not contact.pulls
 
 
-@pytest.mark.parametrize("scene", [VerticalDisc(gravity=-9.81), small.DiscWithHeightRow(gravity=-9.81)], ids=["Newton", "row"])
+@pytest.mark.parametrize(
+    "scene", [VerticalDisc(gravity=-9.81), small.DiscWithHeightRow(gravity=-9.81)], ids=["Newton", "row"]
+)
 def test_a_contact_that_would_have_to_pull_is_flagged(scene):
     q, u, _ = scene.named()
     contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
@@ -101,7 +120,9 @@ def test_a_motion_says_that_a_contact_would_have_to_pull():
     assert "WOULD HAVE TO PULL" in str(jj.simulate(VerticalDisc(gravity=-9.81), t1=1.0))
 
 
-@pytest.mark.parametrize("scene", [VerticalDisc(gravity=0.0), small.DiscWithHeightRow(gravity=0.0)], ids=["Newton", "row"])
+@pytest.mark.parametrize(
+    "scene", [VerticalDisc(gravity=0.0), small.DiscWithHeightRow(gravity=0.0)], ids=["Newton", "row"]
+)
 def test_a_contact_without_any_load_bears_nothing_and_is_honest(scene):
     roll = {"spin_rate": 3.0} if isinstance(scene, small.DiscWithHeightRow) else {"roll_rate": 3.0}
     motion = jj.simulate(scene, roll, t1=1.0)  # straight on
@@ -118,7 +139,9 @@ def test_a_contact_that_presses_nowhere_and_is_pushed_sideways_needs_infinite_fr
     scene = VerticalDisc(mass=1.4, radius=0.7, gravity=0.0)
     q, u, _ = scene.named(heading_rate=2.0, roll_rate=1.5, x_rate=1.05)
     contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
-    assert jnp.allclose(contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=tolerance("round_off"))
+    assert jnp.allclose(
+        contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=tolerance("round_off")
+    )
     assert jnp.isinf(contact.friction_needed)
     assert not contact.pulls
 

@@ -8,7 +8,13 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reduced import reduced_accelerations, reduced_coordinates
-from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleFree
+from jourdain_jax.models import (
+    BallOnTurntable,
+    ChaplyginSleigh,
+    IsokineticParticle,
+    TiltingDisc,
+    TwoWheelAxleFree,
+)
 
 
 def test_the_reduced_equations_of_the_axle_keep_its_heading_alone():
@@ -32,7 +38,9 @@ def test_what_its_own_rate_needs_cannot_be_found_by_quadrature():
 def test_the_reduced_accelerations_of_the_axle_are_equations_64():
     scene = TwoWheelAxleFree()
     phi = 0.7
-    psi1, phi_acceleration = reduced_accelerations(scene, 0.0, jnp.array([phi, 0.0, phi, 0.0]), jnp.array([1.3, 0.9]))
+    psi1, phi_acceleration = reduced_accelerations(
+        scene, 0.0, jnp.array([phi, 0.0, phi, 0.0]), jnp.array([1.3, 0.9])
+    )
     expected = 1.2 * 9.81 * np.sin(0.2) * np.cos(phi) / (0.3 * (1.2 + 0.5))
     assert np.isclose(psi1, expected, rtol=tolerance("round_off"))
     assert abs(phi_acceleration) <= tolerance("round_off") * expected
@@ -44,7 +52,10 @@ def test_reduced_accelerations_are_those_of_the_whole_scene():
 
     def both(t, q, u):
         y = u[jnp.array(independent)]
-        return reduced_accelerations(scene, t, q[3:4], y), jj.accelerations(scene, t, q, u).udot[jnp.array(independent)]
+        return (
+            reduced_accelerations(scene, t, q[3:4], y),
+            jj.accelerations(scene, t, q, u).udot[jnp.array(independent)],
+        )
 
     reduced, whole = jax.jit(jax.vmap(both))(*jj.sample_states(scene, 20))
     assert jnp.max(jnp.abs(reduced - whole)) <= tolerance("round_off") * jnp.max(jnp.abs(whole))

@@ -11,13 +11,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-PAGES = sorted(page for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md") if page.stem != "index")
+PAGES = sorted(
+    page for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md") if page.stem != "index"
+)
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
 def blocks(page):
     """Code, and what it prints."""
-    return re.findall(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", page.read_text(encoding="utf-8"), re.DOTALL)
+    return re.findall(
+        r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", page.read_text(encoding="utf-8"), re.DOTALL
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

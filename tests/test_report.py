@@ -14,7 +14,15 @@ from small_scenes import OnLine, OnPlane
 import jourdain_jax as jj
 from jourdain_jax import report
 from jourdain_jax.analysis import Verification
-from jourdain_jax.models import ChaplyginSleigh, IsokineticParticle, Skate, Snakeboard, TiltingDisc, TrailerChain, TwoWheelAxleFree
+from jourdain_jax.models import (
+    ChaplyginSleigh,
+    IsokineticParticle,
+    Skate,
+    Snakeboard,
+    TiltingDisc,
+    TrailerChain,
+    TwoWheelAxleFree,
+)
 
 
 class SkateTwice(Skate):
@@ -46,7 +54,12 @@ def test_the_report_on_the_free_axle_says_what_the_paper_says_and_more():
     assert found.holonomic_rows_together == 8
     assert not found.rheonomic
     text = " ".join(str(found).split())
-    for phrase in ("(2, 3, 4), closed", "taken together: 8", "manifold of dimension 4", "degrees of freedom 2"):
+    for phrase in (
+        "(2, 3, 4), closed",
+        "taken together: 8",
+        "manifold of dimension 4",
+        "degrees of freedom 2",
+    ):
         assert phrase in text
 
 
@@ -74,7 +87,10 @@ class Roller(jj.Scene):
         return {"roller": jj.RigidBody(1.0, jnp.array([0.1, 0.05, 0.1]), [q.x, q.y, 0.0 * q.x + 0.3], turned)}
 
     def contacts(self, pose):
-        return {side: jj.disc_contact(pose["roller"], 0.3, centre=(0.0, y, 0.0)) for side, y in (("left", 0.5), ("right", -0.5))}
+        return {
+            side: jj.disc_contact(pose["roller"], 0.3, centre=(0.0, y, 0.0))
+            for side, y in (("left", 0.5), ("right", -0.5))
+        }
 
 
 def test_rows_that_follow_from_the_others_in_another_way_at_each_configuration_are_counted():
@@ -137,7 +153,11 @@ def test_the_report_tells_stop_events_domain_and_conventions():
     assert "probed in y -1 to 2; otherwise coordinates -3.2 to 3.2, speeds -1 to 1" in text
     assert "conventions x along the belt." in text
     facts = json.loads(json.dumps(found.as_dict()))
-    assert (facts["events"], facts["domain"], facts["conventions"]) == (["off the belt"], {"y": [-1.0, 2.0]}, "x along the belt.")
+    assert (facts["events"], facts["domain"], facts["conventions"]) == (
+        ["off the belt"],
+        {"y": [-1.0, 2.0]},
+        "x along the belt.",
+    )
 
 
 @pytest.mark.parametrize("scene", [IsokineticParticle(), Skate()], ids=lambda s: type(s).__name__)
@@ -176,7 +196,12 @@ def test_round_off_is_printed_as_zero():
 @functools.cache
 def measured():
     motion = jj.simulate(SLEIGH, {"x_rate": 0.6, "heading_rate": 0.9}, **RUN)
-    return jj.Experiment(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
+    return jj.Experiment(
+        motion.ts,
+        {"heading": motion["heading"], "x": motion["x"]},
+        0.01,
+        start={"x_rate": 0.6, "heading_rate": 0.9},
+    )
 
 
 @functools.cache
@@ -187,13 +212,25 @@ def fitted():
 RESULTS = {
     "State": (lambda: jj.start(SLEIGH, heading_rate=0.5), "State at t = 0 s: x = 0"),
     "Report": (lambda: jj.report(SLEIGH), "Report on ChaplyginSleigh"),
-    "Verification": (lambda: Verification("ChaplyginSleigh", (), ()), "Verification of ChaplyginSleigh: passed"),
-    "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
+    "Verification": (
+        lambda: Verification("ChaplyginSleigh", (), ()),
+        "Verification of ChaplyginSleigh: passed",
+    ),
+    "Rollout": (
+        lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN),
+        "Rollout of ChaplyginSleigh: 2 lanes",
+    ),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
     "Estimated": (lambda: fitted()["offset"], f"{SLEIGH.offset:.3g} m, standard error"),
-    "Profile": (lambda: fitted().profiles(measured())["offset"], f"`offset` = {SLEIGH.offset:.3g} m, profile"),
+    "Profile": (
+        lambda: fitted().profiles(measured())["offset"],
+        f"`offset` = {SLEIGH.offset:.3g} m, profile",
+    ),
     "Prediction": (lambda: fitted().predict(measured())[0]["x"], "5 samples from 0 to"),
-    "ChannelResiduals": (lambda: fitted().residual_summary()[0], "residuals of `heading` of run 0, in sigmas: 5 samples"),
+    "ChannelResiduals": (
+        lambda: fitted().residual_summary()[0],
+        "residuals of `heading` of run 0, in sigmas: 5 samples",
+    ),
     "SteadyMotion": (lambda: jj.steady(SLEIGH, {"x_rate": 0.5}, held="x_rate"), "steady motion: residual"),
     "Linearization": (lambda: jj.linearize(SLEIGH, {"x_rate": 0.5}, ()), "Small motions: residual"),
 }
@@ -210,7 +247,11 @@ def test_a_result_shows_its_text_wherever_it_is_shown(name):
 
 
 def test_a_scene_shows_its_numbers_as_one_writes_them():
-    assert repr(ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)) == str(ChaplyginSleigh()) == "ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)"
+    assert (
+        repr(ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25))
+        == str(ChaplyginSleigh())
+        == "ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)"
+    )
     assert str(TrailerChain(trailers=0)).startswith("TrailerChain(trailers=0, car_mass=1, ")
     seen = []
     jax.jit(lambda scene: seen.append(str(scene)))(SLEIGH)

@@ -1,4 +1,6 @@
-"""Motions that are no answer end with a result code: rows that contradict each other, energy that is lost, rates that become infinite."""
+"""Motions that are no answer end with a result code: rows that contradict each other, energy that is lost,
+rates that become infinite.
+"""
 
 import diffrax
 import jax
@@ -11,7 +13,8 @@ from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
 
-# Velocity rows that depend on each other and follow inputs or time: motions on which they contradict each other have a result code, others do not.
+# Velocity rows that depend on each other and follow inputs or time: motions on which they contradict each
+# other have a result code, others do not.
 
 
 class TwoBelts(OnPlane):
@@ -21,7 +24,10 @@ class TwoBelts(OnPlane):
     mass: float = jj.parameter(1.0, unit="kg", positive=True)
 
     def velocity_constraints(self, motion):
-        return {"first": motion.u.x_rate - motion.inputs.first, "second": 10.0 * (motion.u.x_rate - motion.inputs.second)}
+        return {
+            "first": motion.u.x_rate - motion.inputs.first,
+            "second": 10.0 * (motion.u.x_rate - motion.inputs.second),
+        }
 
 
 class Circling(OnPlane):
@@ -50,13 +56,19 @@ def test_rows_that_contradict_each_other_later_are_told_and_derivatives_are_as_w
     offs = np.array([0.0, 0.0, 0.5])
     alone = [driven(off) for off in offs]
     slopes, codes = jax.jit(jax.vmap(jax.jacfwd(squared, has_aux=True)))(np.array([1.0, 2.0, 1.0]), offs)
-    assert [int(motion.result) for motion in alone] == codes.tolist() == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
+    assert (
+        [int(motion.result) for motion in alone]
+        == codes.tolist()
+        == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
+    )
     assert_allclose(alone[0].q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
     assert_allclose(slopes[:2], [2.0, 4.0], rtol=1e-7)
 
 
 def test_nonlinear_rows_are_told_as_well():
-    run = lambda gain: jj.simulate(Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": lambda t: 1.0 + gain * t})  # noqa: E731
+    run = lambda gain: jj.simulate(
+        Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": lambda t: 1.0 + gain * t}
+    )
     assert run(0.0).result == results.SUCCESS
     assert int(run(1.0).result) != results.SUCCESS
 
@@ -64,16 +76,21 @@ def test_nonlinear_rows_are_told_as_well():
 def test_what_long_steps_violate_is_no_contradiction():
     formulation = jj.Formulation("full", stabilisation=None)
     long = {"solver": diffrax.Heun(), "rtol": 1e3, "atol": 1e3, "max_step": np.inf, "work": False}
-    motion = jj.simulate(TwoBelts(), {"y_rate": 1.0}, ts=[1.0], inputs=belts(0.0), formulation=formulation, **long)
+    motion = jj.simulate(
+        TwoBelts(), {"y_rate": 1.0}, ts=[1.0], inputs=belts(0.0), formulation=formulation, **long
+    )
     assert jnp.max(jnp.abs(motion.residuals()[1])) > 0.3  # of 10 sin(1)
     assert motion.result == results.SUCCESS
 
 
-# A motion whose energy changes by more than its steps explain has a result code, inside `jit` and in every lane; right motions never have it.
+# A motion whose energy changes by more than its steps explain has a result code, inside `jit` and in every
+# lane; right motions never have it.
 
 
 class Step(OnPlane):
-    """A particle that flies over an edge of the potential, `height` (J) high and `width` (m) wide, at x = 1 m."""
+    """A particle that flies over an edge of the potential, `height` (J) high and `width` (m) wide, at x = 1
+    m.
+    """
 
     height: float = jj.parameter(2.0, unit="J")
     width: float = jj.parameter(1e-9, unit="m")
@@ -121,7 +138,9 @@ def test_a_feature_that_steps_pass_over_is_told_by_the_energy(way):
 
 def test_the_energy_tells_it_also_of_motions_alone_and_in_a_rollout():
     assert [int(passing(v)) for v in SPEEDS] == CODES
-    assert jj.rollout(Step(), {"x_rate": SPEEDS, "y_rate": 1.0 + 0 * SPEEDS}, ts=[1.5]).result.tolist() == CODES
+    assert (
+        jj.rollout(Step(), {"x_rate": SPEEDS, "y_rate": 1.0 + 0 * SPEEDS}, ts=[1.5]).result.tolist() == CODES
+    )
 
 
 def test_an_edge_that_steps_can_follow_is_passed():
@@ -137,7 +156,10 @@ def test_a_potential_that_is_not_that_of_its_force_is_told():
         motion.raise_if_failed()
 
 
-@pytest.mark.parametrize(("amplitude", "level", "tolerance"), [(1.0, 0.0, 1e-2), (1e-9, 0.0, 1e-6), (1e-3, 1e12, 1e-6), (0.0, 0.0, 1e-3), (1e6, -1e3, 1e-4)])
+@pytest.mark.parametrize(
+    ("amplitude", "level", "tolerance"),
+    [(1.0, 0.0, 1e-2), (1e-9, 0.0, 1e-6), (1e-3, 1e12, 1e-6), (0.0, 0.0, 1e-3), (1e6, -1e3, 1e-4)],
+)
 @pytest.mark.parametrize("k", [4.0, 1e6])
 def test_errors_that_the_tolerance_allows_are_not_told(amplitude, level, tolerance, k):
     scene, turns = Spring(k, level), 40 * np.pi / np.sqrt(k)
@@ -167,7 +189,8 @@ def test_steps_without_control_are_taken_as_they_are():
     assert motion.result == results.SUCCESS
 
 
-# Speeds of a scene's own in which rates of coordinates become infinite: motions that come there end with a code.
+# Speeds of a scene's own in which rates of coordinates become infinite: motions that come there end with a
+# code.
 
 
 # the rate of the coordinate a for the speed w, and whether it becomes infinite between 1 and -1
@@ -180,7 +203,10 @@ RATES = {
     "squared": (lambda a, w: w / (1.0 - jnp.cos(a)), True),
     "regular": (lambda a, w: w / (1.0 + a**2), False),
     "cosine": (lambda a, w: w / jnp.cos(a), False),
-    "chosen": (lambda a, w: w * jnp.where(jnp.abs(a) < 1e-9, 1.0, a) / jnp.where(jnp.abs(a) < 1e-9, 1.0, jnp.sin(a)), False),
+    "chosen": (
+        lambda a, w: w * jnp.where(jnp.abs(a) < 1e-9, 1.0, a) / jnp.where(jnp.abs(a) < 1e-9, 1.0, jnp.sin(a)),
+        False,
+    ),
 }
 
 
@@ -209,11 +235,15 @@ def _codes(kind, backend, solver=None):
         start = {"a": 1.0, "w": a_rate / rate(1.0, 1.0), "v": 0.3}
         return jj.simulate(scene, start, ts=[1.0], backend=backend, solver=solver).result
 
-    *inward, away = jax.jit(jax.vmap(one))(np.append(np.linspace(-1.5, -1.3, 7 if backend == "dense" else 63), 0.1)).tolist()
+    *inward, away = jax.jit(jax.vmap(one))(
+        np.append(np.linspace(-1.5, -1.3, 7 if backend == "dense" else 63), 0.1)
+    ).tolist()
     return inward, away, lost
 
 
-CASES = [(kind, backend, None) for kind in RATES for backend in ("native", "xla")] + [(kind, "dense", None) for kind in ("shifted", "regular")]
+CASES = [(kind, backend, None) for kind in RATES for backend in ("native", "xla")] + [
+    (kind, "dense", None) for kind in ("shifted", "regular")
+]
 CASES += [(kind, "native", jj.Taylor()) for kind in ("sine", "regular")]
 
 
@@ -229,4 +259,3 @@ def test_a_single_motion_says_why_it_ended():
     assert motion.result == results.SINGULAR_PARTITION
     assert "infinite" in motion.message
     assert motion.t_end < np.sin(1.0)  # a = 0 is met before, as w falls no faster than sin(a)
-

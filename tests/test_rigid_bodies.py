@@ -16,8 +16,16 @@ TOP, HELD = FreeRigidBody(**MOMENTS), Suslov()
 @pytest.fixture(scope="module")
 def free():
     """20 s, turning and flying off."""
-    start = {"attitude_omega": jnp.asarray(free_rigid_body.RUN["w0"]), "x": 1.0, "x_rate": 0.3, "y_rate": -0.1, "z_rate": 0.2}
-    return jj.simulate(TOP, start, ts=jnp.linspace(0.0, free_rigid_body.RUN["t_end"], 21), rtol=1e-12, atol=1e-12)
+    start = {
+        "attitude_omega": jnp.asarray(free_rigid_body.RUN["w0"]),
+        "x": 1.0,
+        "x_rate": 0.3,
+        "y_rate": -0.1,
+        "z_rate": 0.2,
+    }
+    return jj.simulate(
+        TOP, start, ts=jnp.linspace(0.0, free_rigid_body.RUN["t_end"], 21), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_a_free_body_turns_by_elliptic_functions(free):
@@ -46,7 +54,9 @@ def test_turning_about_the_middle_axis_is_steady_until_disturbed():
     q, u, _ = TOP.named(attitude_omega=jnp.array([0.0, 1.0, 0.0]))
     assert jnp.max(jnp.abs(jj.accelerations(TOP, 0.0, q, u).udot)) == 0
     nearly = (0.01, 1.0, 0.0)
-    kicked = jj.simulate(TOP, {"attitude_omega": jnp.array(nearly)}, ts=jnp.linspace(0.0, 15.0, 7), rtol=1e-12, atol=1e-12)
+    kicked = jj.simulate(
+        TOP, {"attitude_omega": jnp.array(nearly)}, ts=jnp.linspace(0.0, 15.0, 7), rtol=1e-12, atol=1e-12
+    )
     expected = free_rigid_body.motion(kicked.ts, inertia=free_rigid_body.RUN["inertia"], w0=nearly)
     assert np.min(expected[:, 1]) < -0.9  # turned over
     assert relative_error(kicked["attitude_omega"], expected) <= tolerance("closed_form")

@@ -1,4 +1,6 @@
-"""What elements of robot files may hold: each neighbour of a file that says something else is refused by name; and files that cannot be read."""
+"""What elements of robot files may hold: each neighbour of a file that says something else is refused by
+name; and files that cannot be read.
+"""
 
 import contextlib
 import copy
@@ -92,14 +94,41 @@ def neighbours(form):
             change(at(root, place), at(root, place[:-1]))
             return reader, ElementTree.tostring(root, encoding="unicode")
 
-        yield f"{where}-text", *changed(lambda x, _: setattr(x, "text", "0 1 0")), r"the text `0 1 0` in .* is not supported"
-        yield f"{where}-tail", *changed(lambda x, above: setattr(x, "tail", "0 1 0") if x is not above else setattr(x, "text", "0 1 0")), "the text `0 1 0` in "
-        yield f"{where}-attribute", *changed(lambda x, _: x.set("spring", "3")), r'`spring="3"` of .* is not supported'
-        yield f"{where}-child", *changed(lambda x, _: ElementTree.SubElement(x, "loop_joint", name="l")), r"`loop_joint` `l` in .* is not supported"
+        yield (
+            f"{where}-text",
+            *changed(lambda x, _: setattr(x, "text", "0 1 0")),
+            r"the text `0 1 0` in .* is not supported",
+        )
+        yield (
+            f"{where}-tail",
+            *changed(
+                lambda x, above: (
+                    setattr(x, "tail", "0 1 0") if x is not above else setattr(x, "text", "0 1 0")
+                )
+            ),
+            "the text `0 1 0` in ",
+        )
+        yield (
+            f"{where}-attribute",
+            *changed(lambda x, _: x.set("spring", "3")),
+            r'`spring="3"` of .* is not supported',
+        )
+        yield (
+            f"{where}-child",
+            *changed(lambda x, _: ElementTree.SubElement(x, "loop_joint", name="l")),
+            r"`loop_joint` `l` in .* is not supported",
+        )
         if place and element.tag not in SEVERAL:
-            yield f"{where}-twice", *changed(lambda x, above: above.append(copy.deepcopy(x))), f"has 2 elements `{element.tag}`, expected one|several shapes"
+            yield (
+                f"{where}-twice",
+                *changed(lambda x, above: above.append(copy.deepcopy(x))),
+                f"has 2 elements `{element.tag}`, expected one|several shapes",
+            )
         for name in element.attrib:
-            if name not in ("effort", "velocity", "version", "energy", "mesh") and (element.tag, name) != ("visual", "name"):
+            if name not in ("effort", "velocity", "version", "energy", "mesh") and (element.tag, name) != (
+                "visual",
+                "name",
+            ):
 
                 def misspell(x, _, name=name):
                     x.set(name[:-1] + "_", x.attrib.pop(name))
@@ -137,7 +166,11 @@ def test_what_is_said_twice_is_refused(form):
     for tag in ("link", "joint", "body", "motor"):
         if f"<{tag} " in text:
             names = re.findall(rf'<{tag} name="(\w+)"', text)
-            twice = text.replace(f'"{names[0]}"', f'"{names[-1]}"') if len(names) > 1 else re.sub(r"(<motor .*?/>)", r"\1\1", text)
+            twice = (
+                text.replace(f'"{names[0]}"', f'"{names[-1]}"')
+                if len(names) > 1
+                else re.sub(r"(<motor .*?/>)", r"\1\1", text)
+            )
             with pytest.raises(ValueError, match=r"two \w+s are called `"):
                 reader(twice)
     if form == "mjcf":
@@ -170,7 +203,10 @@ def test_what_is_refused_can_be_left_out_on_purpose(old, new, key):
 
 
 def test_a_misspelt_name_is_put_right():
-    with pytest.raises(ValueError, match=r'`dampin="0.7"` of `dynamics` of joint `turn` is not supported; did you mean `damping`\?'):
+    with pytest.raises(
+        ValueError,
+        match=r'`dampin="0.7"` of `dynamics` of joint `turn` is not supported; did you mean `damping`\?',
+    ):
         jj.from_urdf(URDF.replace('damping="0.7"', 'dampin="0.7"'))
 
 
@@ -180,7 +216,9 @@ IDLE = """<collision><geometry><box/>any</geometry></collision></link>"""
 @pytest.mark.filterwarnings("error")
 def test_elements_without_influence_on_the_motion_are_read_over():
     own = jj.from_urdf(URDF)()
-    calm = URDF.replace("</link>", IDLE).replace("</robot>", "<gazebo>x<y/></gazebo><transmission name='t'/><ros2_control/></robot>")
+    calm = URDF.replace("</link>", IDLE).replace(
+        "</robot>", "<gazebo>x<y/></gazebo><transmission name='t'/><ros2_control/></robot>"
+    )
     other = jj.from_urdf(calm, ignore=("gazebo", "transmission", "ros2_control"))()
     q, u = jj.start(own).q, jj.start(own).u
     assert_array_equal(jj.accelerations(own, 0.0, q, u).udot, jj.accelerations(other, 0.0, q, u).udot)
@@ -198,9 +236,11 @@ NO_FILES = {
     "deep": b"<robot name='r'>" + b"<link>" * 1200 + b"</link>" * 1200 + b"</robot>",
     "very-deep": b"<robot>" * 100_000 + b"</robot>" * 100_000,
     "bodies": b"<mujoco><worldbody>" + b"<body>" * 1200 + b"</body>" * 1200 + b"</worldbody></mujoco>",
-    "laughs": b'<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'
-    + b"".join(b'<!ENTITY a%d "%s">' % (k, b"&a%d;" % (k - 1) * 20 if k else b"&a;") for k in range(9))
-    + b"]><r>&a8;</r>",
+    "laughs": (
+        b'<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'
+        + b"".join(b'<!ENTITY a%d "%s">' % (k, b"&a%d;" % (k - 1) * 20 if k else b"&a;") for k in range(9))
+        + b"]><r>&a8;</r>"
+    ),
 }
 
 
@@ -237,7 +277,11 @@ def test_what_is_no_number_is_refused_with_its_place(number):
     ):
         with pytest.raises(ValueError, match=rf"the URDF text: {what} is `.*`, expected"):
             jj.from_urdf(URDF.replace(old, re.sub('".*"', f'"{number}"', old)))
-    for old, what in (('mass="2"', "mass of `inertial` of body `a`"), ('gear="2"', "gear of motor `push`"), ('density="500"', "density of")):
+    for old, what in (
+        ('mass="2"', "mass of `inertial` of body `a`"),
+        ('gear="2"', "gear of motor `push`"),
+        ('density="500"', "density of"),
+    ):
         with pytest.raises(ValueError, match=rf"the MJCF text: {what}.* is `.*`, expected"):
             jj.from_mjcf(MJCF.replace(old, re.sub('".*"', f'"{number}"', old)))
 
@@ -249,10 +293,14 @@ def test_meshes_that_are_nowhere_are_listed_in_short(name):
         jj.from_urdf(text)
     assert len(str(told[0].message)) < 300
     with pytest.warns(UserWarning, match="omitted `geom of type mesh`"):
-        jj.from_mjcf(MJCF.replace("m.obj", name).replace('<geom name="g" size="0.1"', '<geom type="mesh" mesh="m" mass="0"/><geom name="g" size="0.1"'))
+        jj.from_mjcf(
+            MJCF.replace("m.obj", name).replace(
+                '<geom name="g" size="0.1"', '<geom type="mesh" mesh="m" mass="0"/><geom name="g" size="0.1"'
+            )
+        )
 
 
-# motors -------------------------------------------------------------------------------------------------------------------
+# motors -----------------------------------------------------------------------------------------------------
 
 MOTORS = [
     "",
@@ -273,13 +321,19 @@ MOTORS = [
     'ctrllimited="false" forcelimited="false" gear="2"',
     'ctrlrange="-1 0.1" ctrllimited="true" forcelimited="false"',
 ]
-BODY = '<body name="a{0}"><joint name="j{0}" type="hinge"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+BODY = (
+    '<body name="a{0}"><joint name="j{0}" type="hinge"/><inertial pos="0 0 0" mass="1" diaginertia="1 1'
+    ' 1"/></body>'
+)
 DEFAULT = '<default><general ctrlrange="-0.4 0.3" forcerange="-0.2 5"/></default>'
 
 
 def swinging(motors, compiler="", sections=""):
     """Bodies of 1 kg m^2, each on a hinge with one motor."""
-    bodies, pushes = (BODY.format(k) for k in range(len(motors))), (f'<motor name="m{k}" joint="j{k}" {motor}/>' for k, motor in enumerate(motors))
+    bodies, pushes = (
+        (BODY.format(k) for k in range(len(motors))),
+        (f'<motor name="m{k}" joint="j{k}" {motor}/>' for k, motor in enumerate(motors)),
+    )
     head = f'<mujoco><compiler {compiler} inertiafromgeom="false"/><option gravity="0 0 0"/>{sections}'
     return f"{head}<worldbody>{''.join(bodies)}</worldbody><actuator>{''.join(pushes)}</actuator></mujoco>"
 
@@ -299,7 +353,11 @@ def test_motors_are_clamped_as_they_are_by_mujoco(compiler, sections):
     text = swinging(right, compiler, sections)
     scene, model = jj.from_mjcf(text)(), mujoco.MjModel.from_xml_string(text)
     data, rest = mujoco.MjData(model), jnp.zeros(len(right))
-    found = jax.jit(lambda value: jj.accelerations(scene, 0.0, rest, rest, {f"m{k}": value for k in range(len(right))}).udot)
+    found = jax.jit(
+        lambda value: (
+            jj.accelerations(scene, 0.0, rest, rest, {f"m{k}": value for k in range(len(right))}).udot
+        )
+    )
     for value in (-10.0, -0.25, 0.0, 0.25, 2.5, 10.0):
         data.ctrl[:] = value
         mujoco.mj_forward(model, data)
@@ -309,10 +367,17 @@ def test_motors_are_clamped_as_they_are_by_mujoco(compiler, sections):
 def test_motors_are_clamped_first_by_their_control_then_by_their_force():
     scene = jj.from_mjcf(swinging(['ctrlrange="-1 3" forcerange="-2 2" gear="-3"']))()
     rest = jnp.zeros(1)
-    found = [float(jj.accelerations(scene, 0.0, rest, rest, {"m0": value}).udot[0]) for value in (-10.0, -0.5, 1.0, 2.5, 10.0)]
+    found = [
+        float(jj.accelerations(scene, 0.0, rest, rest, {"m0": value}).udot[0])
+        for value in (-10.0, -0.5, 1.0, 2.5, 10.0)
+    ]
     assert_allclose(found, [3.0, 1.5, -3.0, -6.0, -6.0], rtol=1e-12)
     with pytest.raises(ValueError, match=r'`clampctrl="disable"` of `flag`'):
-        jj.from_mjcf(swinging([""]).replace('<option gravity="0 0 0"/>', '<option><flag clampctrl="disable"/></option>'))
+        jj.from_mjcf(
+            swinging([""]).replace(
+                '<option gravity="0 0 0"/>', '<option><flag clampctrl="disable"/></option>'
+            )
+        )
 
 
 def test_a_clamped_motor_moves_in_lanes_and_has_derivatives():

@@ -1,4 +1,6 @@
-"""Trees of links with the tensors of inertia of real robots: thin shells, long bones, products of inertia beside small moments. All are lowered."""
+"""Trees of links with the tensors of inertia of real robots: thin shells, long bones, products of inertia
+beside small moments. All are lowered.
+"""
 
 import itertools
 
@@ -16,11 +18,16 @@ START, SPAN = {"j00": 0.3, "j01_rate": 0.7}, {"t1": 0.2, "ts": [0.0, 0.2]}
 
 def inertial(mass, centre, I):
     moments = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{I[i, j]}"' for i in range(3) for j in range(i, 3))
-    return f'<inertial><origin xyz="{centre[0]} {centre[1]} {centre[2]}"/><mass value="{mass}"/><inertia {moments}/></inertial>'
+    return (
+        f'<inertial><origin xyz="{centre[0]} {centre[1]} {centre[2]}"/><mass value="{mass}"/><inertia'
+        f" {moments}/></inertial>"
+    )
 
 
 def possible_tensor(draw: np.random.Generator, thin) -> np.ndarray:
-    """I = tr(S) 1 - S of a body turned at random, whose second moment S about one axis is `thin` beside the largest."""
+    """I = tr(S) 1 - S of a body turned at random, whose second moment S about one axis is `thin` beside the
+    largest.
+    """
     turn, size = np.linalg.qr(draw.normal(size=(3, 3)))[0], 10.0 ** draw.uniform(-6, -2)
     S = turn @ np.diag(size * np.array([1.0, draw.uniform(0.01, 1.0), thin])) @ turn.T
     return np.trace(S) * np.eye(3) - S
@@ -29,13 +36,21 @@ def possible_tensor(draw: np.random.Generator, thin) -> np.ndarray:
 def tree(seed, legs, joints, tensor):
     """A trunk with legs, each a chain of revolute joints, its links with what `tensor` draws."""
     draw = np.random.default_rng(seed)
-    parts = [f'<link name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]]))}</link>']
+    parts = [
+        "<link"
+        f' name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]]))}</link>'
+    ]
     for leg in range(legs):
         names = ["trunk", *(f"l{leg}{k}" for k in range(joints))]
         for k, (parent, name) in enumerate(itertools.pairwise(names)):
             at, axis = draw.normal(size=3) * 0.1, "1 0 0" if k == 0 else "0 1 0"
-            parts.append(f'<link name="{name}">{inertial(draw.uniform(0.05, 0.5), 0.03 * draw.normal(size=3), tensor(draw))}</link>')
-            parts.append(f'<joint name="j{leg}{k}" type="revolute"><parent link="{parent}"/><child link="{name}"/>')
+            parts.append(
+                "<link"
+                f' name="{name}">{inertial(draw.uniform(0.05, 0.5), 0.03 * draw.normal(size=3), tensor(draw))}</link>'
+            )
+            parts.append(
+                f'<joint name="j{leg}{k}" type="revolute"><parent link="{parent}"/><child link="{name}"/>'
+            )
             parts.append(f'<origin xyz="{at[0]} {at[1]} {at[2]}"/><axis xyz="{axis}"/></joint>')
     return f'<robot name="walker">{"".join(parts)}</robot>'
 
@@ -64,9 +79,15 @@ def test_a_tree_whose_tensors_are_traced_first_is_lowered_too():
     scene = jj.from_urdf(tree(2, 1, 2, lambda draw: BONE))()
     jax.jit(lambda I: jj.simulate(scene.replace(l01_inertia=I), START, **SPAN).q_end)(jnp.asarray(BONE))
     assert jj.lower(scene).operations > 0
-    lanes = jj.rollout(scene, START, **SPAN, parameters={"l01_inertia": jnp.stack([BONE, 1.2 * BONE])}, progress=False)
+    lanes = jj.rollout(
+        scene, START, **SPAN, parameters={"l01_inertia": jnp.stack([BONE, 1.2 * BONE])}, progress=False
+    )
     for k, scale in enumerate((1.0, 1.2)):
-        assert_allclose(lanes["j01"][k], jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"], rtol=1e-9)
+        assert_allclose(
+            lanes["j01"][k],
+            jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"],
+            rtol=1e-9,
+        )
 
 
 def bone():
@@ -82,8 +103,20 @@ class Spinning(jj.Scene):
     domain = {"lean": (-1.0, 1.0), "spin": (-1.0, 1.0)}
 
     def bodies(self, t, q):
-        I = bone().at[0, 1].set(self.across).at[1, 0].set(self.across).at[0, 2].set(self.beside).at[2, 0].set(self.beside)
-        return {"body": jj.RigidBody(1.0, I, jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin))}
+        I = (
+            bone()
+            .at[0, 1]
+            .set(self.across)
+            .at[1, 0]
+            .set(self.across)
+            .at[0, 2]
+            .set(self.beside)
+            .at[2, 0]
+            .set(self.beside)
+        )
+        return {
+            "body": jj.RigidBody(1.0, I, jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin))
+        }
 
 
 def test_products_of_inertia_that_are_parameters_of_their_own_are_varied_within_what_bodies_have():
@@ -96,9 +129,17 @@ PENDULUM = '<robot name="p"><link name="base"/><link name="arm">{}</link>' + JOI
 
 @pytest.mark.parametrize("noise", [2e-35, -1e-33, 1e-22])
 def test_round_off_in_a_tensor_of_zeros_is_no_moment(noise):
-    arm = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]]))))()
+    arm = jj.from_urdf(
+        PENDULUM.format(
+            inertial(
+                1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]])
+            )
+        )
+    )()
     point = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.zeros((3, 3)))))()
-    assert_array_equal(jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end)
+    assert_array_equal(
+        jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end
+    )
 
 
 class Point(jj.Scene):
@@ -114,18 +155,26 @@ def test_round_off_in_a_tensor_of_a_scene_is_no_negative_moment():
     motion = jj.simulate(Point(), {"q_rate": 1.0}, **SPAN)
     assert motion.result == 0
     assert_allclose(motion.q_end, [0.2], rtol=1e-9)
-    lanes = jj.rollout(Point(), {"q_rate": 1.0}, **SPAN, parameters={"noise": jnp.array([2e-35, -1e-33])}, progress=False)
+    lanes = jj.rollout(
+        Point(), {"q_rate": 1.0}, **SPAN, parameters={"noise": jnp.array([2e-35, -1e-33])}, progress=False
+    )
     assert not np.any(np.asarray(lanes.result))
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.2), (3.0, 1.0, 1.0), (0.0, 0.0, 1.0), (1.0, -0.5, 1.2), (-1e-3, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "moments", [(1.0, 1.0, 2.2), (3.0, 1.0, 1.0), (0.0, 0.0, 1.0), (1.0, -0.5, 1.2), (-1e-3, 0.0, 0.0)]
+)
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
 def test_moments_that_no_body_has_are_refused_when_they_are_read(moments, form):
-    with pytest.raises(ValueError, match=r"link `arm` has principal moments of inertia .* impossible for a body"):
+    with pytest.raises(
+        ValueError, match=r"link `arm` has principal moments of inertia .* impossible for a body"
+    ):
         _pendulum(form, moments)
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 1.0, 2.05), (0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1e-3, 2e-3, 2.5e-3)])
+@pytest.mark.parametrize(
+    "moments", [(1.0, 1.0, 2.0), (1.0, 1.0, 2.05), (0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1e-3, 2e-3, 2.5e-3)]
+)
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
 def test_moments_of_discs_rods_and_points_are_read(moments, form):
     assert _pendulum(form, moments)().arm_mass == 1.0
@@ -134,11 +183,18 @@ def test_moments_of_discs_rods_and_points_are_read(moments, form):
 @pytest.mark.parametrize("moments", [(0.0, 0.0, 3e-6), (1e-4, -1e-4, 1e-4)])
 def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(moments):
     plate = f'<link name="plate">{inertial(0.1, (0.0, 0.0, 0.0), np.diag(moments))}</link>'
-    joint = '<joint name="f" type="fixed"><parent link="arm"/><child link="plate"/><origin xyz="0 0 0.1" rpy="0.3 0.2 0.1"/></joint></robot>'
+    joint = (
+        '<joint name="f" type="fixed"><parent link="arm"/><child link="plate"/><origin xyz="0 0 0.1" rpy="0.3'
+        ' 0.2 0.1"/></joint></robot>'
+    )
     arm = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), 0.01 * np.eye(3)))
     assert jj.from_urdf(arm.replace("</robot>", plate + joint))().plate_mass == 0.1
     with pytest.raises(ValueError, match=r"link `arm`, with links fixed to it, has principal moments"):
-        jj.from_urdf(arm.replace("0.01", "1e-8").replace('xyz="0.0 0.3 0.0"', "").replace("</robot>", (plate + joint).replace("0 0 0.1", "0 0 0")))
+        jj.from_urdf(
+            arm.replace("0.01", "1e-8")
+            .replace('xyz="0.0 0.3 0.0"', "")
+            .replace("</robot>", (plate + joint).replace("0 0 0.1", "0 0 0"))
+        )
 
 
 def test_moments_that_no_body_has_are_taken_on_purpose():
@@ -150,4 +206,7 @@ def _pendulum(form, moments):
     if form == "urdf":
         return jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag(moments))))
     stated = f'<inertial pos="0 0.3 0" mass="1" diaginertia="{moments[0]} {moments[1]} {moments[2]}"/>'
-    return jj.from_mjcf(f'<mujoco><worldbody><body name="arm"><joint name="j" axis="1 0 0"/>{stated}</body></worldbody></mujoco>')
+    return jj.from_mjcf(
+        '<mujoco><worldbody><body name="arm"><joint name="j" axis="1 0'
+        f' 0"/>{stated}</body></worldbody></mujoco>'
+    )

@@ -1,4 +1,6 @@
-"""Rows that are nonlinear in the speeds and lose their slope where these vanish: no motion is determined beyond, whatever times are saved."""
+"""Rows that are nonlinear in the speeds and lose their slope where these vanish: no motion is determined
+beyond, whatever times are saved.
+"""
 
 import diffrax
 import jax
@@ -16,11 +18,17 @@ ROWS = {
     "speed": (lambda x, y, z, c: x**2 + y**2 - c**2, (0.6, 0.8, 0.3)),
     "one component": (lambda x, y, z, c: x**2 - c**2, (1.0, 0.4, 0.3)),
     "quadric": (lambda x, y, z, c: x**2 + y**2 + z**2 + x * y - 2.0 * c**2, (0.0, 1.0, 1.0)),
-    "two rows": (lambda x, y, z, c: jnp.stack([x**2 + y**2 + z**2 - 2.0 * c**2, x + 2.0 * y - z - c]), (0.0, 1.0, 1.0)),
+    "two rows": (
+        lambda x, y, z, c: jnp.stack([x**2 + y**2 + z**2 - 2.0 * c**2, x + 2.0 * y - z - c]),
+        (0.0, 1.0, 1.0),
+    ),
     "weighted": (lambda x, y, z, c: 1e4 * (x**2 + 3.0 * z**2 - c**2), (0.5, 0.4, 0.5)),
 }
 # and such as determine the motion beyond, though their slope vanishes
-PASSED = {"cube": (lambda x, y, z, c: x**3 - c**3, (1.0, 0.4, 0.3)), "magnitude": (lambda x, y, z, c: x * jnp.abs(x) - c, (1.0, 0.4, 0.3))}
+PASSED = {
+    "cube": (lambda x, y, z, c: x**3 - c**3, (1.0, 0.4, 0.3)),
+    "magnitude": (lambda x, y, z, c: x * jnp.abs(x) - c, (1.0, 0.4, 0.3)),
+}
 
 
 def _scene(row, stop, pull=0.0):
@@ -45,7 +53,11 @@ def _end(scene, speeds, **options):
 
 
 CASES = [(name, {"backend": backend}) for name in ROWS for backend in ("native", "dense")]
-CASES += [(name, options) for name in ("speed", "two rows") for options in ({"backend": "xla"}, {"solver": jj.Taylor()})]
+CASES += [
+    (name, options)
+    for name in ("speed", "two rows")
+    for options in ({"backend": "xla"}, {"solver": jj.Taylor()})
+]
 
 
 @pytest.mark.parametrize(("name", "options"), CASES, ids=str)
@@ -58,7 +70,9 @@ def test_no_lane_goes_through_a_row_that_is_lost(name, options):
         return _end(scene.replace(stop=stop, pull=pull), speeds, ts=ts, **options).result
 
     lanes = 4 if options.get("backend") in ("dense", "xla") else 32
-    stops = jnp.concatenate([ts[lanes // 2 : lanes], jnp.linspace(0.3, 1.7, lanes // 2)])  # half of them are saved times
+    stops = jnp.concatenate(
+        [ts[lanes // 2 : lanes], jnp.linspace(0.3, 1.7, lanes // 2)]
+    )  # half of them are saved times
     pulls = jnp.asarray(np.random.default_rng(len(name)).choice([0.0, 0.7, 2.0], lanes))
     assert not np.isin(jax.jit(jax.vmap(code))(stops, pulls), (results.SUCCESS, results.EVENT)).any()
 
@@ -73,7 +87,9 @@ def test_no_step_is_so_long_that_it_misses_the_loss(backend):
         return _end(_scene(row, 1.0, 0.3), speeds, ts=ts, **options).result
 
     times = jnp.array([[0.1, 0.2, 2.0], [2 / 3, 4 / 3, 2.0]])
-    found = jax.jit(jax.vmap(jax.vmap(code, (None, 0)), (0, None)))(times, jnp.array([1e-3, 1e-4, 1e-5, 1e-6]))
+    found = jax.jit(jax.vmap(jax.vmap(code, (None, 0)), (0, None)))(
+        times, jnp.array([1e-3, 1e-4, 1e-5, 1e-6])
+    )
     assert np.all(found == results.STEP_TOO_SMALL)
 
 
@@ -91,7 +107,12 @@ def test_motions_that_rows_determine_beyond_are_right_or_flagged(name, backend):
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-5, 1e-7])
 def test_slow_motions_are_as_fast_ones(size):
     def end(speeds, pull):
-        return _end(_scene(lambda x, y, z, c: (x**2 + y**2) / size**2 - 1.0, 0.7, pull), speeds, t1=1.0, backend="native")
+        return _end(
+            _scene(lambda x, y, z, c: (x**2 + y**2) / size**2 - 1.0, 0.7, pull),
+            speeds,
+            t1=1.0,
+            backend="native",
+        )
 
     found = end((0.6 * size, 0.8 * size, 0.0), 2.0 * size)
     assert found.result == results.SUCCESS
@@ -137,12 +158,21 @@ SETS_IN = {
     "beyond a place": (True, lambda t, q, u: ramp(q.x - 1.5) * u.x_rate + u.y_rate - 0.1 * u.x_rate),
     "by a step that is flat here": (False, lambda t, q, u: jax.nn.relu(t - 2.0) * u.x_rate),
     "as a drift": (True, lambda t, q, u: u.y_rate - 0.1 * u.x_rate + jnp.maximum(t - 2.0, 0.0)),
-    "by a loop": (True, lambda t, q, u: jax.lax.while_loop(lambda c: c[0] < t - 2.0, lambda c: (c[0] + 1.0, 1.0 + c[1]), (0.0, 0.0))[1] * u.x_rate),
+    "by a loop": (
+        True,
+        lambda t, q, u: (
+            jax.lax.while_loop(lambda c: c[0] < t - 2.0, lambda c: (c[0] + 1.0, 1.0 + c[1]), (0.0, 0.0))[1]
+            * u.x_rate
+        ),
+    ),
 }
 FOLLOWS = {
     "the rail again": (True, lambda t, q, u: 3.0 * u.y_rate - 0.3 * u.x_rate),
     "the rail, times a branch": (True, lambda t, q, u: (1.0 + ramp(t - 2.0)) * (u.y_rate - 0.1 * u.x_rate)),
-    "the rail, times what is flat here": (True, lambda t, q, u: jnp.exp(-jnp.maximum(q.x, 1.5)) * (u.y_rate - 0.1 * u.x_rate)),
+    "the rail, times what is flat here": (
+        True,
+        lambda t, q, u: jnp.exp(-jnp.maximum(q.x, 1.5)) * (u.y_rate - 0.1 * u.x_rate),
+    ),
     "nothing at all": (False, lambda t, q, u: jnp.tanh(t) * u.x_rate - u.x_rate * jnp.tanh(t)),
 }
 
@@ -158,10 +188,17 @@ def slider(case, monkeypatch):
 def test_a_row_that_may_set_in_is_not_left_out(name, monkeypatch):
     scene = slider(SETS_IN[name], monkeypatch)
     assert jj.structure_of(scene).may_set_in == ("late",)
-    with pytest.raises(jj.NotLowered, match="constraints `late` are redundant at all probed states, but not provably everywhere"):
+    with pytest.raises(
+        jj.NotLowered,
+        match="constraints `late` are redundant at all probed states, but not provably everywhere",
+    ):
         jj.lower(scene)
     with pytest.raises(
-        ValueError, match=r"of `Slider` (may become independent during a motion|are nonlinear in the speeds).*use jj.Formulation\('full'\)"
+        ValueError,
+        match=(
+            r"of `Slider` (may become independent during a motion|are nonlinear in the speeds).*use"
+            r" jj.Formulation\('full'\)"
+        ),
     ):
         jj.simulate(scene, {}, t1=1.0, formulation=jj.Formulation("minimal"))
 
@@ -175,7 +212,9 @@ def test_a_row_that_follows_by_an_identity_is_left_out(name, monkeypatch):
 
 @pytest.mark.parametrize("use", ["simulate", "jit", "rollout"])
 def test_a_motion_meets_a_row_that_has_set_in(use, monkeypatch):
-    """The mass would be stopped along x when the row sets in: no motion without an impact, so it ends there with a result code, however it is simulated."""
+    """The mass would be stopped along x when the row sets in: no motion without an impact, so it ends there
+    with a result code, however it is simulated.
+    """
     scene = slider(SETS_IN["in time"], monkeypatch)
 
     def speed(scene):

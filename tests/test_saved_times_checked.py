@@ -1,4 +1,6 @@
-"""Times to save at that no motion can serve are refused where they are known, and end in a result code of their own, lane by lane, where they are traced."""
+"""Times to save at that no motion can serve are refused where they are known, and end in a result code of
+their own, lane by lane, where they are traced.
+"""
 
 import diffrax
 import jax
@@ -20,8 +22,16 @@ WRONG = {
     "against reversed time": {"ts": [0.2, 0.3, 0.4], "t0": 1.0, "t1": 0.0},
     "an empty span": {"ts": [0.5, 0.6, 0.7], "t0": 0.7},
 }
-SHUFFLED = {"out of order": {"ts": [0.0, 0.7, 0.5]}, "twice": {"ts": [0.0, 0.5, 0.5]}, "no number": {"ts": [0.0, np.nan, 0.5]}}
-RIGHT = {"plain": {"ts": [0.0, 0.5, 1.0]}, "reversed": {"ts": [1.0, 0.5, 0.1], "t0": 1.2}, "inside": {"ts": [0.3, 0.5, 0.6], "t0": 0.1, "t1": 0.8}}
+SHUFFLED = {
+    "out of order": {"ts": [0.0, 0.7, 0.5]},
+    "twice": {"ts": [0.0, 0.5, 0.5]},
+    "no number": {"ts": [0.0, np.nan, 0.5]},
+}
+RIGHT = {
+    "plain": {"ts": [0.0, 0.5, 1.0]},
+    "reversed": {"ts": [1.0, 0.5, 0.1], "t0": 1.2},
+    "inside": {"ts": [0.3, 0.5, 0.6], "t0": 0.1, "t1": 0.8},
+}
 
 
 @pytest.mark.parametrize("times", [*WRONG.values(), *SHUFFLED.values()], ids=[*WRONG, *SHUFFLED])
@@ -32,7 +42,9 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
         lambda: jj.rollout(SPRING, {"x": np.array([1.0, 2.0])}, progress=False, **times),
         lambda: jax.jit(lambda x: jj.simulate(SPRING, {"x": x}, **times).q)(1.0),
     ):
-        with pytest.raises(ValueError, match=r"`ts` (runs from|must be finite and strictly)|the span from") as refused:
+        with pytest.raises(
+            ValueError, match=r"`ts` (runs from|must be finite and strictly)|the span from"
+        ) as refused:
             run()
         sentences.append(str(refused.value))
     assert len(set(sentences)) == 1
@@ -42,13 +54,19 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
 def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_state(solver):
     every = [{"t0": 0.0, "t1": times["ts"][-1]} | times for times in (WRONG | SHUFFLED | RIGHT).values()]
     stacked = {name: jnp.array([times[name] for times in every]) for name in ("ts", "t0", "t1")}
-    lanes = jax.jit(jax.vmap(lambda times: jj.simulate(SPRING, START, rtol=1e-7, atol=1e-7, solver=solver, work=False, **times)))(stacked)
+    lanes = jax.jit(
+        jax.vmap(
+            lambda times: jj.simulate(SPRING, START, rtol=1e-7, atol=1e-7, solver=solver, work=False, **times)
+        )
+    )(stacked)
     wrong = len(WRONG) + len(SHUFFLED)
     assert lanes.result.tolist() == [results.BAD_TIMES] * wrong + [results.SUCCESS] * len(RIGHT)
     assert np.isnan(lanes.q[:wrong]).all()
     assert np.isnan(lanes.u[:wrong]).all()
     assert_array_equal(lanes.ts, stacked["ts"])
-    assert_allclose(lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5)
+    assert_allclose(
+        lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5
+    )
     assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
 
 
@@ -72,6 +90,8 @@ def test_even_times_of_any_span_go_together():
     @jax.jit
     @jax.vmap
     def code(t0, t1):
-        return jj.simulate(SPRING.replace(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000).result
+        return jj.simulate(
+            SPRING.replace(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000
+        ).result
 
     assert not np.any(np.asarray(code(*jnp.asarray(ends.T))) == results.BAD_TIMES)

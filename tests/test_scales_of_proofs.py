@@ -1,4 +1,6 @@
-"""What is proved of a scene does not depend on the size of its numbers: nothing is dropped for being small, nothing hidden by what is large elsewhere."""
+"""What is proved of a scene does not depend on the size of its numbers: nothing is dropped for being small,
+nothing hidden by what is large elsewhere.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +28,14 @@ DIFFERENT = {
     "in a divisor": lambda c, x, y, p: (1.0 / (2.0 + y), 1.0 / (2.0 + y + c * jnp.sin(x))),
     "twice": lambda c, x, y, p: (y * p, (y + c * x) * (p + c)),
 }
-# but where a number and its double lie on either side of 2^20, 2^60, 2^100: there what is equal passes for different, which costs operations, never truth
+# but where a number and its double lie on either side of 2^20, 2^60, 2^100: there what is equal passes for
+# different, which costs operations, never truth
 OF_IDENTITIES = [*SCALES[:-1], 1e28]
 EQUAL = {
-    "waves": lambda c, x, y, p: (c * jnp.sin(x + y), c * jnp.sin(x) * jnp.cos(y) + c * jnp.cos(x) * jnp.sin(y)),
+    "waves": lambda c, x, y, p: (
+        c * jnp.sin(x + y),
+        c * jnp.sin(x) * jnp.cos(y) + c * jnp.cos(x) * jnp.sin(y),
+    ),
     "squares": lambda c, x, y, p: (c * (x + y) ** 2, c * x * x + 2.0 * (c * x) * y + (c * y) * y),
     "a factor taken out": lambda c, x, y, p: ((c * x) / (c * y), x / y),
     "a turned plane": lambda c, x, y, p: (c * (jnp.cos(x) ** 2 + jnp.sin(x) ** 2) * p, c * p),
@@ -49,13 +55,17 @@ def test_identities_hold_at_every_scale(name):
 
 def test_a_large_number_elsewhere_hides_nothing():
     def f(x, y, p):
-        return jnp.stack([1e16 * jnp.sin(y) + p, x * 0.0, y]), jnp.stack([1e16 * jnp.sin(y) + p, jnp.sin(x), y])
+        return jnp.stack([1e16 * jnp.sin(y) + p, x * 0.0, y]), jnp.stack(
+            [1e16 * jnp.sin(y) + p, jnp.sin(x), y]
+        )
 
     assert judged(f) == [True, False, True]
 
 
 class Sleigh(jj.Scene):
-    """A knife edge with a row nonlinear in the speeds or not, a drive and a load; lengths, masses and times in any units."""
+    """A knife edge with a row nonlinear in the speeds or not, a drive and a load; lengths, masses and times
+    in any units.
+    """
 
     coordinates = jj.coordinates("x y heading")
     units = (1.0, 1.0, 1.0)  # one metre, kilogram and second, in the units of the scene
@@ -65,26 +75,53 @@ class Sleigh(jj.Scene):
     def domain(self):
         metre, _, second = self.units
         speed = metre / second
-        return {"x": (-metre, metre), "y": (-metre, metre), "x_rate": (-speed, speed), "y_rate": (-speed, speed), "heading_rate": (-1.0 / second, 1.0 / second)}
+        return {
+            "x": (-metre, metre),
+            "y": (-metre, metre),
+            "x_rate": (-speed, speed),
+            "y_rate": (-speed, speed),
+            "heading_rate": (-1.0 / second, 1.0 / second),
+        }
 
     def bodies(self, t, q):
         metre, kilogram, _ = self.units
-        position = jnp.stack([q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0])
-        return {"sleigh": jj.RigidBody(2.0 * kilogram, 0.05 * kilogram * metre**2 * jnp.eye(3), position, jj.rot_z(q.heading))}
+        position = jnp.stack(
+            [q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0]
+        )
+        return {
+            "sleigh": jj.RigidBody(
+                2.0 * kilogram, 0.05 * kilogram * metre**2 * jnp.eye(3), position, jj.rot_z(q.heading)
+            )
+        }
 
     def velocity_constraints(self, motion):
         metre, _, second = self.units
         speed = metre / second
         across = -jnp.sin(motion.q.heading) * motion.u.x_rate + jnp.cos(motion.q.heading) * motion.u.y_rate
-        drift = {"affine": 1e-3 * speed, "homogeneous": 0.0, "nonlinear": 1e-2 * motion.u.heading_rate**2 * second**2 * speed}[self.kind]
+        drift = {
+            "affine": 1e-3 * speed,
+            "homogeneous": 0.0,
+            "nonlinear": 1e-2 * motion.u.heading_rate**2 * second**2 * speed,
+        }[self.kind]
         return {"edge": across + drift}
 
     def loads(self, motion):
         metre, kilogram, second = self.units
-        return (jj.Load(generalized={"heading_rate": 0.1 * kilogram * metre**2 / second**2 * jnp.sin(motion.q.heading)}),)
+        return (
+            jj.Load(
+                generalized={
+                    "heading_rate": 0.1 * kilogram * metre**2 / second**2 * jnp.sin(motion.q.heading)
+                }
+            ),
+        )
 
 
-UNITS = {"m, kg, s": (1.0, 1.0, 1.0), "mm, t, s": (1e3, 1e-3, 1.0), "nm, kg, s": (1e9, 1.0, 1.0), "km, t, h": (1e-3, 1e-3, 1 / 3600)}
+UNITS = {
+    "m, kg, s": (1.0, 1.0, 1.0),
+    "mm, t, s": (1e3, 1e-3, 1.0),
+    "nm, kg, s": (1e9, 1.0, 1.0),
+    "km, t, h": (1e-3, 1e-3, 1 / 3600),
+}
 
 
 @pytest.mark.parametrize("kind", ["affine", "homogeneous", "nonlinear"])
@@ -94,6 +131,13 @@ def test_units_decide_nothing(kind, monkeypatch):
     for name, units in UNITS.items():
         monkeypatch.setattr(Sleigh, "units", units)
         structure, program = jj.structure_of(Sleigh()), jj.lower(Sleigh())
-        said[name] = structure.rank, structure.affine, structure.homogeneous, structure.independent, structure.redundant_rows, program.held
+        said[name] = (
+            structure.rank,
+            structure.affine,
+            structure.homogeneous,
+            structure.independent,
+            structure.redundant_rows,
+            program.held,
+        )
         assert said[name][1:3] == (kind != "nonlinear", kind != "affine")
     assert len(set(said.values())) == 1, said

@@ -1,4 +1,6 @@
-"""What a scene's methods return, and what is handed to the equations, is checked by kind and shape; the error names the method and the thing."""
+"""What a scene's methods return, and what is handed to the equations, is checked by kind and shape; the error
+names the method and the thing.
+"""
 
 import inspect
 
@@ -10,7 +12,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Bead
 
 import jourdain_jax as jj
-from jourdain_jax.equations import coordinate_rates, gibbs_function, kinetic_energy, position_residual, unconstrained_equations, velocity_residual
+from jourdain_jax.equations import (
+    coordinate_rates,
+    gibbs_function,
+    kinetic_energy,
+    position_residual,
+    unconstrained_equations,
+    velocity_residual,
+)
 from jourdain_jax.models import BallOnTurntable, TrailerChain
 
 
@@ -33,7 +42,13 @@ def test_one_load_counts_as_a_tuple_of_one():
 def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_probed():
     tilted = described(loads=lambda self, m: (jj.gravity(m, 9.81, self.mass * jnp.array([0.6, 0.8, 0.0])),))
     jj.simulate(tilted, {}, t1=0.1)
-    with pytest.raises(ValueError, match=r"the direction of gravity in load 1 of `Described` has a length that differs from 1 by .*, expected a unit vector"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"the direction of gravity in load 1 of `Described` has a length that differs from 1 by .*,"
+            r" expected a unit vector"
+        ),
+    ):
         jj.simulate(tilted.replace(mass=1.5), {}, t1=0.1)
     with pytest.raises(ValueError, match=r"the direction of gravity in load 1 of `Described`"):
         jj.accelerations(tilted.replace(mass=1.5), 0.0, np.zeros(2), np.zeros(2))
@@ -55,7 +70,10 @@ def test_a_direction_of_gravity_that_is_traced_hides_nothing_else():
 
 
 def test_lists_and_integers_are_numbers():
-    pulled = described(loads=lambda self, m: (jj.spring(m["bead"].point((0, 0, 0)), jj.fixed_point((0, 0, 1)), 2, 1),), prescribed=lambda self, t: {"y": 0})
+    pulled = described(
+        loads=lambda self, m: (jj.spring(m["bead"].point((0, 0, 0)), jj.fixed_point((0, 0, 1)), 2, 1),),
+        prescribed=lambda self, t: {"y": 0},
+    )
     exact = jj.accelerations(pulled, 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.0]), reduction="svd").udot
     for q in ([1, 0], (1.0, 0.0), np.array([1, 0]), jnp.array([1, 0], jnp.int32)):
         assert_allclose(jj.accelerations(pulled, 0, q, [0, 0], reduction="svd").udot, exact)
@@ -68,7 +86,12 @@ def test_lists_and_integers_are_numbers():
 
 
 def test_a_body_of_integers_has_velocities():
-    whole = described(bodies=lambda self, t, q: {"bead": jj.Particle(1, [q.x, q.y, 0]), "post": jj.RigidBody(1, [1, 1, 1], [0, 0, 0], np.eye(3, dtype=int))})
+    whole = described(
+        bodies=lambda self, t, q: {
+            "bead": jj.Particle(1, [q.x, q.y, 0]),
+            "post": jj.RigidBody(1, [1, 1, 1], [0, 0, 0], np.eye(3, dtype=int)),
+        }
+    )
     assert_allclose(at_rest(whole).udot, [0.0, 0.0])
 
 
@@ -79,7 +102,13 @@ def test_inputs_are_given_by_name_or_as_a_vector():
     assert_array_equal(by_name, jj.accelerations(chain, 0.0, q, u, [0, 2]).udot)
     with pytest.raises(ValueError, match="`TrailerChain` has no input `trun`; did you mean `turn`"):
         jj.accelerations(chain, 0.0, q, u, {"trun": 2.0})
-    with pytest.raises(ValueError, match="input `turn` of `TrailerChain` is a function, expected real numbers; a function of time is for `simulate`"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            "input `turn` of `TrailerChain` is a function, expected real numbers; a function of time is for"
+            " `simulate`"
+        ),
+    ):
         jj.accelerations(chain, 0.0, q, u, {"turn": lambda t: t})
 
 

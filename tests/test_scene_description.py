@@ -1,4 +1,6 @@
-"""A scene's class is read for misspelt methods, names that do not exist and arguments it does not take, before anything is computed."""
+"""A scene's class is read for misspelt methods, names that do not exist and arguments it does not take,
+before anything is computed.
+"""
 
 import equinox as eqx
 import jax
@@ -33,7 +35,13 @@ def described(**members):
     ],
 )
 def test_a_method_whose_name_is_misspelt_does_not_drop_physics_silently(name, meant):
-    with pytest.raises(ValueError, match=f"`Described` has a method `{name}`, which nothing calls; did you mean `{meant}`\\? Rename it, or begin its name"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            f"`Described` has a method `{name}`, which nothing calls; did you mean `{meant}`\\? Rename it, or"
+            " begin its name"
+        ),
+    ):
         described(**{name: lambda self, motion: {}})()
 
 
@@ -99,7 +107,13 @@ def test_a_text_must_be_a_static_field():
     class Labelled(jj.models.Skate):
         label: object = "blue"
 
-    with pytest.raises(ValueError, match=r"field `label` of `Labelled` holds the text 'blue', expected numbers; .*eqx.field\(static=True, default='blue'\)"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"field `label` of `Labelled` holds the text 'blue', expected numbers; .*eqx.field\(static=True,"
+            r" default='blue'\)"
+        ),
+    ):
         Labelled()
 
 
@@ -108,7 +122,12 @@ def test_a_count_or_a_switch_must_be_a_static_field(value):
     class Chain(Bead):
         links: object = value
 
-    with pytest.raises(ValueError, match=rf"field `links` of `Chain` is {value}, which is not a parameter; .*static=True, default={value}"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            rf"field `links` of `Chain` is {value}, which is not a parameter; .*static=True, default={value}"
+        ),
+    ):
         Chain()
 
     class Static(Bead):

@@ -1,8 +1,9 @@
-"""Sensors and actuators in the identification: gain, bias, delay and lag against closed forms, estimates with coverage, what cannot be told, bad input.
+"""Sensors and actuators in the identification: gain, bias, delay and lag against closed forms, estimates with
+coverage, what cannot be told, bad input.
 
-A cart with a spring and a damper is linear, so that its readings are sums of exponentials, also through a delay and a low-pass.
+A cart with a spring and a damper is linear, so that its readings are sums of exponentials, also through a
+delay and a low-pass.
 """
-
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,9 @@ IDEAL = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}
 
 
 def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, order=1, x0=0.3):
-    """What a sensor shows of x (order 0) or v (order 1) of the cart let go at x0: x = Re(C exp(s t)), through `lag y' + y = x` from rest."""
+    """What a sensor shows of x (order 0) or v (order 1) of the cart let go at x0: x = Re(C exp(s t)), through
+    `lag y' + y = x` from rest.
+    """
     rate = damping / (2 * mass)
     s = -rate + 1j * np.sqrt(STIFFNESS / mass - rate**2)
     C = x0 * (1 - 1j * rate / s.imag) * s**order
@@ -35,15 +38,32 @@ def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=
     return gain * (lagged + rest) + bias
 
 
-def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers) -> jj.Experiment:
-    """Place by an ideal sensor and speed by one with these `numbers`, in truth `truth`; samples before `SEEN` are missing from the latter."""
+def run(
+    seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers
+) -> jj.Experiment:
+    """Place by an ideal sensor and speed by one with these `numbers`, in truth `truth`; samples before `SEEN`
+    are missing from the latter.
+    """
     noise = np.random.default_rng(seed)
     since = ts - ts[0]
-    values = {"x": shown(since, order=0, x0=x0), "gyro": np.where(since < SEEN, np.nan, shown(since, x0=x0, **truth))}
+    values = {
+        "x": shown(since, order=0, x0=x0),
+        "gyro": np.where(since < SEEN, np.nan, shown(since, x0=x0, **truth)),
+    }
     if seed is not None:
-        values = {name: x + s * noise.normal(size=(*repeats, len(ts))) for (name, x), s in zip(values.items(), (0.002, sigma), strict=True)}
+        values = {
+            name: x + s * noise.normal(size=(*repeats, len(ts)))
+            for (name, x), s in zip(values.items(), (0.002, sigma), strict=True)
+        }
     sensors = {"gyro": Sensor("x_rate", **(truth | numbers))}
-    return jj.Experiment(ts, values, {"x": 0.002, "gyro": sigma}, start={"x": x0, "x_rate": 0.0}, sensors=sensors, unknown_start=unknown_start)
+    return jj.Experiment(
+        ts,
+        values,
+        {"x": 0.002, "gyro": sigma},
+        start={"x": x0, "x_rate": 0.0},
+        sensors=sensors,
+        unknown_start=unknown_start,
+    )
 
 
 GAIN = jj.Estimate(1.0)
@@ -52,7 +72,7 @@ DELAY = jj.Estimate(0.05, range=jj.bounds(0.0, SEEN))
 LAG = jj.Estimate(0.05)
 
 
-# Readings of known quantities. ------------------------------------------------------------------------------------------
+# Readings of known quantities. ------------------------------------------------------------------------------
 
 
 def wave(t, w=3.0):
@@ -61,12 +81,21 @@ def wave(t, w=3.0):
 
 def lagged_wave(ts, delay, lag, w=3.0):
     """The wave through a low-pass that starts at rest at time zero."""
-    steady = lambda t: (np.sin(w * t + 0.4) - w * lag * np.cos(w * t + 0.4)) / (1 + (w * lag) ** 2)  # noqa: E731
+    steady = lambda t: (np.sin(w * t + 0.4) - w * lag * np.cos(w * t + 0.4)) / (1 + (w * lag) ** 2)
     t = ts - delay
     return steady(t) + ((wave(0.0) - steady(0.0)) * np.exp(-t / lag) if lag else 0.0)
 
 
-LAGS = (0.0, 1e-6, 1e-3, 0.009, 0.0099, 0.0101, 0.1, 3.0)  # s; of the coarser grid below, 0.01 s is where the formula changes
+LAGS = (
+    0.0,
+    1e-6,
+    1e-3,
+    0.009,
+    0.0099,
+    0.0101,
+    0.1,
+    3.0,
+)  # s; of the coarser grid below, 0.01 s is where the formula changes
 
 
 @pytest.mark.parametrize("lag", LAGS)
@@ -78,7 +107,10 @@ def test_a_reading_through_delay_and_lag_is_the_closed_form(lag):
         assert error < 0.02 * (3.0 * grid[1]) ** 6 + 1e-12, (count, error)
     inside = ts[(ts > 0.6) & (ts < 3.5)]
     grid = np.linspace(0.0, 4.0, 81)
-    assert np.abs(read(wave(grid), grid, inside, 0.123)[0] - wave(inside - 0.123)).max() < 0.005 * (3.0 * grid[1]) ** 6
+    assert (
+        np.abs(read(wave(grid), grid, inside, 0.123)[0] - wave(inside - 0.123)).max()
+        < 0.005 * (3.0 * grid[1]) ** 6
+    )
 
 
 @pytest.mark.parametrize(("order", "inside", "at_the_ends"), [(1, 0.18, 0.26), (2, 0.032, 0.075)])
@@ -88,7 +120,13 @@ def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, insid
     reading = jax.jit(lambda values: read(values, grid, ts, 0.0)[0])
     # max(t - c, 0)^order / order!: the derivative of this order jumps by one at c
     errors = {
-        c: np.abs(reading(np.maximum(grid - h * c, 0) ** order / order) - np.maximum(ts - h * c, 0) ** order / order).max() for c in np.arange(0, 20, 0.05)
+        c: (
+            np.abs(
+                reading(np.maximum(grid - h * c, 0) ** order / order)
+                - np.maximum(ts - h * c, 0) ** order / order
+            ).max()
+        )
+        for c in np.arange(0, 20, 0.05)
     }
     assert max(error for c, error in errors.items() if c > 3) == pytest.approx(inside * h**order, rel=0.03)
     assert max(errors.values()) == pytest.approx(at_the_ends * h**order, rel=0.03)
@@ -106,13 +144,19 @@ def test_a_command_through_a_low_pass_is_exact_at_its_samples(lag):
     assert_allclose(found, np.interp(ts, fine, y), atol=1e-12)
 
 
-# Estimates. -------------------------------------------------------------------------------------------------------------
+# Estimates. -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("names", [("gain", "bias"), ("delay",), ("lag",), ("gain", "bias", "delay", "lag")])
 def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
     asked = {"gain": GAIN, "bias": jj.Estimate(0.0), "delay": DELAY, "lag": LAG}
-    found = jj.fit(Cart(mass=1.8), run(**{name: asked[name] for name in names}), ("mass", "damping"), rtol=1e-10, atol=1e-10)
+    found = jj.fit(
+        Cart(mass=1.8),
+        run(**{name: asked[name] for name in names}),
+        ("mass", "damping"),
+        rtol=1e-10,
+        atol=1e-10,
+    )
     assert found.converged
     assert found.labels == ("mass", "damping", *(f"gyro.{name}" for name in sorted(names)))
     expected = [MASS, DAMPING, *(TRUTH[name] for name in sorted(names))]
@@ -123,39 +167,78 @@ def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
 
     def residual(theta):
         numbers = TRUTH | dict(zip(sorted(names), theta[2:], strict=True))
-        return np.concatenate([shown(TS, *theta[:2], order=0) / 0.002, shown(TS, *theta[:2], **numbers)[counted] / 0.005])
+        return np.concatenate(
+            [shown(TS, *theta[:2], order=0) / 0.002, shown(TS, *theta[:2], **numbers)[counted] / 0.005]
+        )
 
-    J = np.stack([(residual(expected + h) - residual(expected - h)) / 2e-5 for h in 1e-5 * np.eye(len(expected))], axis=1)
+    J = np.stack(
+        [(residual(expected + h) - residual(expected - h)) / 2e-5 for h in 1e-5 * np.eye(len(expected))],
+        axis=1,
+    )
     assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
 
 
 def test_a_bias_of_each_run_and_a_delay_that_all_share():
     biases, ts = (0.05, -0.02, 0.3), np.linspace(1.0, 4.0, 61)
     runs = [
-        run(k, truth=TRUTH | {"bias": bias}, ts=ts[: 61 - 7 * k], x0=0.3 - 0.1 * k, sigma=1e-4, gain=GAIN, bias=BIAS, delay=DELAY)
+        run(
+            k,
+            truth=TRUTH | {"bias": bias},
+            ts=ts[: 61 - 7 * k],
+            x0=0.3 - 0.1 * k,
+            sigma=1e-4,
+            gain=GAIN,
+            bias=BIAS,
+            delay=DELAY,
+        )
         for k, bias in enumerate(biases)
     ]
     found = jj.fit(Cart(), runs, ("damping",))
     assert found.labels == ("damping", "gyro.delay", "gyro.gain", *(f"run {k}: gyro.bias" for k in range(3)))
     assert found.converged
-    for name, value in [("gyro.delay", 0.07), ("gyro.gain", 1.2), *((f"run {k}: gyro.bias", bias) for k, bias in enumerate(biases))]:
+    for name, value in [
+        ("gyro.delay", 0.07),
+        ("gyro.gain", 1.2),
+        *((f"run {k}: gyro.bias", bias) for k, bias in enumerate(biases)),
+    ]:
         assert abs(found[name].value - value) < 4 * found[name].standard_error, name
         assert found[name].standard_error < 0.02
 
 
 def test_a_sensor_shows_functions_and_coordinates_under_other_names():
-    seen = {"place": lambda motion: motion["cart"].position, "encoder": "x", "x_rate": Sensor(gain=jj.Estimate(1.0))}
+    seen = {
+        "place": lambda motion: motion["cart"].position,
+        "encoder": "x",
+        "x_rate": Sensor(gain=jj.Estimate(1.0)),
+    }
     x, v = shown(TS, order=0), shown(TS, gain=1.3)
     values = {"place": np.stack([x, 0 * x, 0 * x], axis=1), "encoder": x, "x_rate": v}
-    found = jj.fit(Cart(mass=1.8), jj.Experiment(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
+    found = jj.fit(
+        Cart(mass=1.8),
+        jj.Experiment(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen),
+        ("mass",),
+    )
     assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
     # a gain and a bias for each component
-    each = Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
-    bent = jj.Experiment(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
+    each = Sensor(
+        lambda motion: motion["cart"].position,
+        gain=jj.Estimate((1.0, 1.0, 1.0)),
+        bias=jj.Estimate((0.0, 0.0, 0.0)),
+        delay=0.0,
+    )
+    bent = jj.Experiment(
+        TS,
+        {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])},
+        0.01,
+        start={"x": 0.3, "x_rate": 0.0},
+        sensors={"place": each},
+    )
     found = jj.fit(Cart(), bent, ())
     assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
     assert found["place.gain[0]"].value == pytest.approx(0.9, rel=1e-6)
-    assert {"no channel depends on `place.gain[1]`", "no channel depends on `place.gain[2]`"} == set(found.not_identifiable)
+    assert {"no channel depends on `place.gain[1]`", "no channel depends on `place.gain[2]`"} == set(
+        found.not_identifiable
+    )
 
 
 class Swing(jj.Scene):
@@ -166,7 +249,9 @@ class Swing(jj.Scene):
     coordinates = jj.coordinates("turn")
 
     def bodies(self, t, q):
-        return {"arm": jj.RigidBody(jnp.asarray(1.0), self.inertia * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))}
+        return {
+            "arm": jj.RigidBody(jnp.asarray(1.0), self.inertia * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))
+        }
 
     def loads(self, motion):
         return (jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn),)
@@ -185,13 +270,25 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
         sensor, missing = Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
         shown = np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
         rough = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
-    data = jj.Experiment(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
+    data = jj.Experiment(
+        TS,
+        {"imu": np.where(missing[:, None], np.nan, shown)},
+        0.01,
+        start={"turn": 0.7},
+        sensors={"imu": sensor},
+    )
     found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
     assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + rough)
     if late:
         assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
     bad = jj.Experiment(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": Accelerometer("arn")})
-    with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` is on body `arn`, which does not exist; did you mean `arm`"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            "the accelerometer `imu` of run 0 of `Swing` is on body `arn`, which does not exist; did you mean"
+            " `arm`"
+        ),
+    ):
         jj.fit(Swing(), bad, ("stiffness",))
 
 
@@ -199,7 +296,9 @@ def test_a_load_cell_shows_what_the_ground_bears():
     cell, start = LoadCell("rim"), {"heading_rate": 0.5, "roll_rate": 4.0}
     motion = jj.simulate(jj.models.VerticalDisc(mass=1.3), start, ts=TS, rtol=1e-10, atol=1e-10)
     force, felt = cell.over_times(motion), Accelerometer("disc").over_times(motion)
-    assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
+    assert_allclose(
+        force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9
+    )  # F = m (a - g)
 
 
 def test_a_delay_that_is_not_there_is_at_its_bound():
@@ -210,15 +309,24 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
 
 
 def late(seed, lag, delay=0.05, tau=0.05) -> jj.Experiment:
-    """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau` that is known or not."""
-    values = np.where(TS < SEEN, np.nan, shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)))
+    """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau`
+    that is known or not.
+    """
+    values = np.where(
+        TS < SEEN,
+        np.nan,
+        shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)),
+    )
     sensor = Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
     return jj.Experiment(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
 
 
 def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
     # at a lag of zero a longer delay does the same, to first order: a saddle on the bound
-    near, far = (jj.fit(Cart(), late(0, 0.1, *guess), ("mass",)) for guess in ((0.07, jj.Estimate(0.1)), (0.17, jj.Estimate(1e-4))))
+    near, far = (
+        jj.fit(Cart(), late(0, 0.1, *guess), ("mass",))
+        for guess in ((0.07, jj.Estimate(0.1)), (0.17, jj.Estimate(1e-4)))
+    )
     assert far.converged
     assert not far.warnings
     assert far.chi_square == pytest.approx(float(near.chi_square), rel=1e-6)
@@ -233,42 +341,62 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     held = jj.fit(Cart(), late(0, 0.0, tau=float(found["late.lag"].high)), ("mass",))
     assert float(held.chi_square - found.chi_square) == pytest.approx(3.841, rel=0.05)
     assert held["late.delay"].value < found["late.delay"].low
-    assert found.warning.startswith("the interval of `late.delay` is too narrow: with `late.lag` off its bound")
+    assert found.warning.startswith(
+        "the interval of `late.delay` is too narrow: with `late.lag` off its bound"
+    )
     assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
     assert near["late.lag"].low > 0.0
-    assert near.warning.startswith("the interval of `late.lag` is too narrow, and others may be: up to a nearby bound")
+    assert near.warning.startswith(
+        "the interval of `late.lag` is too narrow, and others may be: up to a nearby bound"
+    )
 
 
 def test_other_numbers_of_a_sensor_compile_nothing(compilations):
     for seed, delay in ((5, 0.05), (6, 0.03)):
         compilations.clear()
-        found = jj.fit(Cart(mass=1.8), [run(seed, delay=jj.Estimate(delay, range=jj.bounds(0.0, 0.15)), gain=1.0 + 0.1 * seed)], ("mass",))
+        found = jj.fit(
+            Cart(mass=1.8),
+            [run(seed, delay=jj.Estimate(delay, range=jj.bounds(0.0, 0.15)), gain=1.0 + 0.1 * seed)],
+            ("mass",),
+        )
         assert found.converged
     assert not compilations
 
 
-# What is known beforehand. ------------------------------------------------------------------------------------------------
+# What is known beforehand. ----------------------------------------------------------------------------------
 
 
 def test_a_prior_counts_as_a_measurement():
     data = run(7)
-    free, known = jj.fit(Cart(), data, ("mass",)), jj.fit(Cart(), data, {"mass": jj.Estimate(prior=Normal(2.005, 0.003))})
+    free, known = (
+        jj.fit(Cart(), data, ("mass",)),
+        jj.fit(Cart(), data, {"mass": jj.Estimate(prior=Normal(2.005, 0.003))}),
+    )
     value, error = float(free["mass"].value), float(free["mass"].standard_error)
     weights = np.array([error**-2, 0.003**-2])
     assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
     assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
     assert known.samples == free.samples
     assert not known.warnings
-    assert jj.fit(Cart(), data, {"mass": Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
+    assert jj.fit(Cart(), data, {"mass": Normal(2.1, 0.01)}).warning.startswith(
+        "`mass` lies 9.9 standard deviations from its prior"
+    )
 
 
 def test_priors_of_starts_and_of_numbers_of_single_runs():
     def one(k, prior):
         start = {"x": jj.Estimate(prior=Normal(0.3, prior))}
-        return run(10 + k, sigma=0.01, unknown_start=start, bias=jj.Estimate(0.0, per_run=True, prior=Normal(0.05, prior)))
+        return run(
+            10 + k,
+            sigma=0.01,
+            unknown_start=start,
+            bias=jj.Estimate(0.0, per_run=True, prior=Normal(0.05, prior)),
+        )
 
-    loose, tight = (jj.fit(Cart(mass=1.9), [one(k, prior) for k in range(3)], ("mass",)) for prior in (1e3, 1e-6))
+    loose, tight = (
+        jj.fit(Cart(mass=1.9), [one(k, prior) for k in range(3)], ("mass",)) for prior in (1e3, 1e-6)
+    )
     assert loose.labels == tight.labels
     for k in range(3):
         assert tight[f"run {k}: gyro.bias"].value == pytest.approx(0.05, abs=1e-6)
@@ -280,16 +408,30 @@ def test_priors_of_starts_and_of_numbers_of_single_runs():
     assert_allclose(tight["mass"].standard_error, fixed["mass"].standard_error, rtol=1e-3)
 
 
-# What cannot be told. -----------------------------------------------------------------------------------------------------
+# What cannot be told. ---------------------------------------------------------------------------------------
 
 
 def pushed(sensor, actuator, ts=TS) -> jj.Experiment:
     """The cart at rest, pushed: place and speed as simulated."""
     knots = np.linspace(0.0, 4.0, 41)
     command = np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0)
-    motion = jj.simulate(Cart(), {"x": 0.0, "x_rate": 0.0}, ts=ts, inputs={"push": jj.Sampled(knots, 1.5 * command)}, rtol=1e-10, atol=1e-10)
+    motion = jj.simulate(
+        Cart(),
+        {"x": 0.0, "x_rate": 0.0},
+        ts=ts,
+        inputs={"push": jj.Sampled(knots, 1.5 * command)},
+        rtol=1e-10,
+        atol=1e-10,
+    )
     inputs = {"push": Actuator(jj.Sampled(knots, command), **actuator)}
-    return jj.Experiment(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": Sensor(**sensor)})
+    return jj.Experiment(
+        ts,
+        {"x": motion["x"]},
+        0.001,
+        start={"x": 0.0, "x_rate": 0.0},
+        inputs=inputs,
+        sensors={"x": Sensor(**sensor)},
+    )
 
 
 def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_them():
@@ -298,14 +440,17 @@ def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_
     found = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1)}, {"gain": 1.5}), names)
     (sentence,) = found.not_identifiable
     assert all(f"`{name}`" in sentence for name in (*names, "x.gain"))
-    assert "d mass/mass : d damping/damping : d stiffness/stiffness : d x.gain/x.gain = 1 : 1 : 1 : 1" in sentence
+    assert (
+        "d mass/mass : d damping/damping : d stiffness/stiffness : d x.gain/x.gain = 1 : 1 : 1 : 1"
+        in sentence
+    )
     known = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1, prior=Normal(1.0, 0.02))}, {"gain": 1.5}), names)
     assert known.not_identifiable == ()
     assert known["x.gain"].standard_error == pytest.approx(0.02, rel=1e-3)
     assert known["mass"].standard_error / known["mass"].value == pytest.approx(0.02, rel=0.05)
 
 
-# Actuators. ---------------------------------------------------------------------------------------------------------------
+# Actuators. -------------------------------------------------------------------------------------------------
 
 
 def driven(truth, **asked) -> jj.Experiment:
@@ -313,10 +458,20 @@ def driven(truth, **asked) -> jj.Experiment:
     knots = np.linspace(0.0, 4.0, 41)
     command = jj.Sampled(knots, np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0))
     late = np.asarray(knots) + truth["delay"]
-    signal = jj.Sampled(late, truth["gain"] * filtered(command.ts, command.values, truth["lag"]) + truth["bias"])
-    motion = jj.simulate(Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10)
+    signal = jj.Sampled(
+        late, truth["gain"] * filtered(command.ts, command.values, truth["lag"]) + truth["bias"]
+    )
+    motion = jj.simulate(
+        Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10
+    )
     inputs = {"push": Actuator(command, **(truth | asked))}
-    return jj.Experiment(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
+    return jj.Experiment(
+        TS,
+        {"x": motion["x"], "x_rate": motion["x_rate"]},
+        0.001,
+        start={"x": 0.3, "x_rate": 0.0},
+        inputs=inputs,
+    )
 
 
 class Mass(OnLine):
@@ -329,7 +484,9 @@ class Mass(OnLine):
 
 
 def speeds_of_held(knots, command, ts, lag=0.0):
-    """Speed from rest under a command that holds, by integrals of constants, or of exponentials, over its intervals."""
+    """Speed from rest under a command that holds, by integrals of constants, or of exponentials, over its
+    intervals.
+    """
     found = []
     for t in ts:
         y, speed = command[0], 0.0
@@ -337,32 +494,54 @@ def speeds_of_held(knots, command, ts, lag=0.0):
             h = min(knots[k + 1] if k + 1 < len(knots) else np.inf, t) - begin
             if h > 0:
                 decay = np.exp(-h / lag) if lag else 0.0
-                speed, y = speed + command[k] * h + lag * (y - command[k]) * (1 - decay), command[k] + (y - command[k]) * decay
+                speed, y = (
+                    speed + command[k] * h + lag * (y - command[k]) * (1 - decay),
+                    command[k] + (y - command[k]) * decay,
+                )
         found.append(speed)
     return np.array(found)
 
 
 def fitted(actuator, ts, speeds):
-    data = jj.Experiment(ts, {"x_rate": speeds}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    data = jj.Experiment(
+        ts, {"x_rate": speeds}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator}
+    )
     return jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
 
 
 def test_a_command_that_holds_keeps_each_value_until_the_next():
-    knots, command, ts = np.linspace(0.0, 2.0, 11), np.random.default_rng(0).normal(size=11), np.linspace(0.0, 2.0, 41)
+    knots, command, ts = (
+        np.linspace(0.0, 2.0, 11),
+        np.random.default_rng(0).normal(size=11),
+        np.linspace(0.0, 2.0, 41),
+    )
     delay = 0.03
     exact = speeds_of_held(knots + delay, command, ts) + command[0] * np.minimum(ts, delay)
     # the speed differs from that of a command which is linear in between
-    linear = np.array([np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001)) for t in ts])
+    linear = np.array(
+        [
+            np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001))
+            for t in ts
+        ]
+    )
     assert np.max(np.abs(exact - linear)) > 0.05
-    actuator = Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
+    actuator = Actuator(
+        jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True
+    )
     found = fitted(actuator, ts, 1.3 * exact)
     assert found.converged
     assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
-    assert max(np.abs(found.residuals[0]["x_rate"])) < 0.05  # of a sigma: samples within half a passage see it
+    assert (
+        max(np.abs(found.residuals[0]["x_rate"])) < 0.05
+    )  # of a sigma: samples within half a passage see it
 
 
 def test_a_lag_after_a_command_that_holds():
-    knots, command, ts = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41), np.linspace(0.0, 2.0, 41)
+    knots, command, ts = (
+        np.linspace(0.0, 2.0, 41),
+        np.random.default_rng(0).normal(size=41),
+        np.linspace(0.0, 2.0, 41),
+    )
     exact = speeds_of_held(knots, command, ts, lag=0.1)
     actuator = Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
     found = fitted(actuator, ts, exact)
@@ -382,7 +561,7 @@ def test_an_actuator_with_known_numbers_is_an_input_like_any_other():
     assert found["mass"].value == pytest.approx(MASS, rel=1e-6)
 
 
-# Likelihood. --------------------------------------------------------------------------------------------------------------
+# Likelihood. ------------------------------------------------------------------------------------------------
 
 
 def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
@@ -395,13 +574,25 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
 
     def by_hand(numbers):
         data = run(8)
-        r = np.concatenate([(shown(TS, order=0) - data.values["x"]) / 0.002, (shown(TS, **numbers) - data.values["gyro"])[counted] / 0.005])
-        return -0.5 * np.sum(r**2) - 81 * np.log(0.002) - counted.sum() * np.log(0.005) - 0.5 * len(r) * np.log(2 * np.pi)
+        r = np.concatenate(
+            [
+                (shown(TS, order=0) - data.values["x"]) / 0.002,
+                (shown(TS, **numbers) - data.values["gyro"])[counted] / 0.005,
+            ]
+        )
+        return (
+            -0.5 * np.sum(r**2)
+            - 81 * np.log(0.002)
+            - counted.sum() * np.log(0.005)
+            - 0.5 * len(r) * np.log(2 * np.pi)
+        )
 
     assert float(value(numbers)) == pytest.approx(by_hand(TRUTH), rel=1e-5)
     for name in TRUTH:
         step = 1e-4
-        expected = (by_hand(TRUTH | {name: TRUTH[name] + step}) - by_hand(TRUTH | {name: TRUTH[name] - step})) / (2 * step)
+        expected = (
+            by_hand(TRUTH | {name: TRUTH[name] + step}) - by_hand(TRUTH | {name: TRUTH[name] - step})
+        ) / (2 * step)
         assert float(slopes[name]) == pytest.approx(expected, rel=1e-3, abs=1e-2), name
 
 
@@ -410,9 +601,14 @@ def test_the_page_on_identification_runs(tmp_path, monkeypatch):
     names = pages.run(pages.DOCS / "howto" / "identification.md", jj=jj, jnp=jnp, np=np)
     found = names["found"]
     assert found.converged
-    for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):
+    for name, value in (
+        ("gyro.gain", 1.1),
+        ("gyro.delay", 0.05),
+        ("run 0: gyro.bias", 0.02),
+        ("offset", 0.25),
+    ):
         assert abs(found[name].value - value) < 4 * found[name].standard_error + 1e-3, name
     assert 0.05 < names["wider"].correlation_time["x"] < 0.9  # s; 0.22 s is true
 
 
-# Bad input. -----------------------------------------------------------------------------------------------------------------
+# Bad input. -------------------------------------------------------------------------------------------------

@@ -38,7 +38,12 @@ class Rolling(jj.Scene):
         return {"table": jj.ball_contact(pose["ball"], self.radius)}
 
     def visuals(self, pose):
-        return {"": [jj.Visual.line(jnp.zeros(3), pose["ball"].position, radius=0.01), jj.Visual.box((1.4, 0.5, 0.02), at=(0.0, 0.0, -0.01))]}
+        return {
+            "": [
+                jj.Visual.line(jnp.zeros(3), pose["ball"].position, radius=0.01),
+                jj.Visual.box((1.4, 0.5, 0.02), at=(0.0, 0.0, -0.01)),
+            ]
+        }
 
 
 @pytest.fixture(scope="module")
@@ -77,14 +82,20 @@ def test_a_page_holds_the_poses_that_the_scene_has(motion, shown):
     assert_allclose(numbers(ball["p"]).reshape(-1, 3), expected.position, atol=1e-6)
     for q, R in zip(numbers(ball["q"]).reshape(-1, 4), expected.orientation, strict=True):
         assert_allclose(matrix(q), R, atol=1e-6)
-    assert [(shape["kind"], shape["size"]) for shape in ball["shapes"]] == [("ellipsoid", [0.1, 0.1, 0.1])]  # known from its contact
+    assert [(shape["kind"], shape["size"]) for shape in ball["shapes"]] == [
+        ("ellipsoid", [0.1, 0.1, 0.1])
+    ]  # known from its contact
     rope, table = frame["shapes"]
     assert_allclose(numbers(rope["points"]).reshape(-1, 2, 3)[:, 1], expected.position, atol=1e-6)
     assert (table["kind"], len(numbers(table["p"]))) == ("box", 3)
     (path,), (force,) = one["paths"], one["forces"]
-    assert_allclose(numbers(path["points"]).reshape(-1, 3), np.asarray(expected.position) - [0, 0, 0.1], atol=1e-6)
+    assert_allclose(
+        numbers(path["points"]).reshape(-1, 3), np.asarray(expected.position) - [0, 0, 0.1], atol=1e-6
+    )
     arrows = numbers(force["vectors"]).reshape(-1, 3)
-    assert_allclose(arrows / np.linalg.norm(arrows, axis=1)[:, None], np.tile([0.0, 0.0, 1.0], (9, 1)), atol=1e-6)
+    assert_allclose(
+        arrows / np.linalg.norm(arrows, axis=1)[:, None], np.tile([0.0, 0.0, 1.0], (9, 1)), atol=1e-6
+    )
     assert "longest arrow: 19.6 N" in page["note"]  # 2 kg
     (ground,) = page["grounds"]
     assert (ground["kind"], ground["p"][2]) == ("plane", 0.0)
@@ -92,8 +103,12 @@ def test_a_page_holds_the_poses_that_the_scene_has(motion, shown):
 
 def test_a_page_asks_for_nothing_beyond_itself_and_is_small(shown):
     assert len(shown.html) < 1e6
-    code = zlib.decompress(base64.b64decode(re.search(r'id="three" type="text/plain">(.*?)<', shown.html)[1])).decode()
-    assert set(re.findall(r"https?://[^\"'` )]*", shown.html + code)) == {"http://www.w3.org/1999/xhtml"}  # the name of a format, no address
+    code = zlib.decompress(
+        base64.b64decode(re.search(r'id="three" type="text/plain">(.*?)<', shown.html)[1])
+    ).decode()
+    assert set(re.findall(r"https?://[^\"'` )]*", shown.html + code)) == {
+        "http://www.w3.org/1999/xhtml"
+    }  # the name of a format, no address
     assert set(re.findall(r'(?:src|href)="([^"]*)"', shown.html)) == {"data:,"}
     assert not re.search(r"\bimport\(|XMLHttpRequest|@import", shown.html + code)
 
@@ -104,10 +119,14 @@ def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
 
         def loads(self, motion):
             blow = 1e4 * jnp.exp(-(((motion.t - 1.0) / 0.01) ** 2))
-            return jj.gravity(motion, 9.81), jj.point_force(motion["ball"].point(), jnp.stack([0.0, 0.0, -1.0]) * blow)
+            return jj.gravity(motion, 9.81), jj.point_force(
+                motion["ball"].point(), jnp.stack([0.0, 0.0, -1.0]) * blow
+            )
 
     struck = Struck()
-    page, numbers = contents(jj.show(jj.simulate(struck, jj.start(struck, **struck.example), ts=jnp.linspace(0.0, 2.0, 41))).html)
+    page, numbers = contents(
+        jj.show(jj.simulate(struck, jj.start(struck, **struck.example), ts=jnp.linspace(0.0, 2.0, 41))).html
+    )
     (force,) = page["motions"][0]["forces"]
     lengths = np.linalg.norm(numbers(force["vectors"]).reshape(-1, 3), axis=1)
     weight = 2.0 * 9.81
@@ -136,7 +155,13 @@ def test_whole_turns_between_saved_times_are_kept():
 
 
 def test_lanes_and_lists_lie_over_one_another():
-    lanes = jj.rollout(jj.models.ChaplyginSleigh(), {"heading_rate": np.linspace(0.5, 2.0, 20)}, t1=0.5, ts=np.linspace(0, 0.5, 5), progress=False)
+    lanes = jj.rollout(
+        jj.models.ChaplyginSleigh(),
+        {"heading_rate": np.linspace(0.5, 2.0, 20)},
+        t1=0.5,
+        ts=np.linspace(0, 0.5, 5),
+        progress=False,
+    )
     page, _ = contents(jj.show(lanes).html)
     assert len(page["motions"]) == 12
     page, _ = contents(jj.show([lanes.lane(0), lanes.lane(7)], follow=True).html)
@@ -195,7 +220,11 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
         coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
         def bodies(self, t, q):
-            return {"ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude))}
+            return {
+                "ball": jj.RigidBody.ball(
+                    1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude)
+                )
+            }
 
         def contacts(self, pose):
             return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=make(), height="row")}
@@ -206,7 +235,9 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)
     assert corners[:, 2].min() == pytest.approx(lowest, abs=2e-3)
-    assert_allclose([float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
+    assert_allclose(
+        [float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5
+    )
 
 
 @needs_browser
@@ -215,7 +246,9 @@ def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     jj.show(motion, tmp_path / "ball.html", colours={"ball": RED}, view=(30.0, -90.0), forces=False, paths=[])
     places = []
     for t in (0.0, 1.0, 2.0):
-        pixels = screenshot(f"file://{tmp_path}/ball.html#t={t}", tmp_path / f"{t}.png")[80:]  # below the labels, which have the body's colour too
+        pixels = screenshot(f"file://{tmp_path}/ball.html#t={t}", tmp_path / f"{t}.png")[
+            80:
+        ]  # below the labels, which have the body's colour too
         red = (pixels[..., 0] > 0.15) & (pixels[..., 1:].max(axis=-1) < 0.5 * pixels[..., 0])
         assert 200 < red.sum() < 0.1 * red.size
         columns = np.flatnonzero(red.sum(axis=0) > 2)
@@ -225,7 +258,9 @@ def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     assert places[0] < 0.3
 
 
-@pytest.mark.parametrize(("view", "hidden"), [("above", "z"), ("side", "y"), ("space", ""), ((20.0, -50.0), "")])
+@pytest.mark.parametrize(
+    ("view", "hidden"), [("above", "z"), ("side", "y"), ("space", ""), ((20.0, -50.0), "")]
+)
 def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path, drawn, view, hidden):
     draw_still(motion, tmp_path / "ball.png", view=view, at=2)
     (axes,) = drawn[0].axes
@@ -241,12 +276,19 @@ FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 
 
 def write_obj(path):
-    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + ["f " + " ".join(str(i + 1) for i in face) for face in FACES]
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + [
+        "f " + " ".join(str(i + 1) for i in face) for face in FACES
+    ]
     path.write_text("\n".join(lines) + "\n")
 
 
 def write_stl(path):
-    facets = ["facet normal 0 0 0\nouter loop\n" + "\n".join("vertex {} {} {}".format(*CORNERS[i]) for i in face) + "\nendloop\nendfacet" for face in FACES]
+    facets = [
+        "facet normal 0 0 0\nouter loop\n"
+        + "\n".join("vertex {} {} {}".format(*CORNERS[i]) for i in face)
+        + "\nendloop\nendfacet"
+        for face in FACES
+    ]
     path.write_text("solid part\n" + "\n".join(facets) + "\nendsolid part\n")
 
 
@@ -269,7 +311,9 @@ def test_a_mesh_of_a_file_has_its_faces_in_metres(name, tmp_path):
     look = jj.Visual.from_file(tmp_path / name, scale=0.001, at=(0.0, 0.0, 0.1), colour="#ff8000")
     assert (look.kind, look.colour) == ("mesh", "#ff8000")
     assert_allclose(look.position, [0.0, 0.0, 0.1])
-    assert triangles(look.faces.corners * np.asarray(look.size), look.faces.polygons) == triangles(0.001 * CORNERS, FACES)
+    assert triangles(look.faces.corners * np.asarray(look.size), look.faces.polygons) == triangles(
+        0.001 * CORNERS, FACES
+    )
 
 
 def test_a_mesh_in_the_visuals_of_a_scene_is_drawn_with_its_body(tmp_path):
@@ -299,7 +343,12 @@ def test_a_file_without_a_mesh_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read a mesh from `.*gone\.stl`: there is no such file"):
         jj.Visual.from_file(tmp_path / "gone.stl")
     (tmp_path / "part.xyzw").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match=r"cannot read a mesh from `.*part\.xyzw`: .*not supported.*; give a file such as \.stl or \.obj"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"cannot read a mesh from `.*part\.xyzw`: .*not supported.*; give a file such as \.stl or \.obj"
+        ),
+    ):
         jj.Visual.from_file(tmp_path / "part.xyzw")
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
     with pytest.raises(ValueError, match=r"`.*points\.obj` has no faces, expected a mesh"):

@@ -142,13 +142,28 @@ def both(*truths):
 
 # how hard a patch brakes a bead that crosses it on its way x = t, y = 0.4 t; few probed states are on it
 PATCHES = {
-    "one condition": lambda s, t, x, y: jnp.where((x > s.a) & (x < s.a + s.w) & (y > 0.25) & (y < 0.4), s.k, 0.0),
-    "one within the other": lambda s, t, x, y: jnp.where(x > s.a, jnp.where(y < 0.4, jnp.where(x < s.a + s.w, s.k, 0.0), 0.0), 0.0),
-    "what is beside it": lambda s, t, x, y: jnp.where((x < s.a) | (x > s.a + s.w) | (y < 0.25) | (y > 0.4), 0.0, s.k),
+    "one condition": lambda s, t, x, y: jnp.where(
+        (x > s.a) & (x < s.a + s.w) & (y > 0.25) & (y < 0.4), s.k, 0.0
+    ),
+    "one within the other": lambda s, t, x, y: jnp.where(
+        x > s.a, jnp.where(y < 0.4, jnp.where(x < s.a + s.w, s.k, 0.0), 0.0), 0.0
+    ),
+    "what is beside it": lambda s, t, x, y: jnp.where(
+        (x < s.a) | (x > s.a + s.w) | (y < 0.25) | (y > 0.4), 0.0, s.k
+    ),
     "a product": lambda s, t, x, y: s.k * (x > s.a) * (x < s.a + s.w) * (jnp.abs(y - 0.3) < 0.05),
-    "signs": lambda s, t, x, y: s.k * both(jnp.sign(x - s.a) > 0, jnp.sign(s.a + s.w - x) > 0) * (jnp.maximum(y, 0.27) == y) * (y < 0.4),
-    "by a margin": lambda s, t, x, y: s.k * (jnp.minimum(x - s.a, s.a + s.w - x) > 0.0) * (y > 0.25) * (y < 0.4),
-    "at its time": lambda s, t, x, y: s.k * both(t > s.a, t < s.a + 3 * s.w, x > s.a, x < s.a + s.w, y > 0.27, y < 0.33),
+    "signs": lambda s, t, x, y: (
+        s.k
+        * both(jnp.sign(x - s.a) > 0, jnp.sign(s.a + s.w - x) > 0)
+        * (jnp.maximum(y, 0.27) == y)
+        * (y < 0.4)
+    ),
+    "by a margin": lambda s, t, x, y: (
+        s.k * (jnp.minimum(x - s.a, s.a + s.w - x) > 0.0) * (y > 0.25) * (y < 0.4)
+    ),
+    "at its time": lambda s, t, x, y: (
+        s.k * both(t > s.a, t < s.a + 3 * s.w, x > s.a, x < s.a + s.w, y > 0.27, y < 0.33)
+    ),
 }
 
 
@@ -164,7 +179,11 @@ class Patch(OnPlane):
         return (jj.generalized_force(motion, x_rate=brakes + 0 * motion.t),)
 
     def events(self, motion):
-        return {} if self.off is None else {"on it": 0.5 * self.k - self.off(self, motion.t, motion.q.x, motion.q.y)}
+        return (
+            {}
+            if self.off is None
+            else {"on it": 0.5 * self.k - self.off(self, motion.t, motion.q.x, motion.q.y)}
+        )
 
 
 @pytest.mark.parametrize("kind", PATCHES)
@@ -266,7 +285,7 @@ def test_dry_friction_at_rest_is_said_to_stick(start):
 
 def test_relations_within_events_and_inputs():
     stops = Bead(event=lambda s, motion: jnp.where(motion.q.x > s.a, s.a + s.k - motion.q.x, 1.0))
-    t = lambda a: end(stops.replace(a=a), {"x_rate": 2.0}).t_end  # noqa: E731
+    t = lambda a: end(stops.replace(a=a), {"x_rate": 2.0}).t_end
     assert_allclose(with_value(jax.grad, t)(0.7), [0.5, 0.6], atol=1e-12)
     bounces = Bead(
         law=LAWS["sets in at a place"][0],
@@ -278,7 +297,7 @@ def test_relations_within_events_and_inputs():
         v = jnp.sqrt(1 - 2 * 0.5 * 0.2)
         return a - (SPAN - a - 2 * (1 - v) / 0.5)
 
-    x = lambda a: end(bounces.replace(a=a)).q_end[0]  # noqa: E731
+    x = lambda a: end(bounces.replace(a=a)).q_end[0]
     for derivative in (jax.jacfwd, jax.grad):
         assert_allclose(*(with_value(derivative, f)(0.7) for f in (x, back)), atol=1e-11)
 

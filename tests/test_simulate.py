@@ -1,4 +1,6 @@
-"""Simulation: right to tolerance in every state form, honest about how it ended, differentiable in every supported mode."""
+"""Simulation: right to tolerance in every state form, honest about how it ended, differentiable in every
+supported mode.
+"""
 
 import diffrax
 import jax
@@ -28,7 +30,11 @@ class Falling(Upright):
 
     def loads(self, motion):
         drag = jj.point_force(motion["mass"].point(), -self.drag * motion["mass"].velocity)
-        return (jj.gravity(motion, self.gravity), drag, jj.generalized_force(motion, x_rate=motion.inputs.force))
+        return (
+            jj.gravity(motion, self.gravity),
+            drag,
+            jj.generalized_force(motion, x_rate=motion.inputs.force),
+        )
 
     def events(self, motion):
         return {"landed": motion.q.z + 0.5, "too far": 100.0 - motion.q.x}
@@ -52,7 +58,9 @@ def test_an_event_stops_the_motion_at_the_closed_form_time():
 
 
 def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so():
-    motion = jj.simulate(Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, rtol=1e-11, atol=1e-11)
+    motion = jj.simulate(
+        Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, rtol=1e-11, atol=1e-11
+    )
     energy = motion.energies()
     assert energy.kind == "T + V less the work done"
     assert jnp.ptp(energy.kinetic + energy.potential) > 1.0
@@ -67,7 +75,10 @@ def test_a_conservative_scene_tracks_no_work():
 
 def test_minimal_and_full_state_give_the_same_motion():
     options = {"t1": 3.0, "rtol": 1e-10, "atol": 1e-10}
-    minimal, full = (jj.simulate(ChaplyginSleigh(), formulation=jj.Formulation(form), **options) for form in ("minimal", "full"))
+    minimal, full = (
+        jj.simulate(ChaplyginSleigh(), formulation=jj.Formulation(form), **options)
+        for form in ("minimal", "full")
+    )
     assert (minimal.state_form, full.state_form) == ("minimal", "full")
     assert_allclose(minimal.q, full.q, atol=1e-8)
     assert jnp.max(jnp.abs(minimal.residuals()[1])) < 1e-14
@@ -76,7 +87,10 @@ def test_minimal_and_full_state_give_the_same_motion():
 
 def test_geometric_rows_hold_after_every_step_by_projection_and_drift_without():
     options = {"rtol": 1e-6, "atol": 1e-6, "ts": jnp.linspace(0.0, 10.0, 21)}
-    kept, drifted = (jj.simulate(DoublePendulumRods(), formulation=jj.Formulation("full", stabilisation=by), **options) for by in ("projection", None))
+    kept, drifted = (
+        jj.simulate(DoublePendulumRods(), formulation=jj.Formulation("full", stabilisation=by), **options)
+        for by in ("projection", None)
+    )
     assert jnp.max(jnp.abs(kept.residuals()[0])) < 1e-12
     assert jnp.max(jnp.abs(drifted.residuals()[0])) > 1e-8
 
@@ -120,14 +134,21 @@ def test_reversed_time_runs_back_to_the_start():
 def test_simulate_traces_once_for_different_numbers():
     import equinox as eqx
 
-    run = eqx.filter_jit(eqx.debug.assert_max_traces(lambda scene, start: jj.simulate(scene, start, t1=0.5).q_end, max_traces=1))
+    run = eqx.filter_jit(
+        eqx.debug.assert_max_traces(
+            lambda scene, start: jj.simulate(scene, start, t1=0.5).q_end, max_traces=1
+        )
+    )
     for mass in (1.0, 2.0):
         scene = Falling(mass=mass)
         run(scene, jj.start(scene, z_rate=mass))
 
 
 def test_a_scene_and_a_start_in_float32_move_in_double_precision_where_it_is_switched_on(recwarn):
-    scene, state = (jax.tree.map(lambda x: x.astype(jnp.float32), x) for x in (Falling(), jj.start(Falling(), z=4.0, z_rate=1.0)))
+    scene, state = (
+        jax.tree.map(lambda x: x.astype(jnp.float32), x)
+        for x in (Falling(), jj.start(Falling(), z=4.0, z_rate=1.0))
+    )
     motion = jj.simulate(scene, state, t1=0.1, rtol=1e-8)
     assert (motion.q.dtype, recwarn.list) == (jnp.float64, [])
     assert motion["z"][-1] == pytest.approx(4.0 + 0.1 - 0.5 * float(scene.gravity) * 0.01, abs=1e-12)
@@ -153,25 +174,43 @@ class Trolley(jj.Scene):
 
 
 def test_rows_that_a_motion_leaves_are_warned_of():
-    options = {"ts": jnp.linspace(0.0, 2.0, 11), "solver": jj.ImplicitMidpoint(step=0.2)}  # a step ends at each saved time
-    for kind, rows in ((DoublePendulumRods, "geometric"), (Snakeboard, "velocity")):  # the velocity rows of rods are quadratic, which the rule keeps
-        kept, left = (jj.simulate(kind(), formulation=jj.Formulation(stabilisation=by), **options).warnings for by in ("projection", None))
+    options = {
+        "ts": jnp.linspace(0.0, 2.0, 11),
+        "solver": jj.ImplicitMidpoint(step=0.2),
+    }  # a step ends at each saved time
+    for kind, rows in (
+        (DoublePendulumRods, "geometric"),
+        (Snakeboard, "velocity"),
+    ):  # the velocity rows of rods are quadratic, which the rule keeps
+        kept, left = (
+            jj.simulate(kind(), formulation=jj.Formulation(stabilisation=by), **options).warnings
+            for by in ("projection", None)
+        )
         assert [text[:5] for text in (*kept, *left[1:])] == ["T + V"] * 2
         assert left[0].startswith(f"{rows} constraints are violated")
 
 
 def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():
     def pulled(inertia, reduction):
-        return jj.simulate(Trolley(inertia=inertia), t1=2.0, ts=[0.0, 2.0], formulation=jj.Formulation("full", reduction), max_steps=2000)
+        return jj.simulate(
+            Trolley(inertia=inertia),
+            t1=2.0,
+            ts=[0.0, 2.0],
+            formulation=jj.Formulation("full", reduction),
+            max_steps=2000,
+        )
 
     by_wheel = Privileged((2,))
     for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-20, "qr")):
         motion = pulled(inertia, reduction)
         assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
         assert motion.warnings == ()
-    # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its rate does not show
+    # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its
+    # rate does not show
     assert pulled(1e-30, "qr").result == results.MAX_STEPS
-    lost = pulled(1e-30, by_wheel)  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
+    lost = pulled(
+        1e-30, by_wheel
+    )  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
     assert lost.q_end[0] < 1e-3
     assert any("hardly determine the others (pivot 1.0e-15)" in text for text in lost.warnings)
 
@@ -191,7 +230,16 @@ def test_named_access_reaches_coordinates_speeds_and_time(rolling):
 
 def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
     text = str(rolling)
-    for part in ("Trajectory of TiltingDisc", "reached the end", "Dopri8", "minimal", "drift", "velocity", "friction coefficient needed", "N"):
+    for part in (
+        "Trajectory of TiltingDisc",
+        "reached the end",
+        "Dopri8",
+        "minimal",
+        "drift",
+        "velocity",
+        "friction coefficient needed",
+        "N",
+    ):
         assert part in text
     assert rolling._repr_html_().startswith(f"<pre>{text[:60]}")
     assert "no drift from one saved time" in str(jj.simulate(rolling.scene, {"lean": 0.3}, ts=[0.1]))
@@ -201,7 +249,12 @@ def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
     centre = np.asarray(rolling.point("disc"))
     assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
     assert_array_equal(centre, rolling.motions()["disc"].position)
-    with pytest.raises(KeyError, match=r'`disc` is a body of `TiltingDisc`.*`motion\.point\("disc"\)`.*`motion\.motions\(\)\["disc"\]`'):
+    with pytest.raises(
+        KeyError,
+        match=(
+            r'`disc` is a body of `TiltingDisc`.*`motion\.point\("disc"\)`.*`motion\.motions\(\)\["disc"\]`'
+        ),
+    ):
         rolling["disc"]
 
 
@@ -222,13 +275,17 @@ DATA = jj.Experiment(TS, {"x": np.array([0.3, 0.5])}, 0.01, start=START)
 def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fields():
     coarse = jj.Options(rtol=1e-4, atol=1e-4, max_step=np.inf)
     by_name = jj.simulate(SLEIGH, START, ts=TS, rtol=1e-4, atol=1e-4, max_step=np.inf)
-    mixed = jj.simulate(SLEIGH, START, ts=TS, options=jj.Options(rtol=1e-4, atol=1e-9), atol=1e-4, max_step=np.inf)
+    mixed = jj.simulate(
+        SLEIGH, START, ts=TS, options=jj.Options(rtol=1e-4, atol=1e-9), atol=1e-4, max_step=np.inf
+    )
     for motion in (jj.simulate(SLEIGH, START, ts=TS, options=coarse), mixed):
         assert_array_equal(motion.q, by_name.q)
         assert motion.accepted == int(by_name.accepted)
     lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
     assert lanes.lane(0).accepted == int(by_name.accepted)
-    assert float(log_likelihood(SLEIGH, DATA, options=coarse)) == float(log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf))
+    assert float(log_likelihood(SLEIGH, DATA, options=coarse)) == float(
+        log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf)
+    )
 
 
 def test_options_are_a_tree_whose_numbers_may_be_traced():
@@ -241,7 +298,9 @@ def test_options_are_a_tree_whose_numbers_may_be_traced():
 
 
 def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
-    motion = jj.simulate(MODELS["ball-on-turntable"]())  # ended at 4.9 of 10 s with a step size that shrank to nothing
+    motion = jj.simulate(
+        MODELS["ball-on-turntable"]()
+    )  # ended at 4.9 of 10 s with a step size that shrank to nothing
     assert motion.result == results.SUCCESS
     assert float(motion.t_end) == 10.0
 
@@ -257,13 +316,18 @@ def test_any_solver_lands_on_the_saved_times(solver):
 def test_an_implicit_solver_serves_a_projected_scene():
     scene = MODELS["double-pendulum-rods"]()
     options = {"t1": 0.5, "rtol": 1e-8, "atol": 1e-8}
-    implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
+    implicit, explicit = (
+        jj.simulate(scene, solver=diffrax.Kvaerno5(), **options),
+        jj.simulate(scene, **options),
+    )
     assert implicit.result == results.SUCCESS
     assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
 
 
 class Tied(jj.Scene):
-    """A bead at height z, tied to the origin by a rod and to the line y = 3: its default rod is too short to be assembled."""
+    """A bead at height z, tied to the origin by a rod and to the line y = 3: its default rod is too short to
+    be assembled.
+    """
 
     mass: float = jj.parameter(1.0, positive=True)
     length: float = jj.parameter(1.0, positive=True)
@@ -278,6 +342,11 @@ class Tied(jj.Scene):
 
 
 def test_a_batch_is_probed_near_its_own_parameters():
-    lanes = jj.rollout(Tied(length=6.0), {"x": np.sqrt([16.0, 27.0]), "z_rate": 1.0}, parameters={"length": np.array([5.0, 6.0])}, t1=0.5)
+    lanes = jj.rollout(
+        Tied(length=6.0),
+        {"x": np.sqrt([16.0, 27.0]), "z_rate": 1.0},
+        parameters={"length": np.array([5.0, 6.0])},
+        t1=0.5,
+    )
     assert list(lanes.result) == [results.SUCCESS, results.SUCCESS]
     assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)

@@ -1,4 +1,6 @@
-"""The built documentation in headless Chromium: front page, gallery, 3D view and search, by what is drawn. Slow, and only where site and browser are."""
+"""The built documentation in headless Chromium: front page, gallery, 3D view and search, by what is drawn.
+Slow, and only where site and browser are.
+"""
 
 import functools
 import http.server
@@ -11,7 +13,10 @@ import pytest
 from browser import dom, needs_browser, screenshot
 
 SITE = Path(__file__).parents[1] / "docs" / "_build" / "html"
-pytestmark = [needs_browser, pytest.mark.skipif(not (SITE / "index.html").exists(), reason="the site is not built; see CONTRIBUTING")]
+pytestmark = [
+    needs_browser,
+    pytest.mark.skipif(not (SITE / "index.html").exists(), reason="the site is not built; see CONTRIBUTING"),
+]
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
@@ -33,7 +38,10 @@ def coloured(pixels: np.ndarray):
     return float(np.mean(np.ptp(pixels, axis=-1) > 0.15))
 
 
-@pytest.mark.parametrize("page", ["index.html", "gallery/pages/index.html", "gallery/pages/whipple-bicycle.html", "howto/showing.html"])
+@pytest.mark.parametrize(
+    "page",
+    ["index.html", "gallery/pages/index.html", "gallery/pages/whipple-bicycle.html", "howto/showing.html"],
+)
 def test_a_page_shows_pictures_in_colour_at_any_width(address, tmp_path, page):
     for width in (1200, 420):
         pixels = screenshot(f"{address}/{page}", tmp_path / "page.png", (width, 1600), budget=8000)
@@ -53,4 +61,8 @@ def test_a_3d_view_on_a_page_draws_its_bodies_in_their_colours(address, tmp_path
 def test_search_finds_a_public_name(address, name):
     found = dom(f"{address}/search.html?q={name}", budget=8000)
     assert re.search(r"found \d+ pages?|Search finished", found)
-    assert re.search(rf'href="reference/\w+\.html[^"]*"[^>]*>[^<]*{name}', re.sub(r"</?span[^>]*>", "", found), re.IGNORECASE), found[-2000:]
+    assert re.search(
+        rf'href="reference/\w+\.html[^"]*"[^>]*>[^<]*{name}',
+        re.sub(r"</?span[^>]*>", "", found),
+        re.IGNORECASE,
+    ), found[-2000:]

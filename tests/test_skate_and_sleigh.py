@@ -36,7 +36,8 @@ def _applies(name, heading):
     return not (name in ("privileged", "gibbs-appell") and abs(np.cos(heading)) < 1e-9)
 
 
-# those that are slow here factorise the rows of an upright disc in `test_discs_and_chains.py`; those of the Gibbs function take longest to compile
+# those that are slow here factorise the rows of an upright disc in `test_discs_and_chains.py`; those of the
+# Gibbs function take longest to compile
 SKATES = ["privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"]
 
 
@@ -64,8 +65,12 @@ def test_privileged_velocities_say_that_they_do_not_apply_across_the_slope():
 
 def test_the_skate_drifts_across_the_slope():
     run = skate.RUN
-    scene = Skate(run["mass"], run["inertia"], run["slope"], run["gravity"])  # passes heading 90 degrees, where x' is no privileged speed
-    assert end_error(scene, {"heading_rate": run["th_rate"]}, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
+    scene = Skate(
+        run["mass"], run["inertia"], run["slope"], run["gravity"]
+    )  # passes heading 90 degrees, where x' is no privileged speed
+    assert end_error(
+        scene, {"heading_rate": run["th_rate"]}, skate.motion, run, "x y", heading="th"
+    ) <= tolerance("closed_form")
 
 
 def test_a_moving_skate_follows_its_closed_form():
@@ -90,4 +95,6 @@ def test_the_sleigh_turns_round_and_runs_straight(turn):
     run = chaplygin_sleigh.RUN | {"w0": turn}
     scene = ChaplyginSleigh(run["mass"], run["inertia"], run["a"])
     start = {"x_rate": run["v0"], "y_rate": run["a"] * turn, "heading_rate": turn}
-    assert end_error(scene, start, chaplygin_sleigh.motion, run, "x y", heading="th", heading_rate="w") <= tolerance("closed_form")
+    assert end_error(
+        scene, start, chaplygin_sleigh.motion, run, "x y", heading="th", heading_rate="w"
+    ) <= tolerance("closed_form")

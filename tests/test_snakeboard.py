@@ -22,7 +22,14 @@ START = {
 @pytest.mark.parametrize("reduction", ["qr", "svd", "kkt", "udwadia-kalaba"])
 def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
     times = np.linspace(0.0, oracle.RUN["t_end"], 10)  # steer is 90 degrees between the fifth and the sixth
-    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, formulation=jj.Formulation(reduction=reduction))
+    motion = jj.simulate(
+        BOARD,
+        START,
+        ts=jnp.asarray(times),
+        rtol=1e-12,
+        atol=1e-12,
+        formulation=jj.Formulation(reduction=reduction),
+    )
     expected = oracle.motion(times, **oracle.RUN)
     pairs = {
         "x": "x",
@@ -33,21 +40,26 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
         "heading_rate": "th_rate",
         "rotor_rate": "psi_rate",
     }
-    travelled = times[-1] * np.mean(np.abs(oracle.velocities(np.linspace(0.0, times[-1], 101), **oracle.RUN)["u"]))  # m, on curls
+    travelled = times[-1] * np.mean(
+        np.abs(oracle.velocities(np.linspace(0.0, times[-1], 101), **oracle.RUN)["u"])
+    )  # m, on curls
     for name, key in pairs.items():
         size = travelled if name in ("x", "y") else None
         assert relative_error(motion[name], expected[key], size) <= tolerance("closed_form"), name
 
 
 def test_the_default_passes_wherever_a_step_ends_near_the_loss_of_rank():
-    # a step that ends within round-off of parallel rows once met a jump of v/(1 - steer) in the accelerations and shrank to nothing
+    # a step that ends within round-off of parallel rows once met a jump of v/(1 - steer) in the accelerations
+    # and shrank to nothing
     times = np.linspace(0.0, oracle.RUN["t_end"], 9)
     for beyond in (0.0, 1e-15, 3e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, -1e-13, -1e-11):
         shifted = times + beyond * (np.arange(9) == 4)
         motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12)
         assert motion.result == results.SUCCESS, beyond
         assert "cutoff 1e-08" in str(motion.reduction)
-        assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance("closed_form"), beyond
+        assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance(
+            "closed_form"
+        ), beyond
 
 
 def test_the_loss_of_rank_is_reported_not_hidden():

@@ -1,4 +1,6 @@
-"""Steady motions: closed forms of the disc and the bicycle, derivatives through the root, and honest residuals."""
+"""Steady motions: closed forms of the disc and the bicycle, derivatives through the root, and honest
+residuals.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -47,9 +49,12 @@ def _spin(radius, lean):
 
 def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     """In a parameter and in a held value, forward and reverse."""
-    closed = lambda radius, lean: _circle(lean, 2.0, radius=radius)  # noqa: E731
+    closed = lambda radius, lean: _circle(lean, 2.0, radius=radius)
     h = 1e-4
-    expected = [(closed(0.5 + h, 0.3) - closed(0.5 - h, 0.3)) / (2 * h), (closed(0.5, 0.3 + h) - closed(0.5, 0.3 - h)) / (2 * h)]
+    expected = [
+        (closed(0.5 + h, 0.3) - closed(0.5 - h, 0.3)) / (2 * h),
+        (closed(0.5, 0.3 + h) - closed(0.5, 0.3 - h)) / (2 * h),
+    ]
     reverse = jax.jit(jax.grad(_spin, (0, 1)))(0.5, 0.3)
     assert_allclose(reverse, expected, rtol=1e-6)
     assert_allclose(jax.jit(jax.jacfwd(_spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
@@ -57,13 +62,21 @@ def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
 
 def test_second_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     h = 1e-4
-    second = (_circle(0.3, 2.0, radius=0.5 + h) + _circle(0.3, 2.0, radius=0.5 - h) - 2 * _circle(0.3, 2.0, radius=0.5)) / h**2
-    assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5)  # differences of second order at 1e-4
+    second = (
+        _circle(0.3, 2.0, radius=0.5 + h)
+        + _circle(0.3, 2.0, radius=0.5 - h)
+        - 2 * _circle(0.3, 2.0, radius=0.5)
+    ) / h**2
+    assert_allclose(
+        jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5
+    )  # differences of second order at 1e-4
 
 
 def test_steady_motions_are_found_in_batches():
     leans = jnp.array([0.2, 0.5, 0.8])
-    found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(leans)
+    found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(
+        leans
+    )
     assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
     assert found.converged.all()
 
@@ -77,7 +90,9 @@ def test_a_pendulum_comes_to_rest_at_an_equilibrium():
 
 
 def test_a_free_body_spins_steadily_about_the_nearest_axis():
-    found = steady(FreeRigidBody(), {"attitude_omega_z": 2.0, "attitude_omega_x": 0.1}, held=("attitude_omega_z",))
+    found = steady(
+        FreeRigidBody(), {"attitude_omega_z": 2.0, "attitude_omega_x": 0.1}, held=("attitude_omega_z",)
+    )
     assert found.converged
     assert_allclose(found["attitude_omega"], [0.0, 0.0, 2.0], atol=1e-10)
 
@@ -102,7 +117,11 @@ class Sprung(OnLine):
     inputs = jj.inputs("push")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3
+            ),
+        )
 
 
 def test_an_equilibrium_is_that_of_the_inputs_and_of_the_time():
@@ -117,11 +136,13 @@ def test_an_equilibrium_is_that_of_the_inputs_and_of_the_time():
 
 def test_what_is_steady_depends_on_the_speeds_that_are_to_be_constant():
     circle = {"heading_rate": 0.5, "roll_rate": 3.0}
-    rolled = lambda *speeds: steady(VerticalDisc(), circle, held=tuple(circle), privileged=speeds)  # noqa: E731
+    rolled = lambda *speeds: steady(VerticalDisc(), circle, held=tuple(circle), privileged=speeds)
     assert rolled("roll_rate", "heading_rate").converged
     found = rolled("x_rate", "heading_rate")  # the velocity along x turns with the heading
     assert not found.converged
-    assert found.residual == pytest.approx(0.5**2 * abs(float(found["x_rate"])), rel=1e-6)  # |d2y/dt2|, where x_rate has its largest value
+    assert found.residual == pytest.approx(
+        0.5**2 * abs(float(found["x_rate"])), rel=1e-6
+    )  # |d2y/dt2|, where x_rate has its largest value
 
 
 def test_a_search_of_one_step_says_that_it_did_not_arrive():

@@ -1,4 +1,6 @@
-"""Stiff motions, motions that end in a singularity, and derivatives through motions that amplify errors: what the engine does, and what it says."""
+"""Stiff motions, motions that end in a singularity, and derivatives through motions that amplify errors: what
+the engine does, and what it says.
+"""
 
 import warnings
 
@@ -18,23 +20,33 @@ TS = np.linspace(0.0, 2.0, 5)
 
 
 class Damped(OnLine):
-    """A particle of 1 kg that a damper drags behind a carriage moving as sin(t): `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t."""
+    """A particle of 1 kg that a damper drags behind a carriage moving as sin(t):
+    `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t.
+    """
 
     rate: object = jj.parameter(1e7, unit="1/s", positive=True)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)
+            ),
+        )
 
 
 class OnALine(OnLine):
-    """A particle of 1 kg on a line, V(x) given by its kind: falls towards an attracting centre, or off a ridge."""
+    """A particle of 1 kg on a line, V(x) given by its kind: falls towards an attracting centre, or off a
+    ridge.
+    """
 
     strength: object = jj.parameter(1.0)
     domain = {"x": (0.5, 1.5)}
 
 
 class Centre(OnALine):
-    """`xddot = -strength / x^2`: from rest at 1 m it arrives after pi / (2 sqrt(2 strength)) s, infinitely fast."""
+    """`xddot = -strength / x^2`: from rest at 1 m it arrives after pi / (2 sqrt(2 strength)) s, infinitely
+    fast.
+    """
 
     def potential(self, pose):
         return -self.strength / pose.q.x
@@ -48,7 +60,9 @@ class Ridge(OnALine):
 
 
 class Drawn(OnALine):
-    """`xddot = -9.81 + strength sqrt(x + 0.02)`, which is no number a little below the floor at x = 0, where the motion stops."""
+    """`xddot = -9.81 + strength sqrt(x + 0.02)`, which is no number a little below the floor at x = 0, where
+    the motion stops.
+    """
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-9.81 + self.strength * jnp.sqrt(motion.q.x + 0.02)),)
@@ -71,7 +85,9 @@ def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
 
 
 def test_a_solver_that_was_chosen_is_kept_and_a_motion_that_is_not_stiff_has_no_other_solver():
-    chosen = jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000, retry=True)
+    chosen = jj.simulate(
+        Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000, retry=True
+    )
     assert chosen.result == results.MAX_STEPS
     assert chosen.fallback == results.AS_ASKED
     slow = jj.simulate(Ridge(strength=0.0), {"x": 1.0, "x_rate": 1.0}, ts=TS, max_steps=2, retry=True)
@@ -80,7 +96,9 @@ def test_a_solver_that_was_chosen_is_kept_and_a_motion_that_is_not_stiff_has_no_
 
 
 def test_a_motion_too_stiff_for_its_number_of_steps_is_called_stiff():
-    motion = jj.simulate(Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30, retry=True)  # 3 for the implicit solver
+    motion = jj.simulate(
+        Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30, retry=True
+    )  # 3 for the implicit solver
     assert motion.result == results.STIFF
     assert motion.message.startswith("stiff: ran out of steps")
     assert motion.warnings[0] == motion.message
@@ -96,13 +114,18 @@ def test_the_method_of_radau_is_of_order_five():
 
 
 class TurnedSkate(jj.models.Skate):
-    """A skate that a stiff damper turns at 1.3 rad/s, in a domain too narrow for that: a partition seems to serve which fails at a right angle."""
+    """A skate that a stiff damper turns at 1.3 rad/s, in a domain too narrow for that: a partition seems to
+    serve which fails at a right angle.
+    """
 
     damping: object = jj.parameter(0.0, unit="N m s")
     domain = {"heading": (-0.5, 0.5)}
 
     def loads(self, motion):
-        return (*super().loads(motion), jj.generalized_force(motion, heading_rate=-self.damping * (motion.u.heading_rate - 1.3)))
+        return (
+            *super().loads(motion),
+            jj.generalized_force(motion, heading_rate=-self.damping * (motion.u.heading_rate - 1.3)),
+        )
 
 
 TURNED = {"heading": 0.0, "heading_rate": 1.3}
@@ -115,7 +138,9 @@ def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_
     assert "retry=True" in told.message
     again = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True)
     assert again.raise_if_failed().fallback == results.FULL_STATE
-    inside = jax.jit(lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True))(1.3)
+    inside = jax.jit(
+        lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True)
+    )(1.3)
     assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
 
 
@@ -125,7 +150,10 @@ def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_a
     batch = jj.rollout(scene, TURNED | {"x": np.zeros(2)}, parameters={"damping": rates}, ts=ts, retry=True)
     assert batch.lanes.fallback.tolist() == [results.FULL_STATE, both]
     assert batch.continued.tolist() == [0, 1]
-    assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [("Dopri8", "full"), ("RadauIIA", "full")]
+    assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [
+        ("Dopri8", "full"),
+        ("RadauIIA", "full"),
+    ]
     alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts, retry=True)
     assert alone.raise_if_failed().fallback == both
     expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
@@ -152,7 +180,9 @@ def said(derivative, x):
 def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_jit():
     scene = Ridge(strength=16.0)
 
-    def end(x, rtol, scene=scene):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
+    def end(
+        x, rtol, scene=scene
+    ):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
         return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, 2, -1]], rtol=rtol, atol=rtol).q_end[0]
 
     (text,) = said(jax.grad(lambda x: end(x, 1e-6)), 1.0)
@@ -171,11 +201,13 @@ def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_ji
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_an_implicit_solver_that_tries_steps_beyond_an_event_has_the_derivative_of_the_closed_form(mode):
     def landing_speed(height):
-        motion = jj.simulate(Drawn(), {"x": height}, t1=3.0, ts=[0.0], rtol=1e-8, atol=1e-8, solver=jj.RadauIIA(), work=False)
+        motion = jj.simulate(
+            Drawn(), {"x": height}, t1=3.0, ts=[0.0], rtol=1e-8, atol=1e-8, solver=jj.RadauIIA(), work=False
+        )
         return motion.u_end[0], (motion.result, motion.rejected)
 
     # v^2/2 + 9.81 x - (2/3) (x + 0.02)^(3/2) is constant
-    stored = lambda x: 9.81 * x - (x + 0.02) ** 1.5 * 2 / 3  # noqa: E731
+    stored = lambda x: 9.81 * x - (x + 0.02) ** 1.5 * 2 / 3
     speed = -np.sqrt(2 * (stored(1.0) - stored(0.0)))
     if mode == "reverse":
         (found, (code, rejected)), slope = jax.value_and_grad(landing_speed, has_aux=True)(1.0)
@@ -187,13 +219,21 @@ def test_an_implicit_solver_that_tries_steps_beyond_an_event_has_the_derivative_
 
 
 class Following(OnPlane):
-    """x is drawn to sin y by a stiff spring and damper, in about 1e-6 s to a speed, in about 1 s to the place; y falls to the floor by 1 m/s^2."""
+    """x is drawn to sin y by a stiff spring and damper, in about 1e-6 s to a speed, in about 1 s to the
+    place; y falls to the floor by 1 m/s^2.
+    """
 
     rate: object = jj.parameter(1e6)
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (jj.generalized_force(motion, x_rate=-self.rate * (q.x - jnp.sin(q.y)) - self.rate * u.x_rate, y_rate=-1.0 + 0.0 * q.x),)
+        return (
+            jj.generalized_force(
+                motion,
+                x_rate=-self.rate * (q.x - jnp.sin(q.y)) - self.rate * u.x_rate,
+                y_rate=-1.0 + 0.0 * q.x,
+            ),
+        )
 
     def events(self, motion):
         return {"floor": motion.q.y}
@@ -218,8 +258,12 @@ def test_a_stiff_motion_is_right_at_its_event_and_so_is_its_derivative(options):
         assert_allclose(motion.q_end, [expected, 0.0], rtol=0, atol=5e-6)
         assert_allclose(motion.u_end, [-expected, -np.sqrt(2 * height)], rtol=0, atol=2e-5)
     if "solver" in options:
-        slope = jax.jacrev(lambda height: jj.simulate(Following(), {"y": height, "x": 0.85}, ts=[6.0], **options).q_end[0])(7.3)
-        assert_allclose(slope, (followed(7.3 + 1e-5, 0.85) - followed(7.3 - 1e-5, 0.85)) / 2e-5, rtol=0, atol=2e-5)
+        slope = jax.jacrev(
+            lambda height: jj.simulate(Following(), {"y": height, "x": 0.85}, ts=[6.0], **options).q_end[0]
+        )(7.3)
+        assert_allclose(
+            slope, (followed(7.3 + 1e-5, 0.85) - followed(7.3 - 1e-5, 0.85)) / 2e-5, rtol=0, atol=2e-5
+        )
 
 
 def test_zero_is_no_attitude():

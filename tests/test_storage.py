@@ -1,4 +1,6 @@
-"""Rollouts in files: every lane comes back as it was, failed ones with their codes; wrong files are refused with the reason."""
+"""Rollouts in files: every lane comes back as it was, failed ones with their codes; wrong files are refused
+with the reason.
+"""
 
 import json
 
@@ -21,7 +23,9 @@ TS = np.linspace(0.0, 0.5, 3)
 def discs():
     """Three discs: one rolls, one has a wrong radius, one falls."""
     starts = {"lean": np.array([0.3, 0.3, 1.4]), "spin_rate": np.array([-6.0, -6.0, -0.1])}
-    return jj.rollout(TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS, progress=False)
+    return jj.rollout(
+        TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS, progress=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +78,12 @@ def test_a_class_that_looks_at_its_numbers_is_made_with_those_of_the_file(tmp_pa
 
 
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
-    lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False)
-    again = eqx.tree_at(lambda motions: motions.fallback, lanes.lanes, jnp.array([0, results.FULL_STATE], jnp.int32))
+    lanes = jj.rollout(
+        PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False
+    )
+    again = eqx.tree_at(
+        lambda motions: motions.fallback, lanes.lanes, jnp.array([0, results.FULL_STATE], jnp.int32)
+    )
     lanes = jj.Rollout(again, reruns=((results.FULL_STATE, ("full", "multipliers", "Dopri8", True, "")),))
     jj.save(lanes, tmp_path / "chains.npz")
     loaded = jj.load_rollout(tmp_path / "chains.npz", PendulumChain)
@@ -85,7 +93,9 @@ def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path)
 
 def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
     inputs = {"speed": lambda t: 1.0 + t, "push": jj.Sampled([0.0, 1.0], [0.0, 2.0])}
-    lanes = jj.rollout(OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs, progress=False)  # in reversed time
+    lanes = jj.rollout(
+        OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs, progress=False
+    )  # in reversed time
     jj.save(lanes, tmp_path / "belt.npz")
     loaded = jj.load_rollout(tmp_path / "belt.npz", OnBelt)
     assert_array_equal(loaded["x"], lanes["x"])
@@ -95,7 +105,14 @@ def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
 
 
 def test_a_motion_of_equal_steps_comes_back_with_its_inputs(tmp_path):
-    steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, ts=[0.0, 0.2], inputs={"speed": 1.0}, solver=jj.ImplicitMidpoint(step=0.1))
+    steps = jj.simulate(
+        OnBelt(),
+        {"y": 0.1},
+        t1=0.5,
+        ts=[0.0, 0.2],
+        inputs={"speed": 1.0},
+        solver=jj.ImplicitMidpoint(step=0.1),
+    )
     jj.save(steps, tmp_path / "steps.npz")
     loaded = jj.load_trajectory(tmp_path / "steps.npz", OnBelt)
     assert_array_equal(loaded.q, steps.q)
@@ -108,10 +125,15 @@ def test_a_field_that_cannot_be_stored_is_named(tmp_path):
 
     labelled = jj.simulate(ChaplyginSleigh(), ts=TS)
     for labels, stored in ((Labelled().labels, True), (("b",), False)):
-        motion = jj.Trajectory(**{name: getattr(labelled, name) for name in labelled.__dataclass_fields__} | {"scene": Labelled(labels=labels)})
+        motion = jj.Trajectory(
+            **{name: getattr(labelled, name) for name in labelled.__dataclass_fields__}
+            | {"scene": Labelled(labels=labels)}
+        )
         if stored:
             jj.save(motion, tmp_path / "labels.npz")
             assert jj.load_trajectory(tmp_path / "labels.npz", Labelled).scene.labels == ("a",)
         else:
-            with pytest.raises(ValueError, match=r"field `labels` of `Labelled` is .*, which `save` cannot store"):
+            with pytest.raises(
+                ValueError, match=r"field `labels` of `Labelled` is .*, which `save` cannot store"
+            ):
                 jj.save(motion, tmp_path / "labels.npz")

@@ -1,4 +1,6 @@
-"""Files that are not what they say: whatever entry is taken away, or changed, is named; and an old file stays until a new one is whole."""
+"""Files that are not what they say: whatever entry is taken away, or changed, is named; and an old file stays
+until a new one is whole.
+"""
 
 import io
 import json
@@ -31,7 +33,14 @@ class Belt(OnBelt):
 @pytest.fixture(scope="module")
 def motions():
     alone = jj.simulate(Belt(drag=0.3, sides=3), {"y": 0.1}, ts=TS, inputs=INPUTS)
-    lanes = jj.rollout(Belt(sides=3), {"y": 0.1}, parameters={"drag": np.array([0.3, 0.4])}, ts=TS, inputs=INPUTS, progress=False)
+    lanes = jj.rollout(
+        Belt(sides=3),
+        {"y": 0.1},
+        parameters={"drag": np.array([0.3, 0.4])},
+        ts=TS,
+        inputs=INPUTS,
+        progress=False,
+    )
     return {"trajectory": alone, "rollout": lanes}
 
 
@@ -43,7 +52,9 @@ def rewritten(path, new, arrays=None, header=None):
     with np.load(path) as file:
         kept = {name: file[name] for name in file.files}
     head = json.loads(str(kept.pop("header"))) | (header or {})
-    kept |= {"header": np.array(json.dumps({name: value for name, value in head.items() if value is not None}))} | (arrays or {})
+    kept |= {
+        "header": np.array(json.dumps({name: value for name, value in head.items() if value is not None}))
+    } | (arrays or {})
     np.savez(new, **{name: value for name, value in kept.items() if value is not None})
     return new
 
@@ -93,7 +104,10 @@ def spoilt_headers(header):
 def _is_as_it_was(*motions):
     """Whether what was read is the motion but for what may be absent or is of no account to it."""
     a, b = (m.lanes if isinstance(m, jj.Rollout) else m for m in motions)
-    return all(np.array_equal(x, y) for x, y in zip(*map(jax.tree.leaves, ((a.scene, a.q), (b.scene, b.q))), strict=True))
+    return all(
+        np.array_equal(x, y)
+        for x, y in zip(*map(jax.tree.leaves, ((a.scene, a.q), (b.scene, b.q))), strict=True)
+    )
 
 
 def test_whatever_happens_to_an_array_is_noticed(saved, tmp_path):
@@ -167,9 +181,13 @@ ARCHIVES = {
     "a deep header": _with_header('{"a": ' * 400 + "1" + "}" * 400),
     "a header that is no JSON": _with_header("{'a': 1}"),
     "an array twice": lambda name, content: [(name, content)] * (2 if name == "q.npy" else 1),
-    "objects": lambda name, content: [(name, _bytes_of(np.array([{}, None])) if name == "q.npy" else content)],
+    "objects": lambda name, content: [
+        (name, _bytes_of(np.array([{}, None])) if name == "q.npy" else content)
+    ],
     "an array without a head": lambda name, content: [(name, content[10:] if name == "q.npy" else content)],
-    "a head that is code": lambda name, content: [(name, content[:10] + b"(" * 100 + content[110:] if name == "q.npy" else content)],
+    "a head that is code": lambda name, content: [
+        (name, content[:10] + b"(" * 100 + content[110:] if name == "q.npy" else content)
+    ],
 }
 
 
@@ -223,14 +241,21 @@ def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
 
 def changed(**parameters):
     """The class with other parameters than when the file was written."""
-    return type("Belt", (Belt,), {"__module__": __name__, "__annotations__": dict.fromkeys(parameters, float)} | parameters)
+    return type(
+        "Belt",
+        (Belt,),
+        {"__module__": __name__, "__annotations__": dict.fromkeys(parameters, float)} | parameters,
+    )
 
 
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
         (changed(spring=jj.parameter(0.0, unit="N/m")), "lacks the parameter `spring` of `Belt`"),
-        (changed(drag=jj.parameter(0.0, unit="N s/mm")), "the parameter `drag` in N s/m, but `Belt` takes it in N s/mm; pass the class as it was"),
+        (
+            changed(drag=jj.parameter(0.0, unit="N s/mm")),
+            "the parameter `drag` in N s/m, but `Belt` takes it in N s/mm; pass the class as it was",
+        ),
         (OnBelt, "of `Belt`, expected `OnBelt`; pass its class"),
         (type("Belt", (OnBelt,), {}), "has a parameter `drag` that `Belt` lacks"),
         (

@@ -1,4 +1,6 @@
-"""Modes of JAX that a user sets for their own code, and threads of their own, leave the package's results as they are."""
+"""Modes of JAX that a user sets for their own code, and threads of their own, leave the package's results as
+they are.
+"""
 
 import sys
 import traceback
@@ -30,7 +32,12 @@ class Spring(jj.Scene):
         return {"bead": jj.Particle(self.mass, (q.x, q.y, 0))}
 
     def loads(self, motion):
-        return (jj.point_force(motion["bead"].point(), -self.stiffness * jnp.eye(3, dtype=jnp.float32) @ jnp.stack([motion.q.x, motion.q.y, 0.0])),)
+        return (
+            jj.point_force(
+                motion["bead"].point(),
+                -self.stiffness * jnp.eye(3, dtype=jnp.float32) @ jnp.stack([motion.q.x, motion.q.y, 0.0]),
+            ),
+        )
 
     def velocity_constraints(self, motion):
         return {"along x": motion.u.y_rate}
@@ -53,9 +60,13 @@ def test_motions_and_their_derivatives_are_found_where_types_and_ranks_of_the_us
         assert_allclose(motion["x"][-1], np.cos(RATE), atol=1e-7)
         assert "reached" in str(motion)
         assert motion.accelerations().udot.shape == (201, 2)
-        lanes = jj.rollout(Spring(), {"x": np.ones(2)}, parameters={"stiffness": np.array([1.0, 4.0])}, t1=1.0)
+        lanes = jj.rollout(
+            Spring(), {"x": np.ones(2)}, parameters={"stiffness": np.array([1.0, 4.0])}, t1=1.0
+        )
         assert_allclose(lanes["x"][:, -1], np.cos([1.0, 2.0]), atol=1e-7)
-        assert_allclose(jax.grad(jax.jit(_end))(RATE**2), SLOPE, atol=1e-6)  # rules of derivatives are asked for once `simulate` has returned
+        assert_allclose(
+            jax.grad(jax.jit(_end))(RATE**2), SLOPE, atol=1e-6
+        )  # rules of derivatives are asked for once `simulate` has returned
         assert {name: getattr(jax.config, name) for name in modes} == modes
     finally:
         for name, mode in before.items():
@@ -86,7 +97,10 @@ def test_numbers_of_extended_precision_are_rounded_and_complex_ones_named():
     lanes = jj.rollout(Spring(), {"x": wide[:1].repeat(2)}, parameters={"stiffness": wide}, ts=wide - 1)
     assert_allclose(lanes["x"][:, -1], np.cos([3.0, 6.0]), atol=1e-6)
     assert jj.Sampled(wide, wide)(2.0) == 2.0
-    assert all(scene.stiffness.dtype == np.float64 for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble))))
+    assert all(
+        scene.stiffness.dtype == np.float64
+        for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble)))
+    )
     with pytest.raises(ValueError, match="`ts` of `Sampled` is of type complex256, expected real numbers"):
         jj.Sampled(wide.astype(np.clongdouble), wide)
 
@@ -157,13 +171,23 @@ class WrongName(Slider):
 
 
 def lines(error):
-    """The lines of the traceback below the one that called, without those of what wraps public functions (in tests, jaxtyping too)."""
+    """The lines of the traceback below the one that called, without those of what wraps public functions (in
+    tests, jaxtyping too).
+    """
     wrappers = (str(Path("scene", "arguments.py")), str(Path("jaxtyping", "_decorator.py")))
-    return [frame.line for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.endswith(wrappers)]
+    return [
+        frame.line
+        for frame in traceback.extract_tb(error.__traceback__)[1:]
+        if not frame.filename.endswith(wrappers)
+    ]
 
 
 @pytest.mark.parametrize("scene", [WrongShapes(), WrongName()], ids=["noticed by JAX", "noticed here"])
-@pytest.mark.parametrize("call", [lambda s: jj.simulate(s, {}, t1=1.0), jj.report, lambda s: jj.start(s, x=0.1)], ids=["simulate", "report", "start"])
+@pytest.mark.parametrize(
+    "call",
+    [lambda s: jj.simulate(s, {}, t1=1.0), jj.report, lambda s: jj.start(s, x=0.1)],
+    ids=["simulate", "report", "start"],
+)
 def test_the_traceback_of_a_mistake_in_a_method_shows_the_lines_of_its_author(scene, call):
     with pytest.raises((TypeError, AttributeError)) as caught:
         call(scene)

@@ -1,4 +1,6 @@
-"""Studies: every lane is the motion that `simulate` gives, and its bits do not depend on chunks, shares or what else is kept."""
+"""Studies: every lane is the motion that `simulate` gives, and its bits do not depend on chunks, shares or
+what else is kept.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,11 @@ def discs():
     generator = np.random.default_rng(2)
     radius = generator.uniform(0.4, 0.6, COUNT)
     radius[BAD] = -0.5
-    start = {"lean": generator.uniform(-0.6, 0.6, COUNT), "lean_rate": generator.normal(0.0, 0.5, COUNT), "spin_rate": -0.5}
+    start = {
+        "lean": generator.uniform(-0.6, 0.6, COUNT),
+        "lean_rate": generator.normal(0.0, 0.5, COUNT),
+        "spin_rate": -0.5,
+    }
     return jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start=start)
 
 
@@ -66,14 +72,20 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
         assert arrays["result"][number] == int(motion.result)
         assert arrays["steps"][number] == int(motion.accepted)
         for name, expected in outputs(motion).items():
-            assert arrays[name][number] == pytest.approx(float(expected), rel=1e-9, abs=1e-9, nan_ok=True), name
+            assert arrays[name][number] == pytest.approx(float(expected), rel=1e-9, abs=1e-9, nan_ok=True), (
+                name
+            )
         assert float(motion.scene.radius) == lane.parameters["radius"] == float(arrays["radius"][number])
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
 
-def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with_and_what_never_has_a_value_has_no_statistics(tmp_path):
+def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with_and_what_never_has_a_value_has_no_statistics(
+    tmp_path,
+):
     outputs = {"lean": End("lean"), "never": EventTime("fallen")}
-    found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(tmp_path / "d.zarr", t1=0.1, outputs=outputs, progress=False)
+    found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(
+        tmp_path / "d.zarr", t1=0.1, outputs=outputs, progress=False
+    )
     assert np.isnan([found.mean("never"), *found.quantile("never", 0.5)]).all()
     assert f"  lean = {float(found.to_xarray()['lean'][1]):.6g}" in str(found.lane(1)).splitlines()
 
@@ -156,7 +168,9 @@ def test_statistics_of_all_lanes_and_every_twelfth_whole(whole, tmp_path):
     assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
     assert_array_equal(arrays["time"].values, ASKED["ts"])
     for place in (0, 12):
-        assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
+        assert_allclose(
+            arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9
+        )
 
 
 def test_a_study_is_opened_without_its_scene(whole):

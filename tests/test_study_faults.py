@@ -1,4 +1,6 @@
-"""What happens to studies that are killed, interrupted, damaged, out of room, or run where they should not be."""
+"""What happens to studies that are killed, interrupted, damaged, out of room, or run where they should not
+be.
+"""
 
 import errno
 import json
@@ -43,7 +45,9 @@ def study(seed=3, memory=None, **more):
     scene = jj.models.TiltingDisc()
     lean = Uniform(-0.5, 0.5)
     scene = scene if memory is None else jj.build(scene, memory=memory)
-    return jj.Study(scene, start={"lean": lean, "spin_rate": Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more)
+    return jj.Study(
+        scene, start={"lean": lean, "spin_rate": Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more
+    )
 
 
 def run(path, seed=3, memory=None, **options):
@@ -65,7 +69,9 @@ def path(whole, tmp_path):
 def computed(monkeypatch):
     """Numbers of the blocks that are computed, in order."""
     numbers, before = [], Runner.run_block
-    monkeypatch.setattr(Runner, "run_block", lambda self, number: numbers.append(number) or before(self, number))
+    monkeypatch.setattr(
+        Runner, "run_block", lambda self, number: numbers.append(number) or before(self, number)
+    )
     return numbers
 
 
@@ -74,7 +80,9 @@ class Killed(BaseException):
 
 
 def _after(monkeypatch, count, error):
-    """The files of a store are written until so many have been; then `error` is raised, in the middle of the next."""
+    """The files of a store are written until so many have been; then `error` is raised, in the middle of the
+    next.
+    """
     left = [count]
 
     def write(path, content, **how):
@@ -88,7 +96,9 @@ def _after(monkeypatch, count, error):
 
 
 def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monkeypatch, computed):
-    count = 4 + 3 * (len(whole.store.columns) + 1)  # study, grid, the manifest of each; per chunk its arrays and its receipt
+    count = 4 + 3 * (
+        len(whole.store.columns) + 1
+    )  # study, grid, the manifest of each; per chunk its arrays and its receipt
     for number in (0, 3, 5, count - 1):
         path = tmp_path / f"killed{number}"
         with monkeypatch.context() as patch:
@@ -98,7 +108,9 @@ def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monk
         computed.clear()
         assert_same(run(path), whole)
         begun = max(0, number - 4) // (len(whole.store.columns) + 1)  # whole chunks
-        assert sorted(set(computed)) == sorted({0, *range(begun, 3)})  # the first block is the yardstick of every process
+        assert sorted(set(computed)) == sorted(
+            {0, *range(begun, 3)}
+        )  # the first block is the yardstick of every process
     assert not [entry for entry in tmp_path.iterdir() if entry.name.startswith(".")]
 
 
@@ -141,7 +153,9 @@ def test_a_study_of_which_no_receipt_is_left_has_no_numbers(path):
         jj.load_study(path).statistics  # noqa: B018
 
 
-@pytest.mark.parametrize("harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")])
+@pytest.mark.parametrize(
+    "harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")]
+)
 def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, path, computed):
     harm(path / "run" / "grid.json")
     with pytest.raises(ValueError, match=r"`run/grid.json` is damaged; run the study again"):
@@ -166,7 +180,9 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
 def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tmp_path, monkeypatch):
     path = tmp_path / "discs.zarr"
     with monkeypatch.context() as patch:
-        _after(patch, 4 + (len(whole.store.columns) + 1) + 3, OSError(errno.ENOSPC, "No space left on device"))
+        _after(
+            patch, 4 + (len(whole.store.columns) + 1) + 3, OSError(errno.ENOSPC, "No space left on device")
+        )
         with pytest.raises(OSError, match="No space left on device; 1 of 3 chunks are kept") as caught:
             run(path)
     assert caught.value.errno == errno.ENOSPC
@@ -228,7 +244,9 @@ def test_a_folder_that_holds_another_study_is_refused_and_left_alone(change, nam
 def test_an_option_is_not_named_for_the_place_of_a_function_in_memory(tmp_path):
     def study(**options):
         inputs = {"speed": lambda t: 1.0 + t, "push": 0.5}
-        return jj.Study(OnBelt(), start={"y": [0.1]}).run(tmp_path / "belt.zarr", t1=0.1, inputs=inputs, progress=False, **options)
+        return jj.Study(OnBelt(), start={"y": [0.1]}).run(
+            tmp_path / "belt.zarr", t1=0.1, inputs=inputs, progress=False, **options
+        )
 
     study()
     with pytest.raises(ValueError, match=r"what differs: options \(`rtol`\); give"):
@@ -256,12 +274,16 @@ def test_other_chunks_than_the_study_began_with_are_refused(whole):
 def test_a_second_run_into_one_folder_is_refused_while_the_first_lives(whole):
     with whole.store.lock(), pytest.raises(InUseError, match=f"in use by process {os.getpid()} on "):
         run(whole.store.path)
-    (whole.store.path / "run" / "lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))  # what a dead run leaves
+    (whole.store.path / "run" / "lock").write_text(
+        json.dumps({"pid": 1, "host": "elsewhere"})
+    )  # what a dead run leaves
     assert run(whole.store.path).complete
 
 
 def _changed(path, name, **entries):
-    """The JSON of a file with other entries, and a manifest that knows them: as a hostile hand, or another version, would write it."""
+    """The JSON of a file with other entries, and a manifest that knows them: as a hostile hand, or another
+    version, would write it.
+    """
     file, manifest = path / "run" / name, path / "run" / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | entries))
     digests = json.loads(manifest.read_text())["digests"] | {f"run/{name}": store._digest(file.read_bytes())}
@@ -271,7 +293,10 @@ def _changed(path, name, **entries):
 def test_another_format_is_refused(path):
     _changed(path, "study.json", format=3)
     for read in (run, jj.load_study):
-        with pytest.raises(ValueError, match="has format 3, this version of jourdain-jax reads 2; use the version that wrote it"):
+        with pytest.raises(
+            ValueError,
+            match="has format 3, this version of jourdain-jax reads 2; use the version that wrote it",
+        ):
             read(path)
     (path / "run" / "manifest.json").unlink()  # as the first format, which had none
     (path / "run" / "study.json").write_text(json.dumps({"format": 1}))
@@ -283,7 +308,9 @@ def test_another_format_is_refused(path):
 @pytest.mark.parametrize("value", [10**18, 10**30, 1e18, 0, -1, 90.0, True, "90", None, [90]])
 def test_numbers_of_a_study_are_within_their_ranges(entry, value, path):
     _changed(path, "study.json", **{entry: value})
-    with pytest.raises(ValueError, match=rf"study.json` is damaged \(`{entry}` is .*, expected a whole number from 1 to"):
+    with pytest.raises(
+        ValueError, match=rf"study.json` is damaged \(`{entry}` is .*, expected a whole number from 1 to"
+    ):
         jj.load_study(path)
 
 
@@ -293,7 +320,16 @@ def test_a_study_has_not_more_chunks_than_can_be_counted(path):
         jj.load_study(path)
 
 
-@pytest.mark.parametrize("grid", [{"centre": [math.nan]}, {"low": [1.0], "high": [-1.0]}, {"centre": [math.inf]}, {"low": []}, {"centre": [[0.0]]}])
+@pytest.mark.parametrize(
+    "grid",
+    [
+        {"centre": [math.nan]},
+        {"low": [1.0], "high": [-1.0]},
+        {"centre": [math.inf]},
+        {"low": []},
+        {"centre": [[0.0]]},
+    ],
+)
 def test_numbers_of_a_grid_are_within_their_ranges(grid, whole, path):
     _changed(path, "grid.json", **{name: values * len(whole.outputs) for name, values in grid.items()})
     _with_receipts_of(path)
@@ -311,12 +347,17 @@ def _with_receipts_of(path):
 
 
 def test_chunks_of_another_grid_do_not_count(whole, path, computed):
-    """As where two machines whose numbers differ found the grid at the same time: sums about another centre would give another mean."""
+    """As where two machines whose numbers differ found the grid at the same time: sums about another centre
+    would give another mean.
+    """
     _changed(path, "grid.json", centre=whole.store.read_grid()["high"])
     with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are omitted"):
         found = jj.load_study(path)
     assert (found.complete, found.counts) == (False, {})
-    with pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"), pytest.warns(UserWarning, match="have other bits here"):
+    with (
+        pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"),
+        pytest.warns(UserWarning, match="have other bits here"),
+    ):
         assert run(path).complete
     assert sorted(set(computed)) == [0, 1, 2]
 
@@ -338,28 +379,44 @@ def test_a_folder_that_is_moved_while_a_study_runs_is_named(tmp_path, monkeypatc
     for options in ({}, {"keep_every": 1}):
         with monkeypatch.context() as patch:
             patch.setattr(Store, "write", write)
-            with pytest.raises(OSError, match=r"the folder is gone: it was moved or removed while the study ran.*discs.zarr"):
+            with pytest.raises(
+                OSError, match=r"the folder is gone: it was moved or removed while the study ran.*discs.zarr"
+            ):
                 run(path, **options)
         assert not path.exists()
         assert run(tmp_path / "moved.zarr", **options).complete
         shutil.rmtree(tmp_path / "moved.zarr")
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "write_grid", lambda self, grid: path.rename(tmp_path / "moved.zarr") and Store(path))
+        patch.setattr(
+            Store, "write_grid", lambda self, grid: path.rename(tmp_path / "moved.zarr") and Store(path)
+        )
         with pytest.raises(ValueError, match="does not exist"):
             run(path)
 
 
-# Every file of a folder, changed in every way that is tried: the right answer, or a named error or warning. --------------------------
+# Every file of a folder, changed in every way that is tried: the right answer, or a named error or warning. -
 
 
 def _harms(content: bytes, generator, count) -> Iterator[tuple[str, bytes]]:
     """Changed contents of a file: `count` bits, twice as many digits; cut short, made longer, emptied."""
     places = generator.integers(len(content), size=count).tolist() if content else []
     for place in places:
-        yield f"a bit of byte {place}", content[:place] + bytes([content[place] ^ 1 << int(generator.integers(8))]) + content[place + 1 :]
+        yield (
+            f"a bit of byte {place}",
+            content[:place]
+            + bytes([content[place] ^ 1 << int(generator.integers(8))])
+            + content[place + 1 :],
+        )
     digits = [place for place, byte in enumerate(content) if 48 <= byte <= 57]
-    for place in generator.choice(digits, size=min(2 * count, len(digits)), replace=False).tolist() if digits else []:
-        yield f"the digit at {place}", content[:place] + bytes([48 + (content[place] - 48 + int(generator.integers(1, 10))) % 10]) + content[place + 1 :]
+    for place in (
+        generator.choice(digits, size=min(2 * count, len(digits)), replace=False).tolist() if digits else []
+    ):
+        yield (
+            f"the digit at {place}",
+            content[:place]
+            + bytes([48 + (content[place] - 48 + int(generator.integers(1, 10))) % 10])
+            + content[place + 1 :],
+        )
     yield "the end", content[: int(generator.integers(len(content) or 1))]
     yield "nothing left", b""
     yield "more", content + content[-7:] + b" "
@@ -368,13 +425,23 @@ def _harms(content: bytes, generator, count) -> Iterator[tuple[str, bytes]]:
 def _answers(path):
     """All that a folder says, read without its scene."""
     found = jj.load_study(path)
-    numbers = {name: (found.mean(name), found.deviation(name), found.quantile(name, 0.5)) for name in found.outputs}
+    numbers = {
+        name: (found.mean(name), found.deviation(name), found.quantile(name, 0.5)) for name in found.outputs
+    }
     arrays = {name: array.values.tobytes() for name, array in found.to_xarray().load().variables.items()}
-    return {"complete": found.complete, "counts": found.counts, "failed": found.failed.tolist(), "numbers": repr(numbers), "arrays": arrays}
+    return {
+        "complete": found.complete,
+        "counts": found.counts,
+        "failed": found.failed.tolist(),
+        "numbers": repr(numbers),
+        "arrays": arrays,
+    }
 
 
 def _is_right_or_said(path, right):
-    """Whether the answers are right (True), or an error or a warning names the folder (False); an AssertionError otherwise."""
+    """Whether the answers are right (True), or an error or a warning names the folder (False); an
+    AssertionError otherwise.
+    """
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
@@ -389,7 +456,10 @@ def _is_right_or_said(path, right):
     return False
 
 
-@pytest.mark.parametrize(("options", "count"), [({}, 2), ({"save": "statistics"}, 6), ({"keep_every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6)])
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [({}, 2), ({"save": "statistics"}, 6), ({"keep_every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6)],
+)
 def test_whatever_happens_to_a_file_of_a_study_no_other_number_comes_out(tmp_path, options, count):
     generator = np.random.default_rng(1)
     path = tmp_path / "discs.zarr"
@@ -422,9 +492,15 @@ def test_whatever_files_of_a_study_are_exchanged_no_other_number_comes_out(tmp_p
     for folder, seed in ((path, 3), (other, 4)):
         run(folder, seed=seed, outputs={"lean": End("lean")})
     right = _answers(path)
-    names = [file.relative_to(path) for file in sorted(path.rglob("*")) if file.is_file() and file.name != "lock"]
+    names = [
+        file.relative_to(path) for file in sorted(path.rglob("*")) if file.is_file() and file.name != "lock"
+    ]
     contents = {name: (path / name).read_bytes() for name in names}
-    alike = [(a, b) for a, b in combinations(names, 2) if len(contents[a]) == len(contents[b]) and contents[a] != contents[b]]  # chunks, columns, receipts
+    alike = [
+        (a, b)
+        for a, b in combinations(names, 2)
+        if len(contents[a]) == len(contents[b]) and contents[a] != contents[b]
+    ]  # chunks, columns, receipts
     assert len(alike) > 60
     for first, second in np.random.default_rng(0).permutation(alike)[:60]:
         (path / first).write_bytes(contents[second])
@@ -439,11 +515,13 @@ def test_whatever_files_of_a_study_are_exchanged_no_other_number_comes_out(tmp_p
     assert _answers(path) == right
 
 
-# Processes that die. ----------------------------------------------------------------------------------------------------
+# Processes that die. ----------------------------------------------------------------------------------------
 
 
 def _with_deaths(path, deadly, first_block=False):
-    """The study, as processes compute it that die on the chunks `deadly`, whose numbers are asked for; with the number of deaths."""
+    """The study, as processes compute it that die on the chunks `deadly`, whose numbers are asked for; with
+    the number of deaths.
+    """
     owned = study().task(t1=1.0, rtol=1e-6, atol=1e-6)
     opened_store, deaths, runners = opened(owned, path, None, ""), Counter(), []
 
@@ -456,7 +534,11 @@ def _with_deaths(path, deadly, first_block=False):
             yield runners[0].run(number)
         return []
 
-    list(workers.whatever_dies(opened_store, range(opened_store.chunks), lambda: False, compute, workers.MOST_DEATHS - 1))
+    list(
+        workers.whatever_dies(
+            opened_store, range(opened_store.chunks), lambda: False, compute, workers.MOST_DEATHS - 1
+        )
+    )
     return deaths
 
 
@@ -464,7 +546,10 @@ def _with_deaths(path, deadly, first_block=False):
 def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes_on(deadly, whole, tmp_path):
     path = tmp_path / "discs.zarr"
     lanes = ", ".join({1: "32 to 63", 2: "64 to 89"}[number] for number in deadly)
-    with pytest.warns(UserWarning, match=rf"processes died 3 times on lanes {lanes} of .*omitted; all others are stored.*memory=") as said:
+    with pytest.warns(
+        UserWarning,
+        match=rf"processes died 3 times on lanes {lanes} of .*omitted; all others are stored.*memory=",
+    ) as said:
         assert _with_deaths(path, deadly) == dict.fromkeys(deadly, 3)
     assert len(said) == 1
     found = jj.load_study(path)
@@ -475,7 +560,9 @@ def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes
 
 def test_a_first_block_on_which_processes_die_ends_the_study(tmp_path):
     """Every process begins with it: all others would die, too."""
-    with pytest.raises(RuntimeError, match=r"processes died 3 times on lanes 0 to 31 of .*with which every process begins"):
+    with pytest.raises(
+        RuntimeError, match=r"processes died 3 times on lanes 0 to 31 of .*with which every process begins"
+    ):
         _with_deaths(tmp_path / "discs.zarr", (), first_block=True)
 
 
@@ -490,7 +577,17 @@ def test_a_function_counts_by_what_it_does():
         return lambda motion: factor * motion.q_end[0] if text in {"a", "b", "x"} else 0.0
 
     assert digest(made(2.0)) == digest(made(2.0))
-    assert len({digest(made(2.0)), digest(made(3.0)), digest(made(2.0, "y")), digest(lambda motion: motion.q_end[0])}) == 4
+    assert (
+        len(
+            {
+                digest(made(2.0)),
+                digest(made(3.0)),
+                digest(made(2.0, "y")),
+                digest(lambda motion: motion.q_end[0]),
+            }
+        )
+        == 4
+    )
     assert digest(jj.models.TiltingDisc()) != digest(jj.models.TiltingDisc(mass=2.0))
     assert digest(np.arange(3.0)) != digest(np.arange(3))
 
@@ -548,7 +645,9 @@ def test_scenes_of_other_tools_count_by_what_they_were_made_from(tmp_path):
 
     assert counted(of_urdf("0 1 0")) == counted(of_urdf("0 1 0")) != counted(of_urdf("1 0 0"))
     systems = pytest.importorskip("sympy_systems")
-    rolling, slipping = (lambda make=make: jj.from_sympy(*make())() for make in (systems.rolling_disc, systems.slipping_disc))
+    rolling, slipping = (
+        lambda make=make: jj.from_sympy(*make())() for make in (systems.rolling_disc, systems.slipping_disc)
+    )
     assert counted(rolling()) == counted(rolling()) != counted(slipping())
     assert counted(slipping()) == counted(slipping())
 
@@ -569,7 +668,11 @@ def test_what_a_function_reads_of_a_module_of_the_user_counts(monkeypatch):
     module, inner = ModuleType("users_module"), ModuleType("users_module.inner")
     module.inner, module.factor, module.unread, inner.helper = inner, 2.0, 1.0, lambda x: 2.0 * x
     monkeypatch.setitem(globals(), "users_module", module)
-    exec("def output(motion): return users_module.inner.helper(users_module.factor * motion.q_end[0])", globals(), found := {})
+    exec(
+        "def output(motion): return users_module.inner.helper(users_module.factor * motion.q_end[0])",
+        globals(),
+        found := {},
+    )
     before = digest(found["output"])
     module.unread = 3.0
     assert digest(found["output"]) == before
@@ -586,7 +689,7 @@ def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):
         run(tmp_path / "discs.zarr", processes=0)
 
 
-# Other processes. ------------------------------------------------------------------------------------------------
+# Other processes. -------------------------------------------------------------------------------------------
 
 SCRIPT = """
 import sys
@@ -623,13 +726,17 @@ def _wait_for(process, path, count):
 
 
 def _workers(process):
-    return [other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())]
+    return [
+        other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())
+    ]
 
 
 def test_workers_end_with_a_run_that_is_killed_while_they_start(tmp_path):
     process = _started(tmp_path, "discs.zarr", 2)
     workers = []
-    while process.poll() is None and not any(worker.cpu_times().user > 0.5 for worker in workers):  # until one has begun to import
+    while process.poll() is None and not any(
+        worker.cpu_times().user > 0.5 for worker in workers
+    ):  # until one has begun to import
         time.sleep(1e-2)
         workers = _workers(process)
     process.kill()
@@ -655,6 +762,8 @@ def test_runs_and_workers_that_are_killed_lose_and_repeat_nothing(tmp_path):
         process.wait()
     before = {file.name: file.stat().st_mtime_ns for file in path.glob("run/chunks/[0-9]*")}
     assert _started(tmp_path, "discs.zarr").wait() == 0
-    assert all((path / "run" / "chunks" / name).stat().st_mtime_ns == time for name, time in before.items())  # none is done twice
+    assert all(
+        (path / "run" / "chunks" / name).stat().st_mtime_ns == time for name, time in before.items()
+    )  # none is done twice
     assert _started(tmp_path, "whole.zarr").wait() == 0
     assert_same(jj.load_study(path), jj.load_study(tmp_path / "whole.zarr"))

@@ -18,14 +18,27 @@ def _blocks_are_small(monkeypatch):
     monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
 
 
-@pytest.mark.parametrize(("text", "count"), [("2GB", 2_000_000_000), ("1.5 gb", 1_500_000_000), ("512 MiB", 2**29), (800e6, 800_000_000), (10**9, 10**9)])
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("2GB", 2_000_000_000),
+        ("1.5 gb", 1_500_000_000),
+        ("512 MiB", 2**29),
+        (800e6, 800_000_000),
+        (10**9, 10**9),
+    ],
+)
 def test_an_amount_is_read(text, count):
     assert jj.build(jj.models.TiltingDisc(), memory=text).memory == count
 
 
-@pytest.mark.parametrize("wrong", ["much", "2 XB", "-1GB", True, "nan GB", float("inf"), float("nan"), "0.GBs"])
+@pytest.mark.parametrize(
+    "wrong", ["much", "2 XB", "-1GB", True, "nan GB", float("inf"), float("nan"), "0.GBs"]
+)
 def test_what_is_no_amount_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"`memory` is .*, expected a number of bytes, or a text such as '2GB'"):
+    with pytest.raises(
+        ValueError, match=r"`memory` is .*, expected a number of bytes, or a text such as '2GB'"
+    ):
         jj.build(jj.models.TiltingDisc(), memory=wrong)
 
 
@@ -40,7 +53,9 @@ def test_blocks_and_chunks_fit_into_the_bound_and_lanes_are_the_same(tmp_path, m
     free = run(tmp_path / "free.zarr", **TIMES)
     assert (free.store.study["block"], free.store.chunk) == (32, 32)
     of_lane = study().task(t1=1.0, **TIMES).bytes_of_lane
-    tight = run(tmp_path / "tight.zarr", memory=bounded(monkeypatch, 2 * memory.BLOCKS * 8 * of_lane), **TIMES)
+    tight = run(
+        tmp_path / "tight.zarr", memory=bounded(monkeypatch, 2 * memory.BLOCKS * 8 * of_lane), **TIMES
+    )
     assert (tight.store.study["block"], tight.store.chunk) == (8, 8)
     one, other = free.to_xarray().load(), tight.to_xarray().load()
     for name in one.variables:
@@ -63,14 +78,19 @@ def test_a_study_goes_on_with_the_blocks_with_which_it_began(tmp_path, monkeypat
 
 
 def test_a_rollout_runs_fewer_lanes_at_once_where_its_model_has_little_memory(capsys):
-    model, starts = jj.build(jj.models.TiltingDisc(), memory=4 * 3 * 8 * 201 * 12), {"lean": np.linspace(0.1, 0.3, 5)}  # room for three lanes
+    model, starts = (
+        jj.build(jj.models.TiltingDisc(), memory=4 * 3 * 8 * 201 * 12),
+        {"lean": np.linspace(0.1, 0.3, 5)},
+    )  # room for three lanes
     some = jj.rollout(model, starts)
     assert "5/5" in capsys.readouterr().err  # a bar, for several chunks
     assert_array_equal(some.lanes.q, jj.rollout(model.scene, starts).lanes.q)
 
 
 def test_too_little_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ValueError, match="`memory` allows 100 MB for each computing process, but this process holds"):
+    with pytest.raises(
+        ValueError, match="`memory` allows 100 MB for each computing process, but this process holds"
+    ):
         run(tmp_path / "discs.zarr", memory="100MB")
     with pytest.raises(ValueError, match="a new process holds 240 MB before it begins"):
         run(tmp_path / "discs.zarr", memory="1GB", processes=4)
@@ -81,7 +101,10 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
     bound = bounded(monkeypatch, 1e9)
     seen = iter([300e6, 400e6, 400e6, 2e9])  # before the first block; after it, and after each of the next
     monkeypatch.setattr(memory, "resident", lambda: next(seen))
-    with pytest.raises(MemoryError, match="a process holds 2000 MB, and `memory` allows 1300 MB for each; all finished chunks are kept"):
+    with pytest.raises(
+        MemoryError,
+        match="a process holds 2000 MB, and `memory` allows 1300 MB for each; all finished chunks are kept",
+    ):
         run(tmp_path / "discs.zarr", memory=bound)
     monkeypatch.undo()
     monkeypatch.setattr(task, "LARGEST_BLOCK", 32)

@@ -1,4 +1,6 @@
-"""Statistics of studies: right, and the same bits whatever the order of blocks. Sobol' indices against closed forms."""
+"""Statistics of studies: right, and the same bits whatever the order of blocks. Sobol' indices against closed
+forms.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,18 +11,27 @@ from scipy import special
 import jourdain_jax as jj
 from jourdain_jax.studies import Design, End, EventTime, Uniform, sobol_indices
 
-# Sobol' indices. -------------------------------------------------------------------------------------------------
+# Sobol' indices. --------------------------------------------------------------------------------------------
 
 
 def _ishigami(samples):
-    """f = sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 on (-pi, pi)^3 (Ishigami and Homma 1990), its indices in closed form."""
+    """f = sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 on (-pi, pi)^3 (Ishigami and Homma 1990), its indices in
+    closed form.
+    """
     a, b, pi = 7.0, 0.1, np.pi
-    design = Design(dict.fromkeys(("x1", "x2", "x3"), Uniform(-pi, pi)), sampler="saltelli", samples=samples, seed=1)
+    design = Design(
+        dict.fromkeys(("x1", "x2", "x3"), Uniform(-pi, pi)), sampler="saltelli", samples=samples, seed=1
+    )
     x = design.values()
     values = np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"])
     one, two, three = 0.5 * (1 + b * pi**4 / 5) ** 2, a**2 / 8, b**2 * pi**8 * (1 / 18 - 1 / 50)
     variance = one + two + three
-    return design, values, np.array([one, two, 0.0]) / variance, np.array([one + three, two, three]) / variance
+    return (
+        design,
+        values,
+        np.array([one, two, 0.0]) / variance,
+        np.array([one + three, two, three]) / variance,
+    )
 
 
 def test_the_indices_of_ishigamis_function_lie_within_their_limits():
@@ -68,8 +79,17 @@ def test_a_study_has_the_indices_of_its_outputs(tmp_path):
     """T / 4 = sqrt(L / g) K(sin(angle / 2)), with the complete elliptic integral K."""
     ranges = {"length": (0.5, 1.5), "gravity": (9.0, 10.5), "angle_at_start": (0.2, 2.8)}
     length, gravity, angle = (Uniform(*limits) for limits in ranges.values())
-    study = jj.Study(Pendulum(), vary={"length": length, "gravity": gravity}, start={"angle": angle}, sampler="saltelli", samples=5 * 2**6, seed=4)
-    result = study.run(tmp_path / "pendulum.zarr", t1=3.0, rtol=1e-8, outputs={"quarter": EventTime("down")}, progress=False)
+    study = jj.Study(
+        Pendulum(),
+        vary={"length": length, "gravity": gravity},
+        start={"angle": angle},
+        sampler="saltelli",
+        samples=5 * 2**6,
+        seed=4,
+    )
+    result = study.run(
+        tmp_path / "pendulum.zarr", t1=3.0, rtol=1e-8, outputs={"quarter": EventTime("down")}, progress=False
+    )
     assert result.counts == {"event": len(result)}
 
     def quarter(length, gravity, angle):
@@ -86,7 +106,9 @@ def test_a_study_has_the_indices_of_its_outputs(tmp_path):
 
 
 def test_what_lies_beyond_the_grid_is_printed_and_drawn_as_that(tmp_path):
-    """The grid spans twice the range of the first block; the middle between its edge and the extreme says nothing."""
+    """The grid spans twice the range of the first block; the middle between its edge and the extreme says
+    nothing.
+    """
     angles = np.r_[np.linspace(0.0, 1.0, 2048), np.linspace(2.0, 12.0, 2000)]
     study = jj.Study(jj.models.TiltingDisc(), start={"yaw": angles, "lean": 0.1})
     found = study.run(tmp_path / "discs.zarr", t1=1e-6, outputs={"yaw": End("yaw", "rad")}, progress=False)

@@ -96,8 +96,14 @@ WIDE = {
     "dots": ("[" + "a." * 300 + "a]", "dots: nested more than 250 levels deep"),
     "tables": ("a = " + "{ a = " * 300 + "1" + " }" * 300, "tables: nested more than 250 levels deep"),
     "many": (FILE.replace("samples = 100", "samples = 1e30"), "`samples` is 1e+30, expected a whole number"),
-    "long": (FILE.replace("samples = 100", "samples = 1" + "0" * 30), "expected a whole number of at least 1 and at most 9007199254740992"),
-    "date": (FILE.replace("samples = 100", "samples = 2020-01-01"), "`samples` is datetime.date(2020, 1, 1), expected a whole number"),
+    "long": (
+        FILE.replace("samples = 100", "samples = 1" + "0" * 30),
+        "expected a whole number of at least 1 and at most 9007199254740992",
+    ),
+    "date": (
+        FILE.replace("samples = 100", "samples = 2020-01-01"),
+        "`samples` is datetime.date(2020, 1, 1), expected a whole number",
+    ),
     "longer": (FILE.replace("samples = 100", "samples = 1" + "0" * 5000), "longer: not valid TOML"),
     "zero": (FILE + "\0", "zero: a binary file"),
     "latin": ("model = 'd\xefsc'", "latin: not UTF-8 text"),
@@ -105,10 +111,14 @@ WIDE = {
 
 
 def test_whatever_stands_in_a_file_is_taken_or_refused_by_name(tmp_path):
-    """Every entry, one after another, replaced by something else; and files beyond all bounds. In a process without the tests' checks of types."""
+    """Every entry, one after another, replaced by something else; and files beyond all bounds. In a process
+    without the tests' checks of types.
+    """
     for name, (text, _) in WIDE.items():
         (tmp_path / name).write_text(text, encoding="latin-1")
-    done = subprocess.run([sys.executable, "-c", REPLACED, FILE, *WIDE], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", REPLACED, FILE, *WIDE], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     found = lines[: -len(WIDE)]
@@ -131,7 +141,9 @@ def test_a_shard_is_two_whole_numbers(shard, tmp_path, monkeypatch, capsys):
     assert "--shard" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("error", [RuntimeError("workers died 3 times on lanes 0 to 31"), MemoryError("a process holds 900 MB")])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("workers died 3 times on lanes 0 to 31"), MemoryError("a process holds 900 MB")]
+)
 def test_a_study_that_stops_says_why_in_one_line(error, tmp_path, monkeypatch, capsys):
     def stops(*_):
         raise error

@@ -1,4 +1,6 @@
-"""Taylor series by machine code: their coefficients against mpmath, motions against closed forms and Dopri8, and when they are refused."""
+"""Taylor series by machine code: their coefficients against mpmath, motions against closed forms and Dopri8,
+and when they are refused.
+"""
 
 import diffrax
 import jax
@@ -23,11 +25,17 @@ from jourdain_jax.program.graph import Graph
 pytestmark = machine_code.needed
 
 ORDER = 9
-UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")]
+UNARY = [
+    name
+    for name, f in TABLE.items()
+    if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")
+]
 
 
 def coefficients(graph: Graph, s, outputs, at, known=None) -> np.ndarray:
-    """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them; `known`: values of other inputs."""
+    """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them;
+    `known`: values of other inputs.
+    """
     assert not ffi.reason_against()
     w = MachineWriter(host.lanes(), host.fuses())
 
@@ -58,7 +66,9 @@ def test_recurrences_of_functions_give_their_taylor_series():
     graph, at = Graph(), 0.7
     s = graph.input("s", True)
     base = {op: 1.3 if op == "acosh" else 0.4 for op in UNARY}
-    inner = {op: graph.add(graph.const(base[op]), graph.mul(graph.const(0.3), graph.mul(s, s))) for op in UNARY}
+    inner = {
+        op: graph.add(graph.const(base[op]), graph.mul(graph.const(0.3), graph.mul(s, s))) for op in UNARY
+    }
     found = coefficients(graph, s, [graph.call(op, inner[op]) for op in UNARY], at)
     for op, series in zip(UNARY, found.T, strict=True):
         true = expected(lambda s, op=op: in_mpmath(op)(mpmath.mpf(base[op]) + mpmath.mpf(0.3) * s * s), at)
@@ -70,11 +80,15 @@ def test_recurrences_of_two_arguments_give_their_taylor_series():
     s = graph.input("s", True)
     nodes = {"sin": graph.call("sin", s), "exp": graph.call("exp", s), "2.7": graph.const(2.7)}
     true = {"sin": mpmath.sin, "exp": mpmath.exp, "2.7": lambda s: mpmath.mpf(2.7)}
-    cases = [(op, *pair) for op in ("add", "sub", "mul", "div", "atan2") for pair in (("sin", "exp"), ("exp", "sin"))]
+    cases = [
+        (op, *pair)
+        for op in ("add", "sub", "mul", "div", "atan2")
+        for pair in (("sin", "exp"), ("exp", "sin"))
+    ]
     cases.append(("pow", "sin", "2.7"))
     found = coefficients(graph, s, [graph.call(op, nodes[a], nodes[b]) for op, a, b in cases], 0.7)
     for (op, a, b), series in zip(cases, found.T, strict=True):
-        f = lambda s, op=op, a=a, b=b: in_mpmath(op)(true[a](s), true[b](s))  # noqa: E731
+        f = lambda s, op=op, a=a, b=b: in_mpmath(op)(true[a](s), true[b](s))
         assert_allclose(series, expected(f, 0.7), rtol=1e-13, atol=1e-13, err_msg=f"{op} of {a} and {b}")
 
 
@@ -85,11 +99,22 @@ def test_series_of_random_programs_are_those_of_mpmath(seed):
     nodes = [(s, lambda s: s), (p, lambda s: mpmath.mpf(1.5)), (graph.const(0.3), lambda s: mpmath.mpf(0.3))]
     for _ in range(14):
         (a, f), (b, g) = (nodes[i] for i in random.integers(len(nodes), size=2))
-        op = str(random.choice(["add", "sub", "mul", "mul", "div", "sin", "cos", "tanh", "atan", "sqrt", "logistic"]))
+        op = str(
+            random.choice(
+                ["add", "sub", "mul", "mul", "div", "sin", "cos", "tanh", "atan", "sqrt", "logistic"]
+            )
+        )
         if op in ("add", "sub", "mul"):
             nodes.append((graph.call(op, a, b), _composed(in_mpmath(op), f, g)))
         elif op in ("div", "sqrt"):  # of what is not small
-            nodes.append((graph.call(op, *([a] if op == "div" else []), graph.add(graph.const(2.0), graph.mul(b, b))), _guarded(op, f, g)))
+            nodes.append(
+                (
+                    graph.call(
+                        op, *([a] if op == "div" else []), graph.add(graph.const(2.0), graph.mul(b, b))
+                    ),
+                    _guarded(op, f, g),
+                )
+            )
         else:
             nodes.append((graph.call(op, a), _composed(in_mpmath(op), f)))
     outputs = [n for n, _ in nodes[3:]]
@@ -107,7 +132,7 @@ def _guarded(op, f, g):
     return (lambda s: f(s) / (2 + g(s) ** 2)) if op == "div" else (lambda s: mpmath.sqrt(2 + g(s) ** 2))
 
 
-# Motions. -------------------------------------------------------------------------------------------------------------
+# Motions. ---------------------------------------------------------------------------------------------------
 
 DISC, SLEIGH = jj.models.TiltingDisc(), jj.models.ChaplyginSleigh()
 
@@ -141,7 +166,9 @@ def test_errors_of_a_sleigh_fall_with_the_tolerance_and_steps_with_the_order():
 def test_motions_with_projection_and_work_are_those_of_dopri8(span):
     scene = jj.models.MODELS["double-pendulum-rods"]()
     options = {"ts": np.linspace(0.0, span, 11), "rtol": 1e-11, "atol": 1e-11}
-    ours, theirs = (jj.simulate(scene, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    ours, theirs = (
+        jj.simulate(scene, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8())
+    )
     assert ours.solver == "Taylor"
     for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end)):
         assert_allclose(a, b, rtol=1e-9, atol=1e-9)
@@ -154,7 +181,10 @@ def test_motions_with_projection_and_work_are_those_of_dopri8(span):
 
 def test_a_disc_that_falls_stops_where_it_does_by_dopri8():
     options = {"ts": np.linspace(0.0, 5.0, 51), "rtol": 1e-11, "atol": 1e-11}
-    ours, theirs = (jj.simulate(DISC, {"lean": 0.6, "spin_rate": -0.1}, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    ours, theirs = (
+        jj.simulate(DISC, {"lean": 0.6, "spin_rate": -0.1}, solver=solver, **options)
+        for solver in (jj.Taylor(), diffrax.Dopri8())
+    )
     assert ours.result == int(theirs.result) == results.EVENT
     assert_allclose(ours.t_end, theirs.t_end, rtol=1e-11)
     assert_allclose(ours.q_end, theirs.q_end, rtol=1e-9, atol=1e-10)
@@ -165,9 +195,18 @@ def test_a_disc_that_falls_stops_where_it_does_by_dopri8():
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), backend="xla"), "jj.Taylor\\(\\) cannot integrate `TiltingDisc`: another backend"),
-        (lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)), "products, more than"),
-        (lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()), "has no Taylor series"),
+        (
+            lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), backend="xla"),
+            "jj.Taylor\\(\\) cannot integrate `TiltingDisc`: another backend",
+        ),
+        (
+            lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)),
+            "products, more than",
+        ),
+        (
+            lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()),
+            "has no Taylor series",
+        ),
         (lambda: jj.simulate(Power(), {"x": 0.3}, t1=1.0, solver=jj.Taylor()), "an exponent varies"),
         (lambda: jj.Taylor(2), "`order` is 2, expected a whole number from 4 to 30"),
     ],

@@ -19,7 +19,10 @@ TIED = {"offset": jj.bounds(0.05, 1.0), "inertia": lambda scene: 0.5 * scene.mas
 
 def measured(seed, repeats=()) -> jj.Experiment:
     motion, noise = jj.simulate(TRUTH, START, ts=TIMES), np.random.default_rng(seed)
-    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(*repeats, TIMES.size)) for name in ("x", "heading")}
+    values = {
+        name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(*repeats, TIMES.size))
+        for name in ("x", "heading")
+    }
     return jj.Experiment(TIMES, values, 0.01, start=START)
 
 
@@ -46,7 +49,9 @@ def test_a_tied_parameter_follows_and_its_interval_with_it(found):
 
 def test_the_page_of_a_fit_tells_tied_parameters(found, tmp_path):
     found.report(tmp_path / "fit.html")
-    assert re.search(rf"inertia +kg m\^2 +{found.scene.inertia:.6g} .*\(tied\)", (tmp_path / "fit.html").read_text())
+    assert re.search(
+        rf"inertia +kg m\^2 +{found.scene.inertia:.6g} .*\(tied\)", (tmp_path / "fit.html").read_text()
+    )
 
 
 def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
@@ -55,8 +60,12 @@ def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
 
     best, step = float(found.scene.offset), float(found["offset"].standard_error)
     below, at, above = (along(best + k * step) for k in (-1, 0, 1))
-    assert abs(above - below) < 0.02 * (2 * at - above - below)  # the parabola's top is within a hundredth of a standard error
-    assert_allclose(2 * at - above - below, 1.0, rtol=0.05)  # one standard error is half a unit down to either side
+    assert abs(above - below) < 0.02 * (
+        2 * at - above - below
+    )  # the parabola's top is within a hundredth of a standard error
+    assert_allclose(
+        2 * at - above - below, 1.0, rtol=0.05
+    )  # one standard error is half a unit down to either side
 
 
 def test_a_density_has_the_slope_along_the_tie(data):
@@ -72,13 +81,19 @@ def test_ties_of_a_batch_and_in_pieces_are_those_of_one_fit(found, data):
     batch = jj.fit_batch(Sleigh(mass=2.0), measured(0, (3,)), free=TIED)
     assert_allclose(batch.scene.inertia, batch.scene.offset, rtol=1e-15)
     assert_allclose(batch.tied["inertia"].standard_error, batch["offset"].standard_error, rtol=1e-12)
-    assert_allclose(batch.derived(lambda scene: scene.inertia).standard_error, batch["offset"].standard_error, rtol=1e-9)
+    assert_allclose(
+        batch.derived(lambda scene: scene.inertia).standard_error, batch["offset"].standard_error, rtol=1e-9
+    )
     pieces = jj.fit(Sleigh(mass=2.0), data, free=TIED, shooting=MultipleShooting(pieces=2))
     assert_allclose(pieces.scene.inertia, found.scene.inertia, rtol=1e-4)
 
 
 def test_ties_follow_from_ties_before_them(data):
-    free = {"offset": None, "inertia": lambda scene: scene.offset * 1.0, "mass": lambda scene: 8.0 * scene.inertia}
+    free = {
+        "offset": None,
+        "inertia": lambda scene: scene.offset * 1.0,
+        "mass": lambda scene: 8.0 * scene.inertia,
+    }
     density = log_density(Sleigh(), data, free=free)
     scene = density.scene_at(density.unconstrain({"offset": 0.3}))
     assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
@@ -95,7 +110,9 @@ def test_a_combination_is_told_whose_parts_are_not(data):
     several = together.derived(lambda scene: jnp.stack([scene.mass, scene.offset, scene.offset**2]))
     assert np.isnan(several.standard_error[0])
     assert_allclose(several.standard_error[1], together["offset"].standard_error, rtol=1e-9)
-    assert_allclose(several.standard_error[2], 2 * together["offset"].value * together["offset"].standard_error, rtol=1e-9)
+    assert_allclose(
+        several.standard_error[2], 2 * together["offset"].value * together["offset"].standard_error, rtol=1e-9
+    )
 
 
 def test_a_derived_number_at_a_bound_has_no_interval(data):

@@ -1,9 +1,10 @@
-"""Scenes whose parameters are traced by a user's own `jit`, `vmap` or `grad`: the right motion or a code that says why not, never another structure.
+"""Scenes whose parameters are traced by a user's own `jit`, `vmap` or `grad`: the right motion or a code that
+says why not, never another structure.
 
-What holds of a scene is found before anything is compiled, at numbers that stand in for traced parameters. These scenes sit at special values by
-default, where rows are dependent, a coordinate does not matter, or nothing does work, and are given generic ones; or the other way round.
+What holds of a scene is found before anything is compiled, at numbers that stand in for traced parameters.
+These scenes sit at special values by default, where rows are dependent, a coordinate does not matter, or
+nothing does work, and are given generic ones; or the other way round.
 """
-
 
 import diffrax
 import jax
@@ -20,7 +21,9 @@ from jourdain_jax.models import ChaplyginSleigh
 
 
 class TwoBlades(jj.Scene):
-    """A plate on two parallel blades, turned by a torque: at one place they are one blade, at two places the plate can only slide along."""
+    """A plate on two parallel blades, turned by a torque: at one place they are one blade, at two places the
+    plate can only slide along.
+    """
 
     mass: float = jj.parameter(1.3, unit="kg", positive=True)
     inertia: float = jj.parameter(0.4, unit="kg m^2", positive=True)
@@ -39,7 +42,10 @@ class TwoBlades(jj.Scene):
     def velocity_constraints(self, motion):
         plate = motion["plate"]
         places = {"front": self.front, "rear": self.rear}
-        return {name: jj.knife_edge(plate, plate.place([a, 0.0, 0.0]), plate.orientation[:, 1]) for name, a in places.items()}
+        return {
+            name: jj.knife_edge(plate, plate.place([a, 0.0, 0.0]), plate.orientation[:, 1])
+            for name, a in places.items()
+        }
 
 
 class Slope(OnPlane):
@@ -80,7 +86,12 @@ class SmallLoop(Upright):
     domain = {"x": (-0.03, 0.03), "z": (-0.03, 0.03)}
 
     def geometric_constraints(self, pose):
-        return {"ring": jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0)) - jnp.sqrt(0.0025 - self.radius**2)}
+        return {
+            "ring": (
+                jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0))
+                - jnp.sqrt(0.0025 - self.radius**2)
+            )
+        }
 
 
 OPTIONS = {"ts": np.array([0.0, 0.4, 0.8]), "rtol": 1e-10, "atol": 1e-10}
@@ -124,19 +135,30 @@ def test_parameters_without_defaults_may_be_traced():
 
 def test_a_traced_parameter_without_default_that_fits_no_state_of_the_domain_is_refused():
     assert jj.structure_of(SmallLoop(radius=0.02)).rank == 1
-    with pytest.raises(ValueError, match="replaced by numbers near their defaults, or near 1 without a default: give defaults near"):
+    with pytest.raises(
+        ValueError,
+        match="replaced by numbers near their defaults, or near 1 without a default: give defaults near",
+    ):
         jax.jit(lambda radius: jj.structure_of(SmallLoop(radius=radius)).rank)(0.02)
 
 
 def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameters():
     q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(0.3, 0.5)
     assert int(code) == results.SUCCESS
-    forward = 0.7 * np.cos(0.3) + 0.4 * np.sin(0.3)  # the one speed that two blades at two places let the plate keep
+    forward = 0.7 * np.cos(0.3) + 0.4 * np.sin(
+        0.3
+    )  # the one speed that two blades at two places let the plate keep
     assert_allclose(q, [0.8 * forward * np.cos(0.3), 0.8 * forward * np.sin(0.3), 0.3], atol=1e-9)
-    many, codes = jax.vmap(lambda front, rear: sliding(front=front, rear=rear))(jnp.array([0.3, 0.1]), jnp.array([0.5, 0.9]))
+    many, codes = jax.vmap(lambda front, rear: sliding(front=front, rear=rear))(
+        jnp.array([0.3, 0.1]), jnp.array([0.5, 0.9])
+    )
     assert_allclose(many, np.stack([q, q]), atol=1e-9)
     assert codes.tolist() == [results.SUCCESS] * 2
-    assert_allclose(jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5), np.zeros((2, 3)), atol=1e-9)
+    assert_allclose(
+        jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5),
+        np.zeros((2, 3)),
+        atol=1e-9,
+    )
 
 
 def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced_parameters():
@@ -150,7 +172,9 @@ def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced
     work = 0.5 * 2.0 * 1.3**2 * ((1 + x) ** 2 - 1.5**2)
     expected = [x, y, work]
     assert_allclose(jax.jit(end)(0.7, 1.3), expected, atol=1e-8)
-    assert_allclose(jax.vmap(end)(jnp.array([0.7, 0.0]), jnp.array([1.3, 0.0])), [expected, [0.5, 0.0, 0.0]], atol=1e-8)
+    assert_allclose(
+        jax.vmap(end)(jnp.array([0.7, 0.0]), jnp.array([1.3, 0.0])), [expected, [0.5, 0.0, 0.0]], atol=1e-8
+    )
     slopes = jax.jit(jax.jacrev(end, (0, 1)))(0.7, 1.3)
     h = 1e-5
     assert_allclose(slopes[0], (end(0.7 + h, 1.3) - end(0.7 - h, 1.3)) / (2 * h), atol=1e-5)
@@ -184,7 +208,9 @@ def test_a_start_that_is_known_is_put_onto_the_rows_while_other_numbers_are_trac
     alone = jj.simulate(skate, start, t1=t1).q_end
     of_time = jax.jit(lambda t1: jj.simulate(skate, start, t1=t1).q_end)
     within = jax.jit(lambda t1: jj.simulate(skate, jj.start(skate, **skate.example), t1=t1).q_end)
-    of_tolerance = jax.jit(lambda rtol: jj.simulate(skate, start, t1=t1, rtol=rtol, solver=diffrax.Dopri8()).q_end)
+    of_tolerance = jax.jit(
+        lambda rtol: jj.simulate(skate, start, t1=t1, rtol=rtol, solver=diffrax.Dopri8()).q_end
+    )
     for found in (of_time(t1), within(t1), of_tolerance(1e-10)):
         assert_allclose(found, alone, rtol=1e-7)
 

@@ -1,4 +1,6 @@
-"""Two wheels on a rigid axle (Wang and Pao 2003, section VI): Methods I, II, III and the redundant rows are one motion."""
+"""Two wheels on a rigid axle (Wang and Pao 2003, section VI): Methods I, II, III and the redundant rows are
+one motion.
+"""
 
 import equinox as eqx
 import jax
@@ -13,7 +15,12 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations import constraint_rows
-from jourdain_jax.models import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
+from jourdain_jax.models import (
+    TwoWheelAxleCoordinates,
+    TwoWheelAxleFree,
+    TwoWheelAxleQuasi,
+    TwoWheelAxleRedundant,
+)
 
 ROUND_OFF = tolerance("round_off")
 PARAMETERS = {"radius": 0.27, "length": 0.9, "mass": 1.7, "rim_mass": 0.4, "slope": 0.35}
@@ -45,11 +52,15 @@ def test_the_accelerations_obey_appells_equations_64(method):
 @pytest.mark.parametrize("turn_rate", [two_wheel_axle.RUN["phi_rate"], 0.0], ids=["turning", "straight"])
 def test_the_motion_is_the_closed_form(method, turn_rate):
     run = two_wheel_axle.RUN | {"phi_rate": turn_rate, "y1": 0.0}
-    scene = method(**{name: run[name] for name in ("radius", "length", "mass", "rim_mass", "slope", "gravity")})
+    scene = method(
+        **{name: run[name] for name in ("radius", "length", "mass", "rim_mass", "slope", "gravity")}
+    )
     _, rolling, turning = NAMES[method]
     start = {"y2": run["length"], rolling: run["psi1_rate"], turning: turn_rate}
     columns = {rolling: "psi1_rate", turning: "phi_rate"} | ({"y1": "y1"} if turn_rate else {})
-    assert end_error(scene, start, two_wheel_axle.motion, run, "x1 psi1 x2 y2 psi2", **columns) <= tolerance("closed_form")
+    assert end_error(scene, start, two_wheel_axle.motion, run, "x1 psi1 x2 y2 psi2", **columns) <= tolerance(
+        "closed_form"
+    )
 
 
 def _rank_of_eleven_rows(heading, without=None):
@@ -80,8 +91,13 @@ def test_redundant_rows_give_the_accelerations_and_forces_of_ten_rows():
     free, redundant = TwoWheelAxleFree(**PARAMETERS), TwoWheelAxleRedundant(**PARAMETERS)
     _, q, u = (jnp.asarray(x) for x in jj.sample_states(free, 20))
     for heading in (0.0, np.pi / 2):  # (60b), (60a) do their work alone here
-        turned, moving, _ = free.named(phi1=heading, phi2=heading, z1=0.27, z2=0.27, psi1_rate=1.0, phi1_rate=0.5)
-        q, u = jnp.concatenate([q, turned[None]]), jnp.concatenate([u, jj.consistent(free, 0.0, turned, moving).u[None]])
+        turned, moving, _ = free.named(
+            phi1=heading, phi2=heading, z1=0.27, z2=0.27, psi1_rate=1.0, phi1_rate=0.5
+        )
+        q, u = (
+            jnp.concatenate([q, turned[None]]),
+            jnp.concatenate([u, jj.consistent(free, 0.0, turned, moving).u[None]]),
+        )
 
     @jax.jit
     @jax.vmap
@@ -100,14 +116,21 @@ def _rolling_acceleration(reduction, x):
     psi1, turn = 1.3, 0.5
     psi2 = psi1 - l / a * turn
     c, s = jnp.cos(phi), jnp.sin(phi)
-    speeds = {"x1_rate": a * c * psi1, "y1_rate": a * s * psi1, "x2_rate": a * c * psi2, "y2_rate": a * s * psi2}
+    speeds = {
+        "x1_rate": a * c * psi1,
+        "y1_rate": a * s * psi1,
+        "x2_rate": a * c * psi2,
+        "y2_rate": a * s * psi2,
+    }
     speeds |= {"psi1_rate": psi1, "psi2_rate": psi2, "phi1_rate": turn, "phi2_rate": turn}
     q, u, _ = scene.named(phi1=phi, phi2=phi, z1=a, z2=a, **speeds)
     solved = jj.accelerations(scene, 0.0, q, u, reduction=reduction)
     return solved.udot[scene.speed_names.entries.index("psi1_rate")]
 
 
-@pytest.mark.parametrize("name", ["qr", "privileged", "svd", "kkt", "udwadia-kalaba"])  # half a minute of compilation each
+@pytest.mark.parametrize(
+    "name", ["qr", "privileged", "svd", "kkt", "udwadia-kalaba"]
+)  # half a minute of compilation each
 def test_derivatives_through_dependent_rows_are_those_of_equation_64(name):
     reduction = jj.reductions(TwoWheelAxleRedundant())[name]
     directions = jax.random.normal(jax.random.key(0), (2, 6))
@@ -116,7 +139,9 @@ def test_derivatives_through_dependent_rows_are_those_of_equation_64(name):
         a, _, M, m, slope, phi = x
         return M * 9.81 * jnp.sin(slope) * jnp.cos(phi) / (a * (M + m))
 
-    differentiate = jax.jit(lambda x: derivatives(lambda x: _rolling_acceleration(reduction, x), x, directions))
+    differentiate = jax.jit(
+        lambda x: derivatives(lambda x: _rolling_acceleration(reduction, x), x, directions)
+    )
     for heading in (0.4, 0.0, np.pi / 2):
         x = jnp.array([0.27, 0.9, 1.7, 0.4, 0.35, heading])
         expected = derivatives(exact, x, directions)

@@ -1,4 +1,6 @@
-"""Quantities with units are no numbers: as numbers they would lose their unit, and 1,300 g would become 1,300 kg."""
+"""Quantities with units are no numbers: as numbers they would lose their unit, and 1,300 g would become 1,300
+kg.
+"""
 
 import types
 

@@ -1,4 +1,6 @@
-"""`verify` finds what is wrong in a scene that states something wrong, and names the body, load or row at fault."""
+"""`verify` finds what is wrong in a scene that states something wrong, and names the body, load or row at
+fault.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +13,21 @@ from jourdain_jax.analysis.statements import statement_checks
 
 
 class Sledge(jj.Scene):
-    """A sprung body on a knife edge and a bead that a bar ties to it; right as it stands, its methods are replaced by wrong ones below."""
+    """A sprung body on a knife edge and a bead that a bar ties to it; right as it stands, its methods are
+    replaced by wrong ones below.
+    """
 
     mass: object = jj.parameter(1.2, unit="kg", positive=True)
     stiffness: object = jj.parameter(3.0, unit="N/m")
     coordinates = jj.coordinates("x y yaw bead_x bead_y")
     example = {"x": 0.4, "y": -0.3, "yaw": 0.5, "bead_x": 1.1, "bead_y": 0.6, "yaw_rate": 0.3}
-    domain = {"x": (0.2, 0.6), "y": (-0.6, -0.2), "yaw": (0.2, 0.8), "bead_x": (0.8, 1.2), "bead_y": (0.4, 0.9)}
+    domain = {
+        "x": (0.2, 0.6),
+        "y": (-0.6, -0.2),
+        "yaw": (0.2, 0.8),
+        "bead_x": (0.8, 1.2),
+        "bead_y": (0.4, 0.9),
+    }
 
     def bodies(self, t, q):
         zero = jnp.zeros_like(q.x)
@@ -54,9 +64,13 @@ def wrong(**methods) -> tuple[jj.Scene, jj.State]:
 
 
 def statements(scene: jj.Scene, state: jj.State) -> Verification:
-    """Of the verification, the part that looks at what the scene states, piece by piece: the rest takes a quarter of a minute to compile."""
+    """Of the verification, the part that looks at what the scene states, piece by piece: the rest takes a
+    quarter of a minute to compile.
+    """
     Z = jnp.eye(len(state.u))
-    return Verification("Wrong", tuple(statement_checks(scene, state.t, state.q, state.u, jnp.zeros(0), Z, 0)), ())
+    return Verification(
+        "Wrong", tuple(statement_checks(scene, state.t, state.q, state.u, jnp.zeros(0), Z, 0)), ()
+    )
 
 
 def refused(found: Verification, check, culprit):
@@ -78,7 +92,11 @@ def with_slope(f, slope):
     return made
 
 
-@pytest.mark.parametrize("scene", [Sledge(), DiscWithHeightRow(), DrivenPendulum(), BeadOnTurningWire(damping=0.4)], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scene",
+    [Sledge(), DiscWithHeightRow(), DrivenPendulum(), BeadOnTurningWire(damping=0.4)],
+    ids=lambda s: type(s).__name__,
+)
 def test_right_scenes_pass_at_random_states(scene):
     t, q, u = (x[0] for x in jj.sample_states(scene, 1, seed=3))
     found = jj.verify(scene, jj.consistent(scene, t, q, u))
@@ -97,13 +115,22 @@ def test_a_potential_that_does_not_give_the_force_is_found_at_its_load():
 
 PUSH = with_slope(lambda x: 1.0 + 0.3 * jnp.sin(x), lambda x, dx: 0.3 * jnp.sin(x) * dx)
 BRAKE = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)  # right at rest
-ACROSS = with_slope(lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]), lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx)
-LENGTH = with_slope(lambda d: jnp.sqrt(d @ d), lambda d, dd: jnp.array([1.0, 0.7, 1.0]) * d @ dd / jnp.sqrt(d @ d))
+ACROSS = with_slope(
+    lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]),
+    lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx,
+)
+LENGTH = with_slope(
+    lambda d: jnp.sqrt(d @ d), lambda d, dd: jnp.array([1.0, 0.7, 1.0]) * d @ dd / jnp.sqrt(d @ d)
+)
 BENT = with_slope(jnp.sin, lambda x, dx: 0.9 * jnp.cos(x) * dx)
 
 
 def energy(of):
-    return {"potential": lambda self, pose: of(pose["bead"].position[0])}, "derivatives", "the scene's `potential`"
+    return (
+        {"potential": lambda self, pose: of(pose["bead"].position[0])},
+        "derivatives",
+        "the scene's `potential`",
+    )
 
 
 def inertia(entries, sentence="body `sledge`"):
@@ -112,12 +139,19 @@ def inertia(entries, sentence="body `sledge`"):
 
 
 def bead(mass, x):
-    return {"bodies": lambda self, t, q: Sledge.bodies(self, t, q) | {"bead": jj.Particle(mass, jnp.stack([x(q.bead_x), q.bead_y, 0.0 * q.x]))}}
+    return {
+        "bodies": lambda self, t, q: (
+            Sledge.bodies(self, t, q)
+            | {"bead": jj.Particle(mass, jnp.stack([x(q.bead_x), q.bead_y, 0.0 * q.x]))}
+        )
+    }
 
 
 def stretched(self, t, q):
     sledge = Sledge.bodies(self, t, q)["sledge"]
-    return Sledge.bodies(self, t, q) | {"sledge": jj.RigidBody(sledge.mass, sledge.inertia, sledge.position, 1.1 * sledge.orientation)}
+    return Sledge.bodies(self, t, q) | {
+        "sledge": jj.RigidBody(sledge.mass, sledge.inertia, sledge.position, 1.1 * sledge.orientation)
+    }
 
 
 def pushed(self, motion):
@@ -138,15 +172,29 @@ WRONG = {  # methods of the sledge, the check that must fail, and what it must n
         "derivatives",
         "its force on `yaw_rate`",
     ),
-    "the drift of a velocity row": ({"blade": lambda self, motion: motion["sledge"].velocity @ ACROSS(motion.q.yaw)}, "derivatives", "constraint `blade`"),
-    "the gradient of a geometric row": ({"bar": lambda self, a, b: LENGTH(b - a) - 0.9}, "derivatives", "constraint `bar`"),
+    "the drift of a velocity row": (
+        {"blade": lambda self, motion: motion["sledge"].velocity @ ACROSS(motion.q.yaw)},
+        "derivatives",
+        "constraint `blade`",
+    ),
+    "the gradient of a geometric row": (
+        {"bar": lambda self, a, b: LENGTH(b - a) - 0.9},
+        "derivatives",
+        "constraint `bar`",
+    ),
     "a pose": (bead(0.3, BENT), "derivatives", "body `bead`: its position"),
-    "an inertia that is not symmetric": inertia([[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"),
+    "an inertia that is not symmetric": inertia(
+        [[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"
+    ),
     "a negative moment": inertia([[0.2, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.1]], NEGATIVE),
     "a large product of inertia": inertia([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], NEGATIVE),
     "an inertia that is not a number": inertia([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]]),
     "a negative mass": (bead(-0.3, lambda x: x), "inertia", "body `bead`: its mass is negative"),
-    "an orientation that is no rotation": ({"bodies": stretched}, "inertia", "body `sledge`: its orientation is no rotation matrix"),
+    "an orientation that is no rotation": (
+        {"bodies": stretched},
+        "inertia",
+        "body `sledge`: its orientation is no rotation matrix",
+    ),
 }
 
 
@@ -183,11 +231,17 @@ class TwoBlades(OnPlane):
 
 @pytest.mark.parametrize(
     ("change", "exists"),
-    [({"slopes": [1.0, 1.0], "mass": 0.0}, True), ({"slopes": [1.0, 0.0], "mass": 0.0}, False), ({"slopes": [0.0, 0.0], "mass": 1.0}, True)],
+    [
+        ({"slopes": [1.0, 1.0], "mass": 0.0}, True),
+        ({"slopes": [1.0, 0.0], "mass": 0.0}, False),
+        ({"slopes": [0.0, 0.0], "mass": 1.0}, True),
+    ],
 )
 def test_a_derivative_that_splits_dependent_rows_does_not_exist(change, exists):
     scene = TwoBlades()
-    assert derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
+    assert (
+        derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
+    )
 
 
 def test_verification_leaves_out_a_derivative_that_does_not_exist_and_says_so():

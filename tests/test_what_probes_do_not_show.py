@@ -1,4 +1,6 @@
-"""Programs are judged at probes. What these cannot show, because a branch lies elsewhere or only derivatives differ, must not be concluded from them."""
+"""Programs are judged at probes. What these cannot show, because a branch lies elsewhere or only derivatives
+differ, must not be concluded from them.
+"""
 
 from collections.abc import Callable
 
@@ -22,16 +24,22 @@ def looked_up(x, table=None):
 
 def ends(scene, start):
     """Of the lowered and of the dense motion."""
-    return [jj.simulate(scene, start, t1=1.0, backend=backend, **TIGHT).q_end for backend in ("auto", "dense")]
+    return [
+        jj.simulate(scene, start, t1=1.0, backend=backend, **TIGHT).q_end for backend in ("auto", "dense")
+    ]
 
 
 class Fading(OnPlane):
     """Two look-ups, one of whose operands leaves the other long after all probes."""
 
     def loads(self, motion):
-        force = lambda x: -looked_up(x)  # noqa: E731
+        force = lambda x: -looked_up(x)
         x = motion.q.x
-        return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))
+            ),
+        )
 
 
 def test_calls_whose_operands_differ_later_stay_two():
@@ -39,13 +47,25 @@ def test_calls_whose_operands_differ_later_stay_two():
 
 
 class Filtered(OnPlane):
-    """Two calls of one kind: what they are given as numbers is the same, the arrays that other calls hand them are not."""
+    """Two calls of one kind: what they are given as numbers is the same, the arrays that other calls hand
+    them are not.
+    """
 
     def loads(self, motion):
-        filtered = lambda x: jax.lax.scan(lambda c, k: (jnp.tanh(c + k * x), c), 0.1 * x, jnp.linspace(0.2, 1.0, 40))[1]  # noqa: E731
-        halved = lambda values: jax.lax.while_loop(lambda v: jnp.max(v) > 0.1, lambda v: 0.5 * v, values).sum()  # noqa: E731
+        filtered = lambda x: jax.lax.scan(
+            lambda c, k: (jnp.tanh(c + k * x), c), 0.1 * x, jnp.linspace(0.2, 1.0, 40)
+        )[1]
+        halved = lambda values: jax.lax.while_loop(
+            lambda v: jnp.max(v) > 0.1, lambda v: 0.5 * v, values
+        ).sum()
         common = 2.0 + jnp.sin(filtered(motion.u.x_rate)[3])
-        return (jj.generalized_force(motion, x_rate=-halved(common * filtered(motion.q.x)), y_rate=-halved(common * filtered(motion.q.y))),)
+        return (
+            jj.generalized_force(
+                motion,
+                x_rate=-halved(common * filtered(motion.q.x)),
+                y_rate=-halved(common * filtered(motion.q.y)),
+            ),
+        )
 
 
 def test_calls_of_what_different_calls_made_stay_two():
@@ -65,7 +85,9 @@ class Pushed(OnPlane):
 PUSHES = {
     "switched on": lambda motion, _: jnp.where(motion.t > 2.0, -4.0 * motion.q.x, 0.0),
     "growing": lambda motion, _: -motion.q.x * jnp.maximum(motion.t - 2.0, 0.0),
-    "table in time": lambda motion, _: -motion.q.x * jnp.interp(motion.t, jnp.array([0.0, 2.0, 3.0]), jnp.array([0.0, 0.0, 4.0])),
+    "table in time": lambda motion, _: (
+        -motion.q.x * jnp.interp(motion.t, jnp.array([0.0, 2.0, 3.0]), jnp.array([0.0, 0.0, 4.0]))
+    ),
     "branch elsewhere": lambda motion, _: jnp.where(motion.q.y > 50.0, -4.0 * motion.q.x, 0.0),
     "wall": lambda motion, _: -50.0 * jax.nn.sigmoid((motion.q.x - 5.0) / 0.02),
     "hill": lambda motion, _: jnp.exp(-((motion.q.x - 20.0) ** 2)),
@@ -81,8 +103,12 @@ def test_a_force_that_acts_later_elsewhere_or_for_other_parameters_is_there(name
 
 def test_a_force_that_sets_in_later_acts_and_one_program_serves_all_parameters():
     later, spring = Pushed(PUSHES["switched on"]), Pushed(PUSHES["tiny by its parameter"])
-    assert jj.simulate(later, {"x": 1.0}, t1=3.0, rtol=1e-9, atol=1e-9).q_end[0] == pytest.approx(np.cos(2.0), abs=1e-7)
-    lanes = jj.rollout(spring, {"x": 1.0}, parameters={"size": jnp.array([1e-10, 4.0])}, t1=1.0, rtol=1e-9, atol=1e-9).lanes
+    assert jj.simulate(later, {"x": 1.0}, t1=3.0, rtol=1e-9, atol=1e-9).q_end[0] == pytest.approx(
+        np.cos(2.0), abs=1e-7
+    )
+    lanes = jj.rollout(
+        spring, {"x": 1.0}, parameters={"size": jnp.array([1e-10, 4.0])}, t1=1.0, rtol=1e-9, atol=1e-9
+    ).lanes
     assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
 
 
@@ -95,7 +121,9 @@ class Ground(InSpace):
 
     def geometric_constraints(self, pose):
         x, _, z = pose["mass"].position
-        return {"ground": z - self.slope * x - (self.bump * jnp.exp(-((x - 6.0) ** 2)) if self.with_bump else 0.0)}
+        return {
+            "ground": z - self.slope * x - (self.bump * jnp.exp(-((x - 6.0) ** 2)) if self.with_bump else 0.0)
+        }
 
 
 @pytest.mark.parametrize("scene", [Ground(slope=0.5), Ground(bump=0.3, with_bump=True)])
@@ -112,7 +140,7 @@ class Small(OnPlane):
     scale: object = jj.parameter(1e11)
 
     def loads(self, motion):
-        force = lambda table: self.scale * looked_up(motion.q.x, table)  # noqa: E731
+        force = lambda table: self.scale * looked_up(motion.q.x, table)
         return (jj.generalized_force(motion, x_rate=force(self.table), y_rate=force(-self.table)),)
 
 
@@ -121,7 +149,11 @@ def test_operands_are_compared_relative_to_their_size():
 
 
 def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
-    called = Pushed(lambda motion, _: jax.pure_callback(lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x))
+    called = Pushed(
+        lambda motion, _: jax.pure_callback(
+            lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x
+        )
+    )
     motion = jj.simulate(called, {"x": 1.0}, t1=1.0, formulation=jj.Formulation(stabilisation=None), **TIGHT)
     assert motion.u_end[0] ** 2 / 2 - np.cos(motion.q_end[0]) == pytest.approx(-np.cos(1.0), abs=1e-7)
     with pytest.raises(NotImplementedError, match="vmap"):
@@ -147,7 +179,9 @@ def test_every_call_says_why_it_is_one():
 def test_a_start_that_hardly_depends_on_a_parameter_gives_no_warning(recwarn):
     def end(k):
         options = {"t1": 3.0, "rtol": 1e-8, "atol": 1e-8}
-        return jj.simulate(Pushed(PUSHES["tiny by its parameter"], size=k), {"x": 1.0 + 1e-6 * k}, **options).q_end[0]
+        return jj.simulate(
+            Pushed(PUSHES["tiny by its parameter"], size=k), {"x": 1.0 + 1e-6 * k}, **options
+        ).q_end[0]
 
     slope = jax.jvp(end, (1.0,), (1.0,))[1]
     assert slope == pytest.approx(-1.5 * np.sin(3.0) + 1e-6 * np.cos(3.0) - 1.5e-6 * np.sin(3.0), rel=1e-6)
@@ -162,14 +196,16 @@ def test_tables_are_parameters_and_differ_between_lanes():
     assert abs(float(lanes[0, 0] - lanes[1, 0])) > 0.1
 
 
-# What begins after t = 1, or outside the domain. ----------------------------------------------------------------------
+# What begins after t = 1, or outside the domain. ------------------------------------------------------------
 
 
 class LateBelt(OnPlane):
     """A belt that starts to move at t = 2."""
 
     def velocity_constraints(self, motion):
-        return {"belt": motion.u.y_rate - motion.u.x_rate - jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 3, 0.0)}
+        return {
+            "belt": motion.u.y_rate - motion.u.x_rate - jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 3, 0.0)
+        }
 
 
 class FarBelt(OnPlane):
@@ -216,7 +252,9 @@ LATE = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "start", "end", "fact"), LATE, ids=[type(case[0]).__name__ for case in LATE])
+@pytest.mark.parametrize(
+    ("scene", "start", "end", "fact"), LATE, ids=[type(case[0]).__name__ for case in LATE]
+)
 def test_the_work_of_what_begins_late_or_far_off_is_counted(scene, start, end, fact):
     assert bool(getattr(jj.structure_of(scene), fact)) == (fact != "homogeneous")
     motion = jj.simulate(scene, start, ts=np.linspace(0.0, end, 41), rtol=1e-10, atol=1e-10).raise_if_failed()
@@ -239,7 +277,9 @@ class FastRow(OnPlane):
 def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
     for backend in ("auto", "dense"):
         motion = jj.simulate(FastRow(), {"x_rate": 4.0}, t1=2.0, backend=backend).raise_if_failed()
-        assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
+        assert_allclose(
+            motion.u_end, [4.0, 1.0], atol=1e-8
+        )  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
 
 
 class Terrain(OnPlane):
@@ -255,4 +295,10 @@ class Terrain(OnPlane):
 
 def test_branches_of_coordinates_alone_leave_rows_linear_and_scleronomic():
     found = jj.structure_of(Terrain())
-    assert (found.affine, found.homogeneous, found.timed, found.driven, found.varying_inertia) == (True, True, (), False, False)
+    assert (found.affine, found.homogeneous, found.timed, found.driven, found.varying_inertia) == (
+        True,
+        True,
+        (),
+        False,
+        False,
+    )

@@ -23,7 +23,9 @@ LEAN, STEER = NAMES.index("lean"), NAMES.index("steer")
 
 def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
     """The admissible state with the front wheel rolling at `speed`; the pitch follows from the front contact."""
-    q = project_positions(bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES]))
+    q = project_positions(
+        bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES])
+    )
     y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rF])
     structure = jj.structure_of(BICYCLE)
     return q, minimal_kinematics(bicycle, structure.independent, structure.kept_rows, 0.0, q, y).u
@@ -32,7 +34,9 @@ def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
 def other_bicycle():
     """Parameters 5 to 20 % from the benchmark's, so that nothing cancels by chance."""
     factors = 1 + np.random.default_rng(7).uniform(0.05, 0.2, len(oracle.BENCHMARK))
-    return {name: value * factor for (name, value), factor in zip(oracle.BENCHMARK.items(), factors, strict=True)}
+    return {
+        name: value * factor for (name, value), factor in zip(oracle.BENCHMARK.items(), factors, strict=True)
+    }
 
 
 def test_defaults_are_the_benchmark_bicycle():
@@ -108,7 +112,13 @@ def test_a_hands_free_ride_keeps_its_energy_and_its_contacts():
 
 
 def test_a_slow_bicycle_falls_and_the_ride_stops():
-    ride = jj.simulate(BICYCLE, {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0}, t1=5.0, rtol=1e-10, atol=1e-10)
+    ride = jj.simulate(
+        BICYCLE,
+        {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0},
+        t1=5.0,
+        rtol=1e-10,
+        atol=1e-10,
+    )
     assert ride.event_names[int(ride.event)] == "fallen"
     lean_left, steer_left = 1.2 - abs(ride.q_end[LEAN]), jnp.pi / 2 - abs(ride.q_end[STEER])
     assert abs(min(lean_left, steer_left)) <= 1e-9

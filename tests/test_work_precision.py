@@ -1,4 +1,6 @@
-"""The work-precision charts: what a record holds, how an error is judged, and what is said of peers that are not installed."""
+"""The work-precision charts: what a record holds, how an error is judged, and what is said of peers that are
+not installed.
+"""
 
 import json
 
@@ -16,7 +18,12 @@ SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
 
 
 def _exact_sleigh():
-    found = {name: values[-1] for name, values in chaplygin_sleigh.motion([0.0, SLEIGH.end], **_without_end(chaplygin_sleigh.RUN)).items()}
+    found = {
+        name: values[-1]
+        for name, values in chaplygin_sleigh.motion(
+            [0.0, SLEIGH.end], **_without_end(chaplygin_sleigh.RUN)
+        ).items()
+    }
     c, s, a = np.cos(found["th"]), np.sin(found["th"]), chaplygin_sleigh.RUN["a"]
     speeds = [found["v"] * c - a * found["w"] * s, found["v"] * s + a * found["w"] * c, found["w"]]
     return np.array([found["x"], found["y"], found["th"]]), np.array(speeds)
@@ -46,7 +53,9 @@ def test_the_reference_says_how_far_a_second_computation_is():
 
 def test_a_curve_gives_records_of_one_format():
     q, u = _exact_sleigh()
-    found, ready = measure.points(SLEIGH, curve.Curve("exact", (1e-3,), _constant(np.concatenate([q, u[:2]]))), lambda text: None)
+    found, ready = measure.points(
+        SLEIGH, curve.Curve("exact", (1e-3,), _constant(np.concatenate([q, u[:2]]))), lambda text: None
+    )
     (entry,) = found
     assert tuple(entry) == record.KEYS
     assert entry == json.loads(json.dumps(entry))
@@ -60,7 +69,9 @@ def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
     y = np.full(5, np.nan)
     (entry,), _ = measure.points(SLEIGH, curve.Curve("lost", (1.0,), _constant(y)), lambda text: None)
     assert entry["error"] is None
-    failed = lambda problem: curve.Prepared(lambda setting: None, lambda raw: curve.Solved(failed="out of steps"))  # noqa: E731
+    failed = lambda problem: curve.Prepared(
+        lambda setting: None, lambda raw: curve.Solved(failed="out of steps")
+    )
     (entry,), _ = measure.points(SLEIGH, curve.Curve("failed", (1.0,), failed), lambda text: None)
     assert entry["error"] is None
     assert entry["note"] == "out of steps"
@@ -68,7 +79,17 @@ def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
 
 def test_a_record_of_an_unknown_kind_is_refused():
     with pytest.raises(ValueError, match="`kind` is 'theirs'"):
-        record.record(problem="", method="", kind="theirs", setting=0.0, setting_unit="", batch=1, error=None, seconds=None, versions={})
+        record.record(
+            problem="",
+            method="",
+            kind="theirs",
+            setting=0.0,
+            setting_unit="",
+            batch=1,
+            error=None,
+            seconds=None,
+            versions={},
+        )
 
 
 @pytest.mark.parametrize(
@@ -92,7 +113,8 @@ def test_peers_that_are_not_installed_are_skipped_with_a_message(monkeypatch, mo
 
 
 def test_a_free_body_is_read_as_the_disc_that_it_is():
-    # as contact engines hold it: centre, rotation, velocities in space; back to the contact point, yaw, lean and spin
+    # as contact engines hold it: centre, rotation, velocities in space; back to the contact point, yaw, lean
+    # and spin
     radius = float(DISC.scene.radius)
     q, u = disc_body.state(radius, disc_body.start(radius, DISC.minimal_start), {"yaw": 0.0, "spin": 0.0})
     assert np.max(np.abs(q - np.asarray(DISC.state.q))) <= tolerance("round_off")
@@ -104,7 +126,9 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
         pytest.skip(peer_sympy.MISSING)
     equations = peer_sympy.kane.SCENES["chaplygin-sleigh"](SLEIGH.scene)
     minimal = SLEIGH.minimal_start
-    assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= tolerance("round_off")
+    assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= tolerance(
+        "round_off"
+    )
     try:
         library = peer_sympy.compiled(peer_sympy.c_source(equations))
     except curve.NotApplicable as reason:
@@ -114,7 +138,13 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
     scene, (_, _, heading, v, w), a = SLEIGH.scene, y, float(SLEIGH.scene.offset)
     # v' = a w^2, w' = -(a/k^2) v w
     k_squared = float(scene.inertia / scene.mass) + a**2
-    expected = [v * np.cos(heading) - a * w * np.sin(heading), v * np.sin(heading) + a * w * np.cos(heading), w, a * w**2, -a / k_squared * v * w]
+    expected = [
+        v * np.cos(heading) - a * w * np.sin(heading),
+        v * np.sin(heading) + a * w * np.cos(heading),
+        w,
+        a * w**2,
+        -a / k_squared * v * w,
+    ]
     assert np.max(np.abs(rates(0.0, y) - expected)) <= tolerance("round_off")
 
 

@@ -1,4 +1,6 @@
-"""Small scenes in which something depends on time by itself, each with the closed form of the work that time does."""
+"""Small scenes in which something depends on time by itself, each with the closed form of the work that time
+does.
+"""
 
 import jax.numpy as jnp
 from small_scenes import OnLine, Upright
@@ -47,7 +49,9 @@ class ShakenAnchor(Bead):
 
 
 class TurningRates(jj.Scene):
-    """A bead on a wire that a coordinate's given rate turns: r = r0 cosh W t from rest, T = m W^2 r0^2 cosh(2 W t)/2."""
+    """A bead on a wire that a coordinate's given rate turns: r = r0 cosh W t from rest, T = m W^2 r0^2 cosh(2
+    W t)/2.
+    """
 
     mass: float = jj.parameter(2.0, unit="kg", positive=True)
     rate: float = jj.parameter(1.3, unit="rad/s")
@@ -67,14 +71,20 @@ class TurningRates(jj.Scene):
 
 
 class DrivenOrientation(jj.Scene):
-    """A ball on a gimbal whose outer axis is turned by the angle c t^2: its inertia is the same all around, so T = I ((2 c t)^2 + lean_rate^2)/2."""
+    """A ball on a gimbal whose outer axis is turned by the angle c t^2: its inertia is the same all around,
+    so T = I ((2 c t)^2 + lean_rate^2)/2.
+    """
 
     rate: float = jj.parameter(0.8, unit="rad/s^2")
     coordinates = jj.coordinates("lean")
     example = {"lean": 0.3, "lean_rate": 0.7}
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(2.0, 0.5, position=jnp.zeros(3), orientation=jj.rot_z(self.rate * t**2) @ jj.rot_x(q.lean))}
+        return {
+            "ball": jj.RigidBody.ball(
+                2.0, 0.5, position=jnp.zeros(3), orientation=jj.rot_z(self.rate * t**2) @ jj.rot_x(q.lean)
+            )
+        }
 
     def work(self, t):
         return 0.5 * (0.4 * 2.0 * 0.5**2) * (2 * self.rate * t) ** 2
@@ -111,7 +121,9 @@ class Lifted(Upright):
 
 
 class Towed(Bead):
-    """A bead that an input tows at its speed through a row, against a spring at the origin: the tow does k x^2/2."""
+    """A bead that an input tows at its speed through a row, against a spring at the origin: the tow does k
+    x^2/2.
+    """
 
     stiffness: float = jj.parameter(18.0, unit="N/m")
     inputs = jj.inputs("speed")

@@ -1,7 +1,7 @@
 """The tolerances of all tests, in one table by floating-point type.
 
-A test that needs a looser one states its own number beside its reason. All are relative to the size of the thing
-compared unless a test says otherwise.
+A test that needs a looser one states its own number beside its reason. All are relative to the size of the
+thing compared unless a test says otherwise.
 """
 
 import numpy as np
@@ -49,7 +49,9 @@ def tolerance(name, dtype=np.float64):
 
 
 def relative_error(value, expected, size: float | None = None):
-    """Largest |value - expected| divided by `size` (default: the largest |expected|, or 1 where that is zero)."""
+    """Largest |value - expected| divided by `size` (default: the largest |expected|, or 1 where that is
+    zero).
+    """
     value, expected = np.asarray(value), np.asarray(expected)
     scale = np.max(np.abs(expected), initial=0.0) if size is None else size
     return float(np.max(np.abs(value - expected), initial=0.0) / (scale or 1.0))

@@ -13,7 +13,9 @@ class Case:
 
     name: str
     title: str
-    probe: Callable[[], object]  # sets it up, once per process; `cell(method, tolerance)` of what it returns is an `Outcome`
+    probe: Callable[
+        [], object
+    ]  # sets it up, once per process; `cell(method, tolerance)` of what it returns is an `Outcome`
     tolerance: float  # float64
     tolerance32: float  # float32
     reason: str  # of both tolerances

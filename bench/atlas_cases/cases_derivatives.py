@@ -1,4 +1,6 @@
-"""Cases about derivatives: E3, E4, E20 and the derivatives through E5, E7, E18 and E19; E21 and E23 on accelerations."""
+"""Cases about derivatives: E3, E4, E20 and the derivatives through E5, E7, E18 and E19; E21 and E23 on
+accelerations.
+"""
 
 from functools import partial
 
@@ -22,7 +24,9 @@ def rosenberg() -> DerivativeOfAccelerations:
     def state(y):
         return scene, jnp.stack([0.0 * y, y, 0.0 * y]), jnp.stack([v + 0 * y, b + 0 * y, v * y])
 
-    return DerivativeOfAccelerations(state, y, np.array([1.0, 0.0, 0.0]), -b * v * (1 - y**2) / (1 + y**2) ** 2)
+    return DerivativeOfAccelerations(
+        state, y, np.array([1.0, 0.0, 0.0]), -b * v * (1 - y**2) / (1 + y**2) ** 2
+    )
 
 
 def orthonormal() -> DerivativeOfAccelerations:
@@ -52,7 +56,9 @@ def dependent() -> DerivativeOfAccelerations:
     def state(h):
         return scene, jnp.stack([0 * h, 0 * h, h]), jnp.stack([v * jnp.cos(h), v * jnp.sin(h), w + 0 * h])
 
-    return DerivativeOfAccelerations(state, 0.4, np.array([1.0, 0.0, 0.0]), -pull * np.sin(0.8) - v * w * np.cos(0.4))
+    return DerivativeOfAccelerations(
+        state, 0.4, np.array([1.0, 0.0, 0.0]), -pull * np.sin(0.8) - v * w * np.cos(0.4)
+    )
 
 
 def through_a_motion() -> DerivativeOfMotion:
@@ -62,8 +68,10 @@ def through_a_motion() -> DerivativeOfMotion:
     def known(w):
         return skate.motion(ts, **(skate.RUN | {"u0": 0.7, "th_rate": w}))["x"][-1]
 
-    begin = lambda w: (scene, {"x_rate": 0.7, "heading_rate": w})  # noqa: E731
-    return DerivativeOfMotion(begin, 1.3, ts, lambda m: m.q_end[0], slope(known, 1.3), naive_value=lambda q, u: q[0])
+    begin = lambda w: (scene, {"x_rate": 0.7, "heading_rate": w})
+    return DerivativeOfMotion(
+        begin, 1.3, ts, lambda m: m.q_end[0], slope(known, 1.3), naive_value=lambda q, u: q[0]
+    )
 
 
 def through_loss_of_rank() -> DerivativeOfMotion:
@@ -71,12 +79,16 @@ def through_loss_of_rank() -> DerivativeOfMotion:
     scene, end = jj.models.Snakeboard(), snakeboard.RUN["t_end"]
     ts = np.array([0.0, end / 2, end])
     known = snakeboard.motion(ts, **snakeboard.RUN)["th"][-1]
-    begin = lambda v: (scene, SNAKE_START | {"x_rate": v})  # noqa: E731
-    return DerivativeOfMotion(begin, 1.0, ts, lambda m: m.q_end[2], known, naive_value=lambda q, u: q[2], steps=1600)
+    begin = lambda v: (scene, SNAKE_START | {"x_rate": v})
+    return DerivativeOfMotion(
+        begin, 1.0, ts, lambda m: m.q_end[2], known, naive_value=lambda q, u: q[2], steps=1600
+    )
 
 
 def through_projected_start() -> DerivativeOfMotion:
-    """A start off the row: d x / d given sideways speed, through the M-orthogonal projection, is that along the edge."""
+    """A start off the row: d x / d given sideways speed, through the M-orthogonal projection, is that along
+    the edge.
+    """
     scene, ts, heading = jj.models.Skate(), np.array([0.0, 1.0]), 0.4
 
     def known(v):
@@ -100,7 +112,9 @@ def along_the_norm() -> DerivativeOfMotion:
         return scene, jj.consistent(scene, 0.0, jnp.concatenate([q[:3], size * q[3:]]), u)
 
     skip = {"rollout": "asked in E4 gradient", "reductions": "no rows", "naive": "no rows"}
-    return DerivativeOfMotion(begin, 1.0, np.array([0.0, 2.0]), lambda m: m.q_end[4], 0.0, scale=1.0, skip=skip)
+    return DerivativeOfMotion(
+        begin, 1.0, np.array([0.0, 2.0]), lambda m: m.q_end[4], 0.0, scale=1.0, skip=skip
+    )
 
 
 def through_a_long_motion(t_end: float) -> DerivativeOfMotion:
@@ -110,18 +124,22 @@ def through_a_long_motion(t_end: float) -> DerivativeOfMotion:
     def known(w):
         return rattleback.motion(ts, w3=w)["w3"][-1]
 
-    begin = lambda w: (scene, scene.example | {"w3": w})  # noqa: E731
+    begin = lambda w: (scene, scene.example | {"w3": w})
     skip = {"reductions": "one is enough", "rollout": "asked in E4 gradient"}
     skip |= {"Kvaerno5": "minutes; asked over 2 s"} if t_end > 2 else {}
-    return DerivativeOfMotion(begin, -5.0, ts, lambda m: m.u_end[4], slope(known, -5.0, 1e-5), rtol=1e-11, atol=1e-11, skip=skip)
+    return DerivativeOfMotion(
+        begin, -5.0, ts, lambda m: m.u_end[4], slope(known, -5.0, 1e-5), rtol=1e-11, atol=1e-11, skip=skip
+    )
 
 
 def through_an_event() -> DerivativeOfMotion:
     """A disc at rest falls to its stop at 1.5 rad: d t* / d lean."""
     scene = jj.models.TiltingDisc()
-    begin = lambda lean: (scene, {"lean": lean})  # noqa: E731
+    begin = lambda lean: (scene, {"lean": lean})
     skip = {"rollout": "asked in E4 gradient"}
-    return DerivativeOfMotion(begin, 0.3, np.array([0.0, 2.0]), lambda m: m.t_end, fall_time_slope(0.3), skip=skip)
+    return DerivativeOfMotion(
+        begin, 0.3, np.array([0.0, 2.0]), lambda m: m.t_end, fall_time_slope(0.3), skip=skip
+    )
 
 
 def axle_accelerations() -> Instant:
@@ -131,7 +149,9 @@ def axle_accelerations() -> Instant:
     c, s = np.cos(th), np.sin(th)
     q = np.array([0.0, 0.0, th, 0.0, 0.0])
     u = np.array([v * c, v * s, w, (v - 0.4 * w) / 0.3, (v + 0.4 * w) / 0.3])
-    return Instant(scene, q, u, np.array([push * c - v * w * s, push * s + v * w * c, 0.0, push / 0.3, push / 0.3]))
+    return Instant(
+        scene, q, u, np.array([push * c - v * w * s, push * s + v * w * c, 0.0, push / 0.3, push / 0.3])
+    )
 
 
 OTHERS = 1e-6, 5e-2, "derivatives agree to 1e-6 relative with those of the closed form"
@@ -143,11 +163,48 @@ CASES = (
     Case("E4 gradient", "derivative through a motion that starts there", through_a_motion, *OTHERS),
     required("E5 gradient", "derivative through the loss of rank", through_loss_of_rank, *OTHERS),
     required("E7 gradient", "derivative of accelerations: dependent rows", dependent, *ROUND_OFF),
-    required("E13 gradient", "derivative along the norm of a quaternion", along_the_norm, 1e-10, 1e-4, "zero, to round-off"),
+    required(
+        "E13 gradient",
+        "derivative along the norm of a quaternion",
+        along_the_norm,
+        1e-10,
+        1e-4,
+        "zero, to round-off",
+    ),
     required("E18 gradient", "derivative through the projected start", through_projected_start, *OTHERS),
-    *(Case(f"E19 gradient {t:g} s", f"derivative through {t:g} s of a rattleback", partial(through_a_long_motion, t), *OTHERS) for t in (2.0, 10.0)),
+    *(
+        Case(
+            f"E19 gradient {t:g} s",
+            f"derivative through {t:g} s of a rattleback",
+            partial(through_a_long_motion, t),
+            *OTHERS,
+        )
+        for t in (2.0, 10.0)
+    ),
     Case("E20", "derivative of the time of an event", through_an_event, *OTHERS),
-    required("E21 light", "mass ratio 1e8: an axle with light wheels", partial(heavy_axle, 1e-8, 1.0), 1e-10, 1e-3, "as E7"),
-    required("E21", "mass ratio 1e8: an axle with heavy wheels", partial(heavy_axle, 1.0, 1e-8), 1e-10, 1e-3, "as E7"),
-    Case("E23", "dependent rows in both precisions: rank by round-off", axle_accelerations, 1e-12, 1e-5, "round-off", quick=True),
+    required(
+        "E21 light",
+        "mass ratio 1e8: an axle with light wheels",
+        partial(heavy_axle, 1e-8, 1.0),
+        1e-10,
+        1e-3,
+        "as E7",
+    ),
+    required(
+        "E21",
+        "mass ratio 1e8: an axle with heavy wheels",
+        partial(heavy_axle, 1.0, 1e-8),
+        1e-10,
+        1e-3,
+        "as E7",
+    ),
+    Case(
+        "E23",
+        "dependent rows in both precisions: rank by round-off",
+        axle_accelerations,
+        1e-12,
+        1e-5,
+        "round-off",
+        quick=True,
+    ),
 )

@@ -13,7 +13,15 @@ from atlas_cases.motions import Motion, against, drift, followed, max_error
 from atlas_cases.outcomes import worst
 from atlas_cases.references import ball_on_switched_turntable, celt_without_angles, linkage_angle
 from atlas_cases.scenes import FourBars
-from atlas_cases.scenes_motion import CeltInQuaternion, ContactOscillator, DragDisc, EccentricBall, PendulumDrivenGear, SoftWheel, SwitchedTurntable
+from atlas_cases.scenes_motion import (
+    CeltInQuaternion,
+    ContactOscillator,
+    DragDisc,
+    EccentricBall,
+    PendulumDrivenGear,
+    SoftWheel,
+    SwitchedTurntable,
+)
 
 NO_ROWS = dict.fromkeys(("naive", "constraints"), "no rows")
 LONG_RUN = dict.fromkeys(("naive", "reductions", "constraints"), "the same in the shorter case")
@@ -81,16 +89,28 @@ def disc_to_its_reference() -> Motion:
     run, scene = rolling_disc.RUN, jj.models.TiltingDiscQuaternion()
     ts = np.linspace(0.0, 2.0, 6)
     known = rolling_disc.motion_yaw_lean_spin(ts, **run)
-    start, asked = leaning_disc(run["lean"], run["yaw_rate"], run["lean_rate"], run["spin_rate"], 0.5), ("Baumgarte 1e4/s", "Kvaerno5")
-    return followed(scene, start, ts, known, "x=cx y=cy z=cz", rtol=1e-8, atol=1e-8, asked=asked, by_mujoco=rolled_disc)
+    start, asked = (
+        leaning_disc(run["lean"], run["yaw_rate"], run["lean_rate"], run["spin_rate"], 0.5),
+        ("Baumgarte 1e4/s", "Kvaerno5"),
+    )
+    return followed(
+        scene, start, ts, known, "x=cx y=cy z=cz", rtol=1e-8, atol=1e-8, asked=asked, by_mujoco=rolled_disc
+    )
 
 
 def four_bar() -> Motion:
-    """A parallelogram of rods swings about its rest, here upright by gravity upwards, for 100 s: lengths of rods, their rates, and energy."""
-    scene, bars = FourBars(windows=1, gravity=-9.81), ((0, 2), (1, 3), (0, 1))  # ends P0, P1 and pivots P2 = (0, 0), P3 = (1, 0)
+    """A parallelogram of rods swings about its rest, here upright by gravity upwards, for 100 s: lengths of
+    rods, their rates, and energy.
+    """
+    scene, bars = (
+        FourBars(windows=1, gravity=-9.81),
+        ((0, 2), (1, 3), (0, 1)),
+    )  # ends P0, P1 and pivots P2 = (0, 0), P3 = (1, 0)
 
     def error(q, u):
-        points = np.concatenate([q.reshape(-1, 2, 2), np.broadcast_to([[0.0, 0.0], [1.0, 0.0]], (len(q), 2, 2))], axis=1)
+        points = np.concatenate(
+            [q.reshape(-1, 2, 2), np.broadcast_to([[0.0, 0.0], [1.0, 0.0]], (len(q), 2, 2))], axis=1
+        )
         rates = np.concatenate([u.reshape(-1, 2, 2), np.zeros((len(u), 2, 2))], axis=1)
         off = []
         for a, b in bars:
@@ -99,17 +119,34 @@ def four_bar() -> Motion:
         return max_error(worst(part, 0.0, 1.0) for part in off)
 
     upright = (np.pi / 2, 0.0, np.pi / 2), (-2.0, 0.0, -2.0)
-    by_mujoco = lambda: elsewhere.four_bar((1.0,) * 4, (1.0,) * 3, -9.81, upright, elsewhere.ends_of_cranks)  # noqa: E731
+    by_mujoco = lambda: elsewhere.four_bar((1.0,) * 4, (1.0,) * 3, -9.81, upright, elsewhere.ends_of_cranks)
     start = {"x0": 0.0, "x1": 1.0, "z0": 1.0, "z1": 1.0, "x0_rate": 2.0, "x1_rate": 2.0}
-    return Motion(scene, start, np.linspace(0.0, 100.0, 21), error, rtol=1e-8, atol=1e-8, asked=("rollout",), by_mujoco=by_mujoco)
+    return Motion(
+        scene,
+        start,
+        np.linspace(0.0, 100.0, 21),
+        error,
+        rtol=1e-8,
+        atol=1e-8,
+        asked=("rollout",),
+        by_mujoco=by_mujoco,
+    )
 
 
 def linkage() -> Motion:
     """Two windows swing through the horizontal, where one freedom becomes three."""
     scene, ts = FourBars(), np.linspace(0.0, 2.0, 9)
     angle = linkage_angle(ts)
-    known = {f"{axis}{i}": value for i in range(3) for axis, value in (("x", i + np.sin(angle)), ("z", np.cos(angle)))}
-    start = {f"x{i}": float(i) for i in range(3)} | {f"z{i}": 1.0 for i in range(3)} | {f"x{i}_rate": 1.0 for i in range(3)}
+    known = {
+        f"{axis}{i}": value
+        for i in range(3)
+        for axis, value in (("x", i + np.sin(angle)), ("z", np.cos(angle)))
+    }
+    start = (
+        {f"x{i}": float(i) for i in range(3)}
+        | {f"z{i}": 1.0 for i in range(3)}
+        | {f"x{i}_rate": 1.0 for i in range(3)}
+    )
     return Motion(scene, start, ts, against(scene, known, dict.fromkeys(known, 1.0)))
 
 
@@ -119,7 +156,9 @@ def _celt_error(ts, w0):
 
 
 def celt_on_edge(scale: float = 1.0, w0=(2.0, 1.0, -3.0)) -> Motion:
-    """The rattleback set on its long edge, where the usual angles are singular; quaternion coordinates. `scale`: units of length per metre."""
+    """The rattleback set on its long edge, where the usual angles are singular; quaternion coordinates.
+    `scale`: units of length per metre.
+    """
     scene, ts = CeltInQuaternion(scale=scale), np.linspace(0.0, 0.5, 6)
     compare = _celt_error(ts, w0)
     start = {"z": 0.03 * scale, "attitude_w": np.cos(0.75 * np.pi), "attitude_x": np.sin(0.75 * np.pi)}
@@ -134,7 +173,9 @@ def celt_on_edge_in_angles() -> Motion:
 
     def error(q, u):
         al, be = q[:, 2], q[:, 3]
-        return compare(np.stack([-np.cos(al) * np.sin(be), np.sin(al), np.cos(al) * np.cos(be)], axis=1), u[:, 2:])
+        return compare(
+            np.stack([-np.cos(al) * np.sin(be), np.sin(al), np.cos(al) * np.cos(be)], axis=1), u[:, 2:]
+        )
 
     start = {"alpha": np.pi / 2, "beta": 0.0, "w1": 2.0, "w2": 1.0, "w3": -3.0}
     return Motion(scene, start, ts, error)
@@ -155,8 +196,18 @@ def free_top(t_end: float) -> Motion:
     skip = NO_ROWS if t_end <= 100 else NO_ROWS | LONG_RUN
     more = {"asked": ("rollout",)} | ({"step": 0.02} if t_end <= 100 else {})
     u = [0.0, 0.0, 0.0, *(scene.example[f"attitude_omega_{axis}"] for axis in "xyz")]
-    by_mujoco = lambda: elsewhere.free_body(1.0, moments, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], u)  # noqa: E731
-    return Motion(scene, scene.example, np.linspace(0.0, t_end, 21), error, rtol=1e-11, atol=1e-11, skip=skip, by_mujoco=by_mujoco, **more)
+    by_mujoco = lambda: elsewhere.free_body(1.0, moments, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], u)
+    return Motion(
+        scene,
+        scene.example,
+        np.linspace(0.0, t_end, 21),
+        error,
+        rtol=1e-11,
+        atol=1e-11,
+        skip=skip,
+        by_mujoco=by_mujoco,
+        **more,
+    )
 
 
 def eccentric_ball() -> Motion:
@@ -172,21 +223,43 @@ def eccentric_ball() -> Motion:
         arm = -0.3 * turned[:, :, 2] - np.array([0.0, 0.0, 1.0])
         return np.sum(np.einsum("tij,tj->ti", turned, moments * u[:, 3:]) * arm, axis=1)
 
-    start = {"z": 1.0 + 0.3 * np.cos(0.4), "attitude_w": np.cos(0.2), "attitude_x": np.sin(0.2), "attitude_omega_z": 4.0, "attitude_omega_x": 0.5}
+    start = {
+        "z": 1.0 + 0.3 * np.cos(0.4),
+        "attitude_w": np.cos(0.2),
+        "attitude_x": np.sin(0.2),
+        "attitude_omega_z": 4.0,
+        "attitude_omega_x": 0.5,
+    }
 
     def by_mujoco():
         q = np.array([0.0, 0.0, start["z"], start["attitude_w"], start["attitude_x"], 0.0, 0.0])
         omega, turned = np.array([0.5, 0.0, 4.0]), matrices(q[None, 3:])[0]
         arm = 0.3 * turned[:, 2] + np.array([0.0, 0.0, 1.0])  # from the contact to the mass centre
-        return elsewhere.rolling(1.0, moments, elsewhere.ball_shape(1.0, (0.0, 0.0, -0.3)), q, [*np.cross(turned @ omega, arm), *omega])
+        return elsewhere.rolling(
+            1.0,
+            moments,
+            elsewhere.ball_shape(1.0, (0.0, 0.0, -0.3)),
+            q,
+            [*np.cross(turned @ omega, arm), *omega],
+        )
 
-    return Motion(scene, start, np.linspace(0.0, 50.0, 26), drift(energy, jellett), asked=("rollout",), by_mujoco=by_mujoco)
+    return Motion(
+        scene,
+        start,
+        np.linspace(0.0, 50.0, 26),
+        drift(energy, jellett),
+        asked=("rollout",),
+        by_mujoco=by_mujoco,
+    )
 
 
 def near_fall(turn: float) -> Motion:
     """The disc nearly falls flat and rises again (B6): the contact races half round the rim."""
     run, theta = rolling_disc.NEAR_FALL, rolling_disc.NEAR_FALL["theta0"]
-    scene, ts = jj.models.TiltingDiscQuaternion(run["mass"], run["radius"], run["gravity"]), np.array([0.0, 0.25])
+    scene, ts = (
+        jj.models.TiltingDiscQuaternion(run["mass"], run["radius"], run["gravity"]),
+        np.array([0.0, 0.25]),
+    )
     yaw_rate = turn / np.sin(theta)
     start = leaning_disc(theta - np.pi / 2, yaw_rate, 0.0, yaw_rate * np.cos(theta), run["radius"])
     if turn >= 1e-5:
@@ -194,7 +267,7 @@ def near_fall(turn: float) -> Motion:
         known = rolling_disc.motion(ts, **values, theta=theta, w1=0.0, w2=turn, w3=0.0)
         error = against(scene, {name: known[f"c{name}"] for name in "xyz"}, dict.fromkeys("xyz", 0.3))
     else:
-        error = lambda q, u: np.inf  # noqa: E731
+        error = lambda q, u: np.inf
     most_steps = 20_000 if turn != 1e-4 else 100_000  # there the right answer takes more
     return Motion(scene, start, ts, error, rtol=1e-9, atol=1e-9, steps=20_000, most_steps=most_steps)
 
@@ -204,16 +277,31 @@ def eulers_disc() -> Motion:
     theta = 0.1
     yaw_rate = np.sqrt(4 * 9.81 / (0.3 * np.sin(theta)))  # the centre at rest
     start = leaning_disc(theta - np.pi / 2, yaw_rate, 0.0, yaw_rate * np.cos(theta), 0.3)
-    return Motion(DragDisc(), start, np.linspace(0.0, 2.0, 5), lambda q, u: np.inf, rtol=1e-8, atol=1e-8, steps=2000, asked=("rollout",))
+    return Motion(
+        DragDisc(),
+        start,
+        np.linspace(0.0, 2.0, 5),
+        lambda q, u: np.inf,
+        rtol=1e-8,
+        atol=1e-8,
+        steps=2000,
+        asked=("rollout",),
+    )
 
 
 def contact_oscillator(pairs: int, strength: float, t_end: float, twin: bool = False) -> Motion:
-    """Energy, what is left of the row and, of one pair, the driver's own energy. `twin`: with a gauge term, which changes no motion."""
+    """Energy, what is left of the row and, of one pair, the driver's own energy. `twin`: with a gauge term,
+    which changes no motion.
+    """
     scene = GaugeTwin(strength=strength) if twin else ContactOscillator(strength=strength, pairs=pairs)
     y, z = slice(1, None, 2), slice(2, None, 2)
 
     def energy(q, u):
-        return (np.sum(u**2, axis=1) + np.sum(q**2, axis=1) + strength * q[:, 0] ** 2 * np.sum(q[:, z] ** 2, axis=1)) / 2
+        return (
+            np.sum(u**2, axis=1)
+            + np.sum(q**2, axis=1)
+            + strength * q[:, 0] ** 2 * np.sum(q[:, z] ** 2, axis=1)
+        ) / 2
 
     def row(q, u):
         return 1 + u[:, 0] + np.sum(q[:, y] * u[:, z], axis=1)
@@ -222,13 +310,36 @@ def contact_oscillator(pairs: int, strength: float, t_end: float, twin: bool = F
         return (q[:, 1] ** 2 + u[:, 1] ** 2) / 2
 
     if twin:
-        skip = dict.fromkeys(("rollout", "reductions", "constraints", "naive"), "equations of motion know no gauge: as E15")
+        skip = dict.fromkeys(
+            ("rollout", "reductions", "constraints", "naive"), "equations of motion know no gauge: as E15"
+        )
         start, more = {"x": 1.0, "y": 0.6, "z_rate": 0.8}, {"step": 0.05, "skip": skip}
-        return Motion(scene, start, np.linspace(0.0, t_end, 21), drift(energy, row, driver), rtol=1e-11, atol=1e-11, **more)
-    start = {"x": 1.0, **{f"y{i}": 0.6 + 0.3 * i for i in range(pairs)}, **{f"z{i}_rate": 0.8 - 0.5 * i for i in range(pairs)}}
+        return Motion(
+            scene,
+            start,
+            np.linspace(0.0, t_end, 21),
+            drift(energy, row, driver),
+            rtol=1e-11,
+            atol=1e-11,
+            **more,
+        )
+    start = {
+        "x": 1.0,
+        **{f"y{i}": 0.6 + 0.3 * i for i in range(pairs)},
+        **{f"z{i}_rate": 0.8 - 0.5 * i for i in range(pairs)},
+    }
     integrals = (energy, row, driver) if pairs == 1 else (energy, row)
     more = {"asked": ("rollout", "Kvaerno5", "Radau IIA"), "step": 0.05}
-    return Motion(scene, start, np.linspace(0.0, t_end, 21), drift(*integrals), rtol=1e-11, atol=1e-11, steps=2000, **more)
+    return Motion(
+        scene,
+        start,
+        np.linspace(0.0, t_end, 21),
+        drift(*integrals),
+        rtol=1e-11,
+        atol=1e-11,
+        steps=2000,
+        **more,
+    )
 
 
 def gear() -> Motion:
@@ -242,7 +353,16 @@ def gear() -> Motion:
         return driver(q, u) + (u[:, 0] ** 2 + u[:, 2] ** 2 + q[:, 0] ** 2 + q[:, 2] ** 2) / 2
 
     start = {"x": 0.5, "y": 0.9, "z": 0.3, "z_rate": 0.4}
-    return Motion(scene, start, np.linspace(0.0, 100.0, 21), drift(energy, driver), rtol=1e-11, atol=1e-11, steps=2000, step=0.05)
+    return Motion(
+        scene,
+        start,
+        np.linspace(0.0, 100.0, 21),
+        drift(energy, driver),
+        rtol=1e-11,
+        atol=1e-11,
+        steps=2000,
+        step=0.05,
+    )
 
 
 def soft_wheel(stiffness: float) -> Motion:
@@ -250,7 +370,13 @@ def soft_wheel(stiffness: float) -> Motion:
     scene, ts = SoftWheel(stiffness=stiffness), np.linspace(0.0, 1.0, 6)
     known = vertical_disc.motion(ts, **vertical_disc.RUN)
     start = {"z": 1.0, "x_rate": 1.0, "heading_rate": 2.0, "roll_rate": 1.0}
-    more = {"rtol": 1e-8, "atol": 1e-8, "skip": NO_ROWS | {"reductions": "no rows"}, "asked": ("Kvaerno5", "Radau IIA", "rollout"), "step": 0.005}
+    more = {
+        "rtol": 1e-8,
+        "atol": 1e-8,
+        "skip": NO_ROWS | {"reductions": "no rows"},
+        "asked": ("Kvaerno5", "Radau IIA", "rollout"),
+        "step": 0.005,
+    }
     return followed(scene, start, ts, known, "x y heading=phi roll=th", **more)
 
 
@@ -259,7 +385,9 @@ def switched_turntable() -> Motion:
     scene, ts = SwitchedTurntable(), np.linspace(0.0, 4.0, 9)
     known = ball_on_switched_turntable(ts, (0.2, 0.0), (0.1, 0.3))
     start = {"x": 0.2, "x_rate": 0.1, "y_rate": 0.3, "attitude_omega_z": 1.0}
-    return Motion(scene, start, ts, against(scene, dict(zip(("x", "y", "x_rate", "y_rate"), known.T, strict=True))))
+    return Motion(
+        scene, start, ts, against(scene, dict(zip(("x", "y", "x_rate", "y_rate"), known.T, strict=True)))
+    )
 
 
 def sleigh_backwards() -> Motion:

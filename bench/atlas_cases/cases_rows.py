@@ -17,20 +17,37 @@ from atlas_cases.motions import Motion, against, followed
 from atlas_cases.references import bricard_accelerations, octahedron_rods
 from atlas_cases.scenes import AppellHamel, Bricard, Edges, HeavyAxle
 
-CLOSED_REASON = "a run at rtol = atol = 1e-12 (float32: 1e-5, 1e-6) against an exact solution, relative to the largest value"
+CLOSED_REASON = (
+    "a run at rtol = atol = 1e-12 (float32: 1e-5, 1e-6) against an exact solution, relative to the largest"
+    " value"
+)
 
 
 def turning_skate() -> Motion:
     """The skate turns through 90 degrees twice a turn (B2)."""
     ts = np.linspace(0.0, 10.0, 11)
-    return followed(jj.models.Skate(), {"heading_rate": 1.3}, ts, skate.motion(ts, **skate.RUN), "x y heading=th", step=0.005)
+    return followed(
+        jj.models.Skate(),
+        {"heading_rate": 1.3},
+        ts,
+        skate.motion(ts, **skate.RUN),
+        "x y heading=th",
+        step=0.005,
+    )
 
 
 def vertical_disc_by_heading_and_x() -> Motion:
     """The vertical disc (B4); the fixed partition keeps heading and x, which turning makes singular."""
     ts = np.linspace(0.0, 5.0, 11)
     start, known = {"heading_rate": 2.0, "roll_rate": 1.0}, vertical_disc.motion(ts, **vertical_disc.RUN)
-    return followed(jj.models.VerticalDisc(), start, ts, known, "x y heading=phi roll=th", independent=("x_rate", "heading_rate"))
+    return followed(
+        jj.models.VerticalDisc(),
+        start,
+        ts,
+        known,
+        "x y heading=phi roll=th",
+        independent=("x_rate", "heading_rate"),
+    )
 
 
 def tilting_disc() -> Motion:
@@ -39,7 +56,14 @@ def tilting_disc() -> Motion:
     ts = np.linspace(0.0, 10.0, 11)
     known = rolling_disc.motion_yaw_lean_spin(ts, **run)
     start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
-    return followed(jj.models.TiltingDisc(), start, ts, known, "x y yaw lean spin", by_mujoco=lambda: _disc_elsewhere(known))
+    return followed(
+        jj.models.TiltingDisc(),
+        start,
+        ts,
+        known,
+        "x y yaw lean spin",
+        by_mujoco=lambda: _disc_elsewhere(known),
+    )
 
 
 def _disc_elsewhere(expected: dict) -> elsewhere.Elsewhere:
@@ -48,7 +72,11 @@ def _disc_elsewhere(expected: dict) -> elsewhere.Elsewhere:
 
     def read(data):
         k = next(saved)
-        return disc_body.state(rolling_disc.RUN["radius"], elsewhere.body_of(data.qpos, data.qvel), {name: expected[name][k] for name in ("yaw", "spin")})
+        return disc_body.state(
+            rolling_disc.RUN["radius"],
+            elsewhere.body_of(data.qpos, data.qvel),
+            {name: expected[name][k] for name in ("yaw", "spin")},
+        )
 
     return replace(rolled_disc(), read=read)
 
@@ -60,13 +88,17 @@ def snakeboard_through_loss_of_rank() -> Motion:
     """Across parallel rows (B14), with a step that ends exactly there."""
     ts = np.linspace(0.0, snakeboard.RUN["t_end"], 9)  # steer is 90 degrees at the fifth
     known = snakeboard.motion(ts, **snakeboard.RUN)
-    travelled = ts[-1] * np.mean(np.abs(snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"]))  # m, on curls
+    travelled = ts[-1] * np.mean(
+        np.abs(snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"])
+    )  # m, on curls
     names, scales = "x y heading=th rotor=psi heading_rate=th_rate", {"x": travelled, "y": travelled}
     return followed(jj.models.Snakeboard(), SNAKE_START, ts, known, names, scales, asked=("rollout",))
 
 
 def snakeboard_at_loss_of_rank() -> Instant:
-    """Accelerations exactly at parallel rows, turning freely about the middle: none, for the free rows bear nothing there."""
+    """Accelerations exactly at parallel rows, turning freely about the middle: none, for the free rows bear
+    nothing there.
+    """
     scene = jj.models.Snakeboard()
     q, u, _ = scene.named(steer=np.pi / 2, heading_rate=1.0)
     return Instant(scene, q, u, np.zeros(5), scale=1.0)
@@ -83,7 +115,10 @@ def heavy_axle(wheel_mass: float = 1.2, axle_mass: float = 0.5) -> Motion:
     """The axle with two equal lateral rows (B1)."""
     run = two_wheel_axle.RUN_HEAVY_AXLE | {"wheel_mass": wheel_mass, "axle_mass": axle_mass}
     ts = np.linspace(0.0, run["t_end"], 11)
-    start, known = {"x_rate": run["u0"], "th_rate": run["th_rate"]}, two_wheel_axle.motion_heavy_axle(ts, **run)
+    start, known = (
+        {"x_rate": run["u0"], "th_rate": run["th_rate"]},
+        two_wheel_axle.motion_heavy_axle(ts, **run),
+    )
     return followed(HeavyAxle(wheel_mass=wheel_mass, axle_mass=axle_mass), start, ts, known, "x y th p1 p2")
 
 
@@ -94,7 +129,9 @@ def three_edges() -> Motion:
 
 
 def bricard() -> Instant:
-    """Bricard's octahedron of twelve rods, rank eleven, while it bends: accelerations against those of its half, six rods of full rank."""
+    """Bricard's octahedron of twelve rods, rank eleven, while it bends: accelerations against those of its
+    half, six rods of full rank.
+    """
     points = np.array([[1.0, 0.2, 0.3], [-0.3, 0.9, -0.4], [0.4, -0.5, 1.1]])
     edges = ((0, 1, False), (1, 2, False), (0, 2, False), (0, 1, True), (1, 2, True), (0, 2, True))
     turned, (rods, rows) = np.diag([-1.0, -1.0, 1.0]), octahedron_rods(points, edges)
@@ -110,7 +147,9 @@ def bricard() -> Instant:
 
 
 def two_edges(angle: float) -> Instant:
-    """Two edges on one spot, turned by an angle: the body can only turn, however small the angle; the edges bear g sin(slope)."""
+    """Two edges on one spot, turned by an angle: the body can only turn, however small the angle; the edges
+    bear g sin(slope).
+    """
     scene = Edges(angle=angle, copies=False)
     q, u, _ = scene.named(heading=0.4)
     pull = 9.81 * np.sin(0.3)
@@ -118,13 +157,17 @@ def two_edges(angle: float) -> Instant:
 
 
 def off_the_rows() -> Motion:
-    """A start 1e-3 m/s off the row: the skate moves as from its M-orthogonal projection, and the trajectory says by how much it was moved."""
+    """A start 1e-3 m/s off the row: the skate moves as from its M-orthogonal projection, and the trajectory
+    says by how much it was moved.
+    """
     scene = jj.models.Skate()
     q, u, _ = scene.named(heading=0.4, heading_rate=1.3)
     along, across = np.array([np.cos(0.4), np.sin(0.4)]), np.array([-np.sin(0.4), np.cos(0.4)])
     given = np.array(u) + np.append(0.7 * along + 1e-3 * across, 0.0)
     unmoved = dict.fromkeys(("t", "moved_q", "moved_u", "residual"), jnp.zeros((), q.dtype))
-    state = jj.State(q=q, u=jnp.asarray(given, q.dtype), **unmoved, names=(scene.coordinate_names, scene.speed_names))
+    state = jj.State(
+        q=q, u=jnp.asarray(given, q.dtype), **unmoved, names=(scene.coordinate_names, scene.speed_names)
+    )
     ts = np.linspace(0.0, 5.0, 6)
     known = skate.motion(ts, **(skate.RUN | {"u0": 0.7, "th0": 0.4}))
     return followed(scene, state, ts, known, "x y heading=th", naive_start=(q, jnp.asarray(given, q.dtype)))
@@ -145,7 +188,9 @@ def cone_from_rest() -> Motion:
 
 
 def cone_in_motion() -> Motion:
-    """Appell and Hamel's row, falling: a straight line with `sdotdot = g k/(1 + k^2)`, for Chetaev's rule gives the row the force 2 lambda (v, -k^2 zdot)."""
+    """Appell and Hamel's row, falling: a straight line with `sdotdot = g k/(1 + k^2)`, for Chetaev's rule
+    gives the row the force 2 lambda (v, -k^2 zdot).
+    """
     scene, k, s0 = AppellHamel(), 0.8, 0.5
     ts = np.linspace(0.0, 2.0, 6)
     path = s0 * ts + 9.81 * k / (1 + k**2) * ts**2 / 2
@@ -156,15 +201,55 @@ def cone_in_motion() -> Motion:
 
 CLOSED = 1e-10, 1e-3, CLOSED_REASON
 CASES = (
-    required("E1", "coordinate partitioning: a skate turns through 90 degrees", turning_skate, *CLOSED, quick=True),
-    required("E1 disc", "coordinate partitioning: a vertical disc by heading and x", vertical_disc_by_heading_and_x, *CLOSED),
-    required("E2", "bases that jump: a disc through several turns", tilting_disc, 1e-9, 3e-3, CLOSED_REASON + "; the motion amplifies errors 66 times"),
-    required("E5", "loss of rank: a snakeboard, a step ends on parallel rows", snakeboard_through_loss_of_rank, *CLOSED, quick=True),
-    Case("E5 point", "accelerations exactly at the loss of rank", snakeboard_at_loss_of_rank, 1e-12, 1e-5, "round-off", quick=True),
-    unanswered("E6", "no motion continues the start at the loss of rank", snakeboard_without_continuation, "there is no right number"),
+    required(
+        "E1", "coordinate partitioning: a skate turns through 90 degrees", turning_skate, *CLOSED, quick=True
+    ),
+    required(
+        "E1 disc",
+        "coordinate partitioning: a vertical disc by heading and x",
+        vertical_disc_by_heading_and_x,
+        *CLOSED,
+    ),
+    required(
+        "E2",
+        "bases that jump: a disc through several turns",
+        tilting_disc,
+        1e-9,
+        3e-3,
+        CLOSED_REASON + "; the motion amplifies errors 66 times",
+    ),
+    required(
+        "E5",
+        "loss of rank: a snakeboard, a step ends on parallel rows",
+        snakeboard_through_loss_of_rank,
+        *CLOSED,
+        quick=True,
+    ),
+    Case(
+        "E5 point",
+        "accelerations exactly at the loss of rank",
+        snakeboard_at_loss_of_rank,
+        1e-12,
+        1e-5,
+        "round-off",
+        quick=True,
+    ),
+    unanswered(
+        "E6",
+        "no motion continues the start at the loss of rank",
+        snakeboard_without_continuation,
+        "there is no right number",
+    ),
     required("E7", "dependent rows: an axle with four rows of rank three", heavy_axle, *CLOSED),
     required("E7 copies", "dependent rows: one edge three times", three_edges, *CLOSED),
-    Case("E7 Bricard", "dependent rows: an octahedron of twelve rods, rank eleven, that bends", bricard, 1e-11, 1e-3, "round-off, over angles of rods"),
+    Case(
+        "E7 Bricard",
+        "dependent rows: an octahedron of twelve rods, rank eleven, that bends",
+        bricard,
+        1e-11,
+        1e-3,
+        "round-off, over angles of rods",
+    ),
     *(
         Case(
             f"E8 {angle:g}",

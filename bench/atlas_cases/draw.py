@@ -1,4 +1,6 @@
-"""The atlas as one picture: cases down, methods across, colour and mark by outcome; a cell is split where float64 and float32 differ."""
+"""The atlas as one picture: cases down, methods across, colour and mark by outcome; a cell is split where
+float64 and float32 differ.
+"""
 
 from pathlib import Path
 
@@ -30,7 +32,11 @@ HALVES = (SQUARE[0], SQUARE[1], SQUARE[3]), SQUARE[1:]
 def draw(cells: list[dict], out: Path) -> None:
     """`atlas.png` and `atlas.svg`."""
     types = list(dict.fromkeys(cell["dtype"] for cell in cells))
-    asked = [method for method in METHODS if any(c["method"] == method.name and c["outcome"] != NOT_APPLICABLE for c in cells)]
+    asked = [
+        method
+        for method in METHODS
+        if any(c["method"] == method.name and c["outcome"] != NOT_APPLICABLE for c in cells)
+    ]
     columns = _places([(method.name, method.group) for method in asked], 0.45)
     cases = sorted((case for case in CASES if any(cell["case"] == case.name for cell in cells)), key=_number)
     rows = _places([(case.name, _number(case)) for case in cases], 0.22)
@@ -47,24 +53,55 @@ def draw(cells: list[dict], out: Path) -> None:
             if len(set(outcomes)) == 1:
                 _filled(ax, x, y, SQUARE, outcomes[0], (0.5, 0.53), 6.5)
             else:
-                for corners, outcome, middle in zip(HALVES, outcomes, ((0.29, 0.33), (0.71, 0.74)), strict=True):
+                for corners, outcome, middle in zip(
+                    HALVES, outcomes, ((0.29, 0.33), (0.71, 0.74)), strict=True
+                ):
                     _filled(ax, x, y, corners, outcome, middle, 5)
     for case in cases:
-        label = f"{case.title}{' (no answer: f is right)' if case.flag_is_right else ''}   $\\bf{{{case.name.split()[0]}}}$"
+        label = (
+            f"{case.title}{' (no answer: f is right)' if case.flag_is_right else ''}  "
+            f" $\\bf{{{case.name.split()[0]}}}$"
+        )
         ax.text(-0.4, rows[case.name] + 0.54, label, ha="right", va="center", fontsize=7.5)
     for name, x in columns.items():
         ax.text(x + 0.55, height + 0.3, name, ha="center", va="top", rotation=90, fontsize=7.5)
     for group in dict.fromkeys(method.group for method in asked):
         inside = [columns[method.name] for method in asked if method.group == group]
-        ax.text((min(inside) + max(inside) + 1) / 2, -0.45, group, ha="center", va="bottom", fontsize=8, style="italic")
+        ax.text(
+            (min(inside) + max(inside) + 1) / 2,
+            -0.45,
+            group,
+            ha="center",
+            va="bottom",
+            fontsize=8,
+            style="italic",
+        )
     if "default" in columns:
-        ax.add_patch(Rectangle((columns["default"] - 0.03, -0.04), 1.06, height + 0.08, fill=False, lw=1.6, ec="black", clip_on=False))
-    how = f"Framed: the engine with nothing chosen. A cell is split where precisions differ: {types[0]} upper left, {types[-1]} lower right."
+        ax.add_patch(
+            Rectangle(
+                (columns["default"] - 0.03, -0.04),
+                1.06,
+                height + 0.08,
+                fill=False,
+                lw=1.6,
+                ec="black",
+                clip_on=False,
+            )
+        )
+    how = (
+        f"Framed: the engine with nothing chosen. A cell is split where precisions differ: {types[0]} upper"
+        f" left, {types[-1]} lower right."
+    )
     titles = (("Where methods fail: hard cases of constrained dynamics", 0.2, 12), (how, 0.44, 8.5))
     for text, below, points in titles:
         figure.text(0.5, 1 - below / size[1], text, ha="center", va="top", fontsize=points)
-    handles = [Rectangle((0, 0), 1, 1, facecolor=colour, edgecolor="#BBBBBB", lw=0.5, label=words) for colour, _, words in LOOKS.values()]
-    figure.legend(handles=handles, loc="lower center", ncols=3 if width < 30 else len(LOOKS), fontsize=8, frameon=False)
+    handles = [
+        Rectangle((0, 0), 1, 1, facecolor=colour, edgecolor="#BBBBBB", lw=0.5, label=words)
+        for colour, _, words in LOOKS.values()
+    ]
+    figure.legend(
+        handles=handles, loc="lower center", ncols=3 if width < 30 else len(LOOKS), fontsize=8, frameon=False
+    )
     for suffix in ("png", "svg"):
         figure.savefig(out / f"atlas.{suffix}", dpi=150)
     plt.close(figure)
@@ -83,4 +120,12 @@ def _number(case: Case) -> int:
 def _filled(ax, x: float, y: float, corners, outcome: str, middle: tuple[float, float], size: float) -> None:
     colour, mark, _ = LOOKS[outcome]
     ax.add_patch(Polygon([(x + a, y + b) for a, b in corners], facecolor=colour, lw=0))
-    ax.text(x + middle[0], y + middle[1], mark, ha="center", va="center", fontsize=size, color="white" if outcome in (WRONG, NAN) else "black")
+    ax.text(
+        x + middle[0],
+        y + middle[1],
+        mark,
+        ha="center",
+        va="center",
+        fontsize=size,
+        color="white" if outcome in (WRONG, NAN) else "black",
+    )

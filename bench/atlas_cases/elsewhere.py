@@ -1,7 +1,9 @@
-"""Cases put to another engine, MuJoCo, as its documentation advises: joints where it has them, `connect` for loops, elliptic friction cones for rolling.
+"""Cases put to another engine, MuJoCo, as its documentation advises: joints where it has them, `connect` for
+loops, elliptic friction cones for rolling.
 
-Free joints have the coordinates of our scenes: position, quaternion, velocity in space, angular velocity in the body. Steps of the fourth order (RK4) where
-there is no contact, `implicitfast` where there is. Source: E. Todorov, T. Erez and Y. Tassa, IROS (2012) 5026.
+Free joints have the coordinates of our scenes: position, quaternion, velocity in space, angular velocity in
+the body. Steps of the fourth order (RK4) where there is no contact, `implicitfast` where there is. Source: E.
+Todorov, T. Erez and Y. Tassa, IROS (2012) 5026.
 """
 
 from collections.abc import Callable
@@ -17,14 +19,21 @@ except ImportError:
 
 MISSING = "`mujoco` is not installed"
 _HEAD = '<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 {gravity}" {more}/>'
-_FREE = '<worldbody>{ground}<body><freejoint/><inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>{shape}</body></worldbody></mujoco>'
-_ROLLING = '<default><geom condim="3" friction="1 0 0" solref="{reference} 1" solimp="0.999 0.9999 1e-4"/></default>'
+_FREE = (
+    '<worldbody>{ground}<body><freejoint/><inertial pos="0 0 0" mass="{mass}"'
+    ' diaginertia="{inertia}"/>{shape}</body></worldbody></mujoco>'
+)
+_ROLLING = (
+    '<default><geom condim="3" friction="1 0 0" solref="{reference} 1" solimp="0.999 0.9999 1e-4"/></default>'
+)
 _GROUND = '<geom type="plane" size="0 0 1"/>'
 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """A model, its state at the start, and how to read our q and u; `push(t)`: applied to the first freedom, N or N m."""
+    """A model, its state at the start, and how to read our q and u; `push(t)`: applied to the first freedom,
+    N or N m.
+    """
 
     model: str
     step: float  # s
@@ -33,7 +42,9 @@ class Elsewhere:
     push: Callable | None = None
 
     def run(self, ts, t0: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """q and u at the times, each reached by steps of equal length; NaN where the engine reports a bad state."""
+        """q and u at the times, each reached by steps of equal length; NaN where the engine reports a bad
+        state.
+        """
         model = mujoco.MjModel.from_xml_string(self.model)
         data, found = mujoco.MjData(model), []
         data.qpos[:], data.qvel[:] = self.start
@@ -49,7 +60,10 @@ class Elsewhere:
                     data.qfrc_applied[0] = self.push(before + k * model.opt.timestep)
                     mujoco.mj_step(model, data)
             mujoco.mj_forward(model, data)
-            bad = any(data.warning[getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")].number for kind in ("POS", "VEL", "ACC"))
+            bad = any(
+                data.warning[getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")].number
+                for kind in ("POS", "VEL", "ACC")
+            )
             q, u = self.read(data)
             found.append((q + np.nan, u + np.nan) if bad else (q, u))
         return tuple(np.array(part) for part in zip(*found, strict=True))
@@ -57,13 +71,32 @@ class Elsewhere:
 
 def free_body(mass: float, inertia, q, u) -> Elsewhere:
     """A body on which nothing acts."""
-    text = _HEAD.format(step=1e-3, integrator="RK4", gravity=0, more="") + _FREE.format(ground="", mass=mass, inertia=_numbers(inertia), shape="")
+    text = _HEAD.format(step=1e-3, integrator="RK4", gravity=0, more="") + _FREE.format(
+        ground="", mass=mass, inertia=_numbers(inertia), shape=""
+    )
     return Elsewhere(text, 1e-3, (q, u))
 
 
-def rolling(mass: float, inertia, shape: str, q, u, *, step: float = 1e-4, constant: float = 5, integrator="implicitfast", impratio=100, noslip=0) -> Elsewhere:
-    """A body that rolls on a plane; friction coefficient 1, time constant of the contact five steps, as short as it may be."""
-    more = f'cone="elliptic" impratio="{impratio}" tolerance="1e-12" iterations="100" noslip_iterations="{noslip}" noslip_tolerance="1e-14"'
+def rolling(
+    mass: float,
+    inertia,
+    shape: str,
+    q,
+    u,
+    *,
+    step: float = 1e-4,
+    constant: float = 5,
+    integrator="implicitfast",
+    impratio=100,
+    noslip=0,
+) -> Elsewhere:
+    """A body that rolls on a plane; friction coefficient 1, time constant of the contact five steps, as short
+    as it may be.
+    """
+    more = (
+        f'cone="elliptic" impratio="{impratio}" tolerance="1e-12" iterations="100"'
+        f' noslip_iterations="{noslip}" noslip_tolerance="1e-14"'
+    )
     head = _HEAD.format(step=step, integrator=integrator, gravity=-9.81, more=more)
     body = _FREE.format(ground=_GROUND, mass=mass, inertia=_numbers(inertia), shape=shape)
     return Elsewhere(head + _ROLLING.format(reference=constant * step) + body, step, (q, u))
@@ -74,7 +107,10 @@ def rolling_disc(mass: float, radius: float, minimal, **settings) -> Elsewhere:
     body, quaternion = start(radius, minimal), np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, body.rotation.ravel())
     shape = f'<geom type="cylinder" size="{radius} 1e-4" euler="90 0 0"/>'
-    q, u = np.concatenate([body.centre, quaternion]), np.concatenate([body.velocity, body.rotation.T @ body.angular_velocity])
+    q, u = (
+        np.concatenate([body.centre, quaternion]),
+        np.concatenate([body.velocity, body.rotation.T @ body.angular_velocity]),
+    )
     return rolling(mass, mass * radius**2 * np.array([0.25, 0.5, 0.25]), shape, q, u, **settings)
 
 
@@ -83,7 +119,9 @@ def body_of(position, velocity) -> Body:
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(position[3:], float))
     rotation = rotation.reshape(3, 3)
-    return Body(np.asarray(position[:3]), rotation, np.asarray(velocity[:3]), rotation @ np.asarray(velocity[3:]))
+    return Body(
+        np.asarray(position[:3]), rotation, np.asarray(velocity[:3]), rotation @ np.asarray(velocity[3:])
+    )
 
 
 def ball_shape(radius: float, middle) -> str:
@@ -92,15 +130,22 @@ def ball_shape(radius: float, middle) -> str:
 
 
 def four_bar(lengths, masses, gravity: float, start, read) -> Elsewhere:
-    """Crank, coupler on it, and rocker on the ground, hinged about -y (angles from x towards z); `connect` closes the loop. `start`: a, b, c and rates."""
+    """Crank, coupler on it, and rocker on the ground, hinged about -y (angles from x towards z); `connect`
+    closes the loop. `start`: a, b, c and rates.
+    """
     (r1, r2, r3, d), (m1, m2, m3) = lengths, masses
     (a, b, c), (da, db, dc) = start
-    head = _HEAD.format(step=1e-4, integrator="RK4", gravity=-gravity, more='tolerance="1e-12" iterations="100"')
+    head = _HEAD.format(
+        step=1e-4, integrator="RK4", gravity=-gravity, more='tolerance="1e-12" iterations="100"'
+    )
     hinge, site = '<joint type="hinge" axis="0 -1 0"/>', '<site name="{}" pos="{} 0 0"/>'
     coupler = f'<body pos="{r1} 0 0">{hinge}{_rod(m2, r2)}{site.format("end", r2)}</body>'
     rocker = f'<body pos="{d} 0 0">{hinge}{_rod(m3, r3)}{site.format("pin", r3)}</body>'
     bodies = f"<worldbody><body>{hinge}{_rod(m1, r1)}{coupler}</body>{rocker}</worldbody>"
-    text = f'{head}{bodies}<equality><connect site1="end" site2="pin" solref="5e-4 1" solimp="0.999 0.9999 1e-4"/></equality></mujoco>'
+    text = (
+        f'{head}{bodies}<equality><connect site1="end" site2="pin" solref="5e-4 1" solimp="0.999 0.9999'
+        ' 1e-4"/></equality></mujoco>'
+    )
     return Elsewhere(text, 1e-4, ([a, b - a, c], [da, db - da, dc]), read)
 
 
@@ -135,7 +180,10 @@ def oscillator(stiffness: float, x: float, v: float, step: float, push=None) -> 
     """A block of 1 kg on a spring."""
     head = _HEAD.format(step=step, integrator="RK4", gravity=0, more="")
     slide = f'<joint type="slide" axis="1 0 0" stiffness="{stiffness}"/>'
-    text = f'{head}<worldbody><body>{slide}<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>'
+    text = (
+        f'{head}<worldbody><body>{slide}<inertial pos="0 0 0" mass="1" diaginertia="1 1'
+        ' 1"/></body></worldbody></mujoco>'
+    )
     return Elsewhere(text, step, ([x], [v]), push=push)
 
 

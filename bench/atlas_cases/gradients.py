@@ -15,13 +15,19 @@ from atlas_cases.methods import Method
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
 from jourdain_jax.integrate import result_codes
 
-FEWER_STEPS = 2000  # for the reductions, of which reverse mode takes seconds per thousand steps: ten times what a right answer took
-IMPLICIT_STEPS = 5000  # for an implicit solver of diffrax, which comes to a singularity in ever shorter steps and goes back over all of them
+# for the reductions, of which reverse mode takes seconds per thousand steps: ten times what a right answer
+# took
+FEWER_STEPS = 2000
+# for an implicit solver of diffrax, which comes to a singularity in ever shorter steps and goes back over all
+# of them
+IMPLICIT_STEPS = 5000
 
 
 @dataclass
 class DerivativeOfMotion:
-    """`d value/d x`, `value` being a function of the trajectory that starts from `begin(x)`: a scene and a start."""
+    """`d value/d x`, `value` being a function of the trajectory that starts from `begin(x)`: a scene and a
+    start.
+    """
 
     begin: Callable
     x: float
@@ -38,17 +44,32 @@ class DerivativeOfMotion:
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
         why = self.skip.get(method.name, self.skip.get(method.group))
-        if why is not None or method.group in ("constraints", "elsewhere") or method.even_steps or method.name == "Radau IIA":
+        if (
+            why is not None
+            or method.group in ("constraints", "elsewhere")
+            or method.even_steps
+            or method.name == "Radau IIA"
+        ):
             return not_applicable(why or "asked of motions")
         x = jnp.asarray(self.x, jnp.result_type(float))
         if method.naive is not None:
             return self._by_naive(method, x, tolerance)
         options = method.options(self.begin(x)[0])
-        if method.reduction:  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
-            options |= {"max_steps": FEWER_STEPS, "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction])}
+        if (
+            method.reduction
+        ):  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
+            options |= {
+                "max_steps": FEWER_STEPS,
+                "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction]),
+            }
         if method.name == "Kvaerno5":
             options |= {"max_steps": IMPLICIT_STEPS}
-        options |= {"rtol": by_type(self.rtol, 1e-5), "atol": by_type(self.atol, 1e-6), "ts": self.ts, "retry": True}
+        options |= {
+            "rtol": by_type(self.rtol, 1e-5),
+            "atol": by_type(self.atol, 1e-6),
+            "ts": self.ts,
+            "retry": True,
+        }
 
         def value(x):
             scene, start = self.begin(x)
@@ -70,14 +91,27 @@ class DerivativeOfMotion:
         except (ValueError, jj.DifferentiationModeError) as refusal:
             return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
         if int(code) not in (result_codes.SUCCESS, result_codes.EVENT):
-            return judged(np.nan, tolerance, result_codes.MESSAGES[int(code)], stalled=int(code) == result_codes.MAX_STEPS)
+            return judged(
+                np.nan,
+                tolerance,
+                result_codes.MESSAGES[int(code)],
+                stalled=int(code) == result_codes.MAX_STEPS,
+            )
         found = judged(worst(float(slope), self.known, self.scale), tolerance)
-        said = [str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)]
-        return found if found.outcome == "right" or not said else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")
+        said = [
+            str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)
+        ]
+        return (
+            found
+            if found.outcome == "right" or not said
+            else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")
+        )
 
     def _by_naive(self, method: Method, x, tolerance: float) -> Outcome:
         if self.naive_value is None or method.naive in naive.REDUCED_STATE:
-            return not_applicable("fixed steps find no event" if self.naive_value is None else "asked of motions")
+            return not_applicable(
+                "fixed steps find no event" if self.naive_value is None else "asked of motions"
+            )
         scene, start = self.begin(x)
         state = jj.start(scene, **start)
         static = naive.fixed_point(scene, state.q, state.u)
@@ -85,7 +119,9 @@ class DerivativeOfMotion:
         def value(x):
             scene, start = self.begin(x)
             state = jj.start(scene, **start)
-            qs, us = naive.motion(method.naive, scene, static, state.q, state.u, self.ts, self.steps, alone=True)
+            qs, us = naive.motion(
+                method.naive, scene, static, state.q, state.u, self.ts, self.steps, alone=True
+            )
             return self.naive_value(qs[-1], us[-1])
 
         try:

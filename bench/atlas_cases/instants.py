@@ -34,7 +34,9 @@ class Instant:
             return not_applicable(ONLY_MOTION)
         q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
         if method.naive is not None:
-            udot = naive.accelerations(method.naive, self.scene, naive.fixed_point(self.scene, q, u), 0.0, q, u)
+            udot = naive.accelerations(
+                method.naive, self.scene, naive.fixed_point(self.scene, q, u), 0.0, q, u
+            )
             return judged(worst(udot, self.udot, self.scale), tolerance)
         found = jj.accelerations(self.scene, 0.0, q, u, reduction=reduction(self.scene, method.reduction))
         error = worst(found.udot, self.udot, self.scale)
@@ -48,7 +50,9 @@ class Instant:
 
 
 def flags_of(found: jj.Accelerations) -> str:
-    """What accelerations say against themselves: not applicable, fewer independent rows than rows, a small singular value, a residual."""
+    """What accelerations say against themselves: not applicable, fewer independent rows than rows, a small
+    singular value, a residual.
+    """
     rows, eps = found.multipliers.shape[0], float(jnp.finfo(found.udot.dtype).eps)
     if not bool(found.applicable):
         return "`applicable` is False"
@@ -87,7 +91,11 @@ class DerivativeOfAccelerations:
         if key not in self.traced:
             self.traced[key] = eval_numpy(jax.grad(value))  # looked at once: compiling would take longer
         try:
-            slope = float(self.traced[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
+            slope = float(
+                self.traced[key](
+                    jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)
+                )
+            )
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
         return judged(worst(slope, self.known), tolerance)

@@ -1,6 +1,8 @@
-"""The methods of the atlas: the engine as it comes, its reductions and options, integrators, adjoints, and naive methods.
+"""The methods of the atlas: the engine as it comes, its reductions and options, integrators, adjoints, and
+naive methods.
 
-To add an integrator, append a line to `INTEGRATORS`; it is then run in every case with a motion. Naive methods live in `naive.py`.
+To add an integrator, append a line to `INTEGRATORS`; it is then run in every case with a motion. Naive
+methods live in `naive.py`.
 """
 
 from collections.abc import Callable
@@ -22,14 +24,23 @@ INTEGRATORS: dict[str, Callable] = {
     "Kvaerno5": diffrax.Kvaerno5,
     "Radau IIA": jj.RadauIIA,
 }
-EVEN_STEPS = {"implicit midpoint": jj.ImplicitMidpoint, "DLA": jj.DiscreteLagrangeDAlembert, "discrete gradient": jj.DiscreteGradient}  # of a `step`
-STABILISED = {"no projection": 0.0, "Baumgarte 5/s": 5.0, "Baumgarte 1e4/s": 1e4}  # rates; one program serves all
+EVEN_STEPS = {
+    "implicit midpoint": jj.ImplicitMidpoint,
+    "DLA": jj.DiscreteLagrangeDAlembert,
+    "discrete gradient": jj.DiscreteGradient,
+}  # of a `step`
+STABILISED = {
+    "no projection": 0.0,
+    "Baumgarte 5/s": 5.0,
+    "Baumgarte 1e4/s": 1e4,
+}  # rates; one program serves all
 
 
 class OneOf(GibbsAppell):
     """The reduction with number `index` out of several: they share one compiled program.
 
-    A kind of `GibbsAppell` because that reduction alone is handed everything: the scene, and equations and rows in raw units.
+    A kind of `GibbsAppell` because that reduction alone is handed everything: the scene, and equations and
+    rows in raw units.
     """
 
     index: Int[Array, ""]
@@ -47,7 +58,12 @@ class OneOf(GibbsAppell):
 
 
 def _uniform(found: Reduced) -> Reduced:
-    return Reduced(found.udot, found.constraint_force, jnp.asarray(found.pivot, found.udot.dtype), jnp.asarray(found.applicable))
+    return Reduced(
+        found.udot,
+        found.constraint_force,
+        jnp.asarray(found.pivot, found.udot.dtype),
+        jnp.asarray(found.applicable),
+    )
 
 
 def reduction(scene, name: str | None):
@@ -55,7 +71,11 @@ def reduction(scene, name: str | None):
     if name is None:
         return None
     known = jj.reductions(scene)
-    return OneOf(known["gibbs-appell"].independent, jnp.asarray(REDUCTIONS.index(name)), tuple(known[member] for member in REDUCTIONS))
+    return OneOf(
+        known["gibbs-appell"].independent,
+        jnp.asarray(REDUCTIONS.index(name)),
+        tuple(known[member] for member in REDUCTIONS),
+    )
 
 
 @dataclass(frozen=True)
@@ -77,11 +97,16 @@ class Method:
 
 
 def _by_reduction(name: str) -> Method:
-    return Method(name, "reductions", lambda scene: {"formulation": jj.Formulation("full", reduction(scene, name))}, reduction=name)
+    return Method(
+        name,
+        "reductions",
+        lambda scene: {"formulation": jj.Formulation("full", reduction(scene, name))},
+        reduction=name,
+    )
 
 
 def _stabilised(name: str, rate: float) -> Method:
-    terms = lambda scene: {"formulation": jj.Formulation("full", stabilisation=jj.Baumgarte(rate, rate))}  # noqa: E731
+    terms = lambda scene: {"formulation": jj.Formulation("full", stabilisation=jj.Baumgarte(rate, rate))}
     return Method(name, "constraints", terms)
 
 
@@ -101,7 +126,10 @@ METHODS: tuple[Method, ...] = (
     Method("rollout", "engine", batch=True),
     *(_by_reduction(name) for name in REDUCTIONS),
     *(_stabilised(name, rate) for name, rate in STABILISED.items()),
-    *(Method(name, "integrators", lambda scene, make=make: {"solver": make(), "work": False}) for name, make in INTEGRATORS.items()),
+    *(
+        Method(name, "integrators", lambda scene, make=make: {"solver": make(), "work": False})
+        for name, make in INTEGRATORS.items()
+    ),
     *(Method(name, "integrators") for name in EVEN_STEPS),
     Method("forward mode", "adjoints"),
     *(Method(name, "naive", naive=name) for name in NAIVE),

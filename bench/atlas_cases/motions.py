@@ -1,4 +1,6 @@
-"""The probe of a motion: integrate to some end, compare with a closed form, a reference or integrals of the motion."""
+"""The probe of a motion: integrate to some end, compare with a closed form, a reference or integrals of the
+motion.
+"""
 
 import warnings
 from collections.abc import Callable
@@ -38,8 +40,12 @@ class Motion:
     atol: float = 1e-12
     rtol32: float = 1e-5
     steps: int = 400  # of the naive methods, between two times
-    most_steps: int = 20_000  # of reductions on the full state (float32: 5,000, constraints too), a hundred times as slow per step as the default
-    independent: tuple[str, ...] | None = None  # speeds that the fixed partition keeps; None: the best at the start
+    # of reductions on the full state (float32: 5,000, constraints too), a hundred times as slow per step as
+    # the default
+    most_steps: int = 20_000
+    independent: tuple[str, ...] | None = (
+        None  # speeds that the fixed partition keeps; None: the best at the start
+    )
     options: dict = field(default_factory=dict)  # of `simulate`, part of the set-up
     skip: dict = field(default_factory=dict)  # method or group -> why it is not asked
     asked: tuple[str, ...] = ()  # costly methods, `SELDOM`, that are asked here
@@ -84,20 +90,31 @@ class Motion:
             steps: dict = {"solver": EVEN_STEPS[method.name](step=self.step)} if method.even_steps else {}
             if method.reduction or (single() and method.group == "constraints" and method.name not in SELDOM):
                 steps["max_steps"] = by_type(self.most_steps, 5_000)
-            return jj.simulate(self.scene, self.start, ts=self.ts, retry=True, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})
+            return jj.simulate(
+                self.scene,
+                self.start,
+                ts=self.ts,
+                retry=True,
+                **self.tolerances,
+                **{**self.options, **method.options(self.scene), **steps},
+            )
 
     def _rollout(self):
         """Two equal lanes of a batch; the second one."""
         lanes = jax.tree.map(lambda x: jnp.stack([x, x]), self.state)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return jj.rollout(self.scene, lanes, ts=self.ts, retry=True, **self.tolerances, **self.options).lane(1)
+            return jj.rollout(
+                self.scene, lanes, ts=self.ts, retry=True, **self.tolerances, **self.options
+            ).lane(1)
 
     def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
         """Outcome of a trajectory: its result code, its numbers, and what its summary warns of."""
         code = int(motion.result)
         if code == result_codes.MAX_STEPS:
-            return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True)
+            return judged(
+                np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True
+            )
         if code != result_codes.SUCCESS:
             return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)")
         error = self.error(np.asarray(motion.q, float), np.asarray(motion.u, float))
@@ -107,17 +124,27 @@ class Motion:
         return judged(error, tolerance, "; ".join(motion.warnings))
 
     def _elsewhere(self, tolerance: float) -> Outcome:
-        why = "its model of the case would be another one" if self.by_mujoco is None else elsewhere.MISSING if elsewhere.mujoco is None else ""
+        why = (
+            "its model of the case would be another one"
+            if self.by_mujoco is None
+            else elsewhere.MISSING
+            if elsewhere.mujoco is None
+            else ""
+        )
         if why or single():
             return not_applicable(why or "it computes in double precision")
         with np.errstate(all="ignore"):
-            return judged(self.error(*self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))), tolerance)
+            return judged(
+                self.error(*self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))), tolerance
+            )
 
     def _by_naive(self, method: Method, tolerance: float) -> Outcome:
         state = self.state
         q, u = (state.q, state.u) if self.naive_start is None else map(jnp.asarray, self.naive_start)
         rows = constraint_rows(self.scene, 0.0, q, u)
-        if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
+        if method.naive in naive.REDUCED_STATE and (
+            not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0
+        ):
             return not_applicable("no rows that are linear in the speeds")
         static = naive.fixed_point(self.scene, q, u, independent=self.independent)
         qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, self.steps)
@@ -127,25 +154,40 @@ class Motion:
         return judged(self.error(qs, us), tolerance)
 
 
-def against(scene: jj.Scene, expected: dict, scales: dict | None = None) -> Callable[[np.ndarray, np.ndarray], float]:
-    """Error against named coordinates and speeds at all times, each relative to its own size (or its entry in `scales`)."""
+def against(
+    scene: jj.Scene, expected: dict, scales: dict | None = None
+) -> Callable[[np.ndarray, np.ndarray], float]:
+    """Error against named coordinates and speeds at all times, each relative to its own size (or its entry in
+    `scales`).
+    """
     names = (scene.coordinate_names.entries, scene.speed_names.entries)
 
     def error(q, u):
-        columns = [q[:, names[0].index(name)] if name in names[0] else u[:, names[1].index(name)] for name in expected]
+        columns = [
+            q[:, names[0].index(name)] if name in names[0] else u[:, names[1].index(name)]
+            for name in expected
+        ]
         pairs = zip(expected, columns, strict=True)
         return max_error(worst(column, expected[name], (scales or {}).get(name)) for name, column in pairs)
 
     return error
 
 
-def followed(scene: jj.Scene, start, ts, known: dict, names: str, scales: dict | None = None, **more) -> Motion:
-    """A motion whose coordinates an oracle knows; `names`: of ours, "ours=theirs" where the oracle calls it otherwise."""
+def followed(
+    scene: jj.Scene, start, ts, known: dict, names: str, scales: dict | None = None, **more
+) -> Motion:
+    """A motion whose coordinates an oracle knows; `names`: of ours, "ours=theirs" where the oracle calls it
+    otherwise.
+    """
     pairs = [name.split("=") for name in names.split()]
-    return Motion(scene, start, ts, against(scene, {pair[0]: known[pair[-1]] for pair in pairs}, scales), **more)
+    return Motion(
+        scene, start, ts, against(scene, {pair[0]: known[pair[-1]] for pair in pairs}, scales), **more
+    )
 
 
-def drift(*integrals: Callable[[np.ndarray, np.ndarray], np.ndarray], size: float | None = None) -> Callable[[np.ndarray, np.ndarray], float]:
+def drift(
+    *integrals: Callable[[np.ndarray, np.ndarray], np.ndarray], size: float | None = None
+) -> Callable[[np.ndarray, np.ndarray], float]:
     """Error as the largest change of integrals of the motion, relative to their start or to `size`."""
 
     def error(q, u):

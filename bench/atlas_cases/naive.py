@@ -1,7 +1,9 @@
-"""Methods as a first attempt would write them, without the guards of the engine: fixed partition, plain Schur complement, ridge, raw bases.
+"""Methods as a first attempt would write them, without the guards of the engine: fixed partition, plain Schur
+complement, ridge, raw bases.
 
-They see the same `M udot + h = Q + A' lambda`, `A udot = -drift` as the engine, in raw units, and are integrated by Runge and Kutta's
-classical method with fixed steps. They report nothing: what comes out is right, wrong or NaN.
+They see the same `M udot + h = Q + A' lambda`, `A udot = -drift` as the engine, in raw units, and are
+integrated by Runge and Kutta's classical method with fixed steps. They report nothing: what comes out is
+right, wrong or NaN.
 """
 
 from dataclasses import dataclass
@@ -33,7 +35,11 @@ def fixed_point(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) 
     rank = int(np.linalg.matrix_rank(A, tol=cut)) if A.size else 0
     rows = _pivots(A.T, rank)
     names = scene.speed_names.entries
-    dependent = _pivots(A[list(rows)], rank) if independent is None else tuple(i for i, name in enumerate(names) if name not in independent)
+    dependent = (
+        _pivots(A[list(rows)], rank)
+        if independent is None
+        else tuple(i for i, name in enumerate(names) if name not in independent)
+    )
     return Static(rank, rows, tuple(sorted(dependent)))
 
 
@@ -54,7 +60,10 @@ def _partition(A, b, static: Static):
     n, dependent = A.shape[1], list(static.dependent)
     independent = [i for i in range(n) if i not in dependent]
     A, b = A[np.array(static.rows, int)], b[np.array(static.rows, int)]
-    B = jnp.linalg.solve(A[:, np.array(dependent, int)], jnp.concatenate([-A[:, np.array(independent, int)], -b[:, None]], axis=1))
+    B = jnp.linalg.solve(
+        A[:, np.array(dependent, int)],
+        jnp.concatenate([-A[:, np.array(independent, int)], -b[:, None]], axis=1),
+    )
     order = np.argsort([*independent, *dependent])
     C = jnp.concatenate([jnp.eye(len(independent)), B[:, :-1]])[order]
     return C, jnp.concatenate([jnp.zeros(len(independent)), B[:, -1]])[order]
@@ -77,7 +86,9 @@ def _by_schur(solve):
 
 def _kkt(M, f, A, b, static):
     m = A.shape[0]
-    return jnp.linalg.solve(jnp.block([[M, -A.T], [A, jnp.zeros((m, m))]]), jnp.concatenate([f, b]))[: M.shape[0]]
+    return jnp.linalg.solve(jnp.block([[M, -A.T], [A, jnp.zeros((m, m))]]), jnp.concatenate([f, b]))[
+        : M.shape[0]
+    ]
 
 
 def svd_basis(A, rank: int):
@@ -131,13 +142,23 @@ def _solved(name: str, static: Static, M, f, A, b):
 def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int, *, alone: bool = False):
     """q and u at `ts` (the first is the start) with `steps` equal steps from each time to the next.
 
-    `alone`: a program of its own, for derivatives: where methods share one, a method without a derivative would take it from all.
+    `alone`: a program of its own, for derivatives: where methods share one, a method without a derivative
+    would take it from all.
     """
-    program, names = (_in_basis, tuple(REDUCED_STATE)) if name in REDUCED_STATE else (_all_in_one, (name,) if alone else tuple(ACCELERATIONS))
+    program, names = (
+        (_in_basis, tuple(REDUCED_STATE))
+        if name in REDUCED_STATE
+        else (_all_in_one, (name,) if alone else tuple(ACCELERATIONS))
+    )
     return program(scene, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts), static, steps, names)
 
 
-_STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # how far each stage reaches along the slope before it, and its weight
+_STAGES = (
+    (0.0, 1 / 6),
+    (0.5, 1 / 3),
+    (0.5, 1 / 3),
+    (1.0, 1 / 6),
+)  # how far each stage reaches along the slope before it, and its weight
 
 
 def _plus(y, factor, slope):
@@ -159,7 +180,9 @@ def _runge_kutta(rates, y, ts, steps: int):
                 slope = rates(t + reach * h, _plus(y, reach * h, slope))
                 return (slope, _plus(total, share * h, slope)), None
 
-            return jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), y), jnp.asarray(_STAGES, h.dtype))[0][1]
+            return jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), y), jnp.asarray(_STAGES, h.dtype))[
+                0
+            ][1]
 
         y = jax.lax.fori_loop(0, steps, step, y)
         return y, y
@@ -184,9 +207,11 @@ def _all_in_one(scene, index, q, u, ts, static: Static, steps: int, names: tuple
 
 @partial(jax.jit, static_argnames=("static", "steps", "names"))
 def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[str, ...]):
-    """A state of as many speeds s as there are freedoms: `u = Z s`, `sdot = Z+ (udot - Zdot s)`, Zdot by a difference.
+    """A state of as many speeds s as there are freedoms: `u = Z s`, `sdot = Z+ (udot - Zdot s)`, Zdot by a
+    difference.
 
-    Z is whatever basis the library returns, or C of the fixed partition, for which Z+ just picks the independent speeds.
+    Z is whatever basis the library returns, or C of the fixed partition, for which Z+ just picks the
+    independent speeds.
     """
     small, none = float(np.sqrt(jnp.finfo(q.dtype).eps)), jnp.zeros(u.shape)
     independent = np.array([i for i in range(u.shape[0]) if i not in static.dependent], int)
@@ -194,13 +219,21 @@ def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[s
     def rows_at(t, q):
         rows = constraint_rows(scene, t, q, none)
         # beyond that LAPACK's singular values of float32 may never converge: a motion that far off is lost
-        A = jnp.where(jnp.max(jnp.abs(rows.A), initial=0.0) < 1e-3 * float(np.sqrt(jnp.finfo(q.dtype).max)), rows.A, jnp.nan)
+        A = jnp.where(
+            jnp.max(jnp.abs(rows.A), initial=0.0) < 1e-3 * float(np.sqrt(jnp.finfo(q.dtype).max)),
+            rows.A,
+            jnp.nan,
+        )
         return A, rows.phi - A @ none
 
     @eqx.filter_jit  # one copy of it
     def basis(t, q):
         """Z and c of `u = Z s + c`."""
-        return jax.lax.switch(index, [lambda A, b, name=name: REDUCED_STATE[name](A, b, static) for name in names], *rows_at(t, q))
+        return jax.lax.switch(
+            index,
+            [lambda A, b, name=name: REDUCED_STATE[name](A, b, static) for name in names],
+            *rows_at(t, q),
+        )
 
     def rates(t, y):
         q, s = y

@@ -1,16 +1,27 @@
-"""What can become of a method in a case, and how it is decided from a measured error and from what the method says of itself."""
+"""What can become of a method in a case, and how it is decided from a measured error and from what the method
+says of itself.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE = "right", "flagged", "wrong", "nan", "stalled", "not applicable"
+RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE = (
+    "right",
+    "flagged",
+    "wrong",
+    "nan",
+    "stalled",
+    "not applicable",
+)
 OUTCOMES = (RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One cell of the atlas. `flag`: what the method says of its own failure, in words; empty where it claims success."""
+    """One cell of the atlas. `flag`: what the method says of its own failure, in words; empty where it claims
+    success.
+    """
 
     outcome: str
     error: float | None = None
@@ -36,7 +47,13 @@ def not_applicable(why: str) -> Outcome:
 
 
 def worst(values, expected, scale=None) -> float:
-    """Largest |value - expected| relative to `scale` (default: the largest |expected|, at least 1e-300); NaN where a value is not finite."""
+    """Largest |value - expected| relative to `scale` (default: the largest |expected|, at least 1e-300); NaN
+    where a value is not finite.
+    """
     values, expected = np.asarray(values, float), np.asarray(expected, float)
     size = max(float(np.max(np.abs(expected), initial=0.0)), 1e-300) if scale is None else scale
-    return float("nan") if not np.all(np.isfinite(values)) else float(np.max(np.abs(values - expected), initial=0.0) / size)
+    return (
+        float("nan")
+        if not np.all(np.isfinite(values))
+        else float(np.max(np.abs(values - expected), initial=0.0) / size)
+    )

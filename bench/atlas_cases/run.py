@@ -31,12 +31,17 @@ def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) 
                 "tolerance": tolerance,
                 "mechanism": mechanism(case, method, outcome),
             }
-        progress(f"{case.name} ({dtype}, {time.perf_counter() - begin:.0f} s): {'; '.join(f for f in found if NOT_APPLICABLE not in f)}")
+        progress(
+            f"{case.name} ({dtype}, {time.perf_counter() - begin:.0f} s):"
+            f" {'; '.join(f for f in found if NOT_APPLICABLE not in f)}"
+        )
         jax.clear_caches()
 
 
 def _asked(probe, method: Method, tolerance: float) -> Outcome:
-    """The method's outcome. An error is a flag; but the engine as it comes must raise its own kind of error, any other is a wrong answer that says why."""
+    """The method's outcome. An error is a flag; but the engine as it comes must raise its own kind of error,
+    any other is a wrong answer that says why.
+    """
     try:
         return probe.cell(method, tolerance)
     except Exception as error:

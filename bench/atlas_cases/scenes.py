@@ -1,4 +1,6 @@
-"""Scenes of the atlas that are no textbook models: redundant and nearly redundant rows, linkages, rows nonlinear in the speeds."""
+"""Scenes of the atlas that are no textbook models: redundant and nearly redundant rows, linkages, rows
+nonlinear in the speeds.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +12,9 @@ _TURN = (-3.2, 3.2)
 
 
 class HeavyAxle(jj.Scene):
-    """Two disc wheels on an axle with mass, on an incline (B1): four rows, of which the two lateral ones are the same."""
+    """Two disc wheels on an axle with mass, on an incline (B1): four rows, of which the two lateral ones are
+    the same.
+    """
 
     radius: object = jj.parameter(0.3, positive=True)
     half_track: object = jj.parameter(0.4, positive=True)
@@ -28,7 +32,9 @@ class HeavyAxle(jj.Scene):
         slender = self.axle_mass * (2 * self.half_track) ** 2 / 12
         bodies = {"axle": jj.RigidBody(self.axle_mass, slender * jnp.ones(3), middle, turned)}
         for name, place, spin in (("wheel 1", middle + axle, q.p1), ("wheel 2", middle - axle, q.p2)):
-            bodies[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(spin))
+            bodies[name] = jj.RigidBody.thin_disc(
+                self.wheel_mass, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(spin)
+            )
         return bodies
 
     def loads(self, motion):
@@ -48,7 +54,9 @@ class HeavyAxle(jj.Scene):
 
 
 class Edges(jj.Scene):
-    """The skate with three copies of its row (one of them seven times as long), or with a second edge turned by `angle` against the first."""
+    """The skate with three copies of its row (one of them seven times as long), or with a second edge turned
+    by `angle` against the first.
+    """
 
     angle: object = jj.parameter(0.0)
     slope: object = jj.parameter(0.3)
@@ -57,21 +65,39 @@ class Edges(jj.Scene):
     domain = {"heading": _TURN}
 
     def bodies(self, t, q):
-        return {"skate": jj.RigidBody(1.0, 0.2 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading))}
+        return {
+            "skate": jj.RigidBody(
+                1.0, 0.2 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading)
+            )
+        }
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81, jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])),)
+        return (
+            jj.gravity(
+                motion,
+                9.81,
+                jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)]),
+            ),
+        )
 
     def velocity_constraints(self, motion):
         skate = motion["skate"]
         rows = {"edge": jj.knife_edge(skate, skate.position, skate.orientation[:, 1])}
         if self.copies:
             return rows | {"copy": rows["edge"], "longer copy": 7.0 * rows["edge"]}
-        return rows | {"second": jj.knife_edge(skate, skate.position, skate.orientation @ jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle), 0.0]))}
+        return rows | {
+            "second": jj.knife_edge(
+                skate,
+                skate.position,
+                skate.orientation @ jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle), 0.0]),
+            )
+        }
 
 
 class OrthonormalRows(Point):
-    """A particle in space whose velocity has two orthonormal rows, turned with its coordinate x: equal singular values everywhere."""
+    """A particle in space whose velocity has two orthonormal rows, turned with its coordinate x: equal
+    singular values everywhere.
+    """
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -83,14 +109,18 @@ class OrthonormalRows(Point):
 
 
 class LeadingRow(Point):
-    """Rosenberg's particle in another order, `xdot = z ydot`: at z = 0 the row lies along the first coordinate."""
+    """Rosenberg's particle in another order, `xdot = z ydot`: at z = 0 the row lies along the first
+    coordinate.
+    """
 
     def velocity_constraints(self, motion):
         return {"sheet": motion.u.x_rate - motion.q.z * motion.u.y_rate}
 
 
 class AppellHamel(Point):
-    """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes, with its slope, at rest."""
+    """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes,
+    with its slope, at rest.
+    """
 
     k: object = jj.parameter(0.8)
     domain = {"x_rate": (0.2, 1.0), "y_rate": (0.2, 1.0), "z_rate": (-2.0, -0.2)}
@@ -104,7 +134,8 @@ class AppellHamel(Point):
 
 
 class FourBars(jj.Scene):
-    """The n-four-bar linkage: n windows of rods of 1 m and 1 kg, in a vertical plane. Points P0 to Pn hang from pivots 1 m apart.
+    """The n-four-bar linkage: n windows of rods of 1 m and 1 kg, in a vertical plane. Points P0 to Pn hang
+    from pivots 1 m apart.
 
     A uniform rod is as good as a sixth of its mass at either end and the rest in the middle.
     """
@@ -120,7 +151,9 @@ class FourBars(jj.Scene):
     @property
     def domain(self):
         """Near the half circle above the pivots."""
-        return {f"x{i}": (i - 1.0, i + 1.0) for i in range(self.windows + 1)} | {f"z{i}": (0.2, 1.0) for i in range(self.windows + 1)}
+        return {f"x{i}": (i - 1.0, i + 1.0) for i in range(self.windows + 1)} | {
+            f"z{i}": (0.2, 1.0) for i in range(self.windows + 1)
+        }
 
     def _points(self, q):
         points = [jnp.stack([q[f"x{i}"], 0.0 * q.x0, q[f"z{i}"]]) for i in range(self.windows + 1)]
@@ -128,9 +161,17 @@ class FourBars(jj.Scene):
 
     def bodies(self, t, q):
         points, pivots = self._points(q)
-        bodies = {f"end {i}": jj.Particle((1 + (0 < i < self.windows) + 1.0) / 6, point) for i, point in enumerate(points)}
-        bodies |= {f"crank {i}": jj.Particle(2 / 3, (a + b) / 2) for i, (a, b) in enumerate(zip(points, pivots, strict=True))}
-        return bodies | {f"coupler {i}": jj.Particle(2 / 3, (points[i] + points[i + 1]) / 2) for i in range(self.windows)}
+        bodies = {
+            f"end {i}": jj.Particle((1 + (0 < i < self.windows) + 1.0) / 6, point)
+            for i, point in enumerate(points)
+        }
+        bodies |= {
+            f"crank {i}": jj.Particle(2 / 3, (a + b) / 2)
+            for i, (a, b) in enumerate(zip(points, pivots, strict=True))
+        }
+        return bodies | {
+            f"coupler {i}": jj.Particle(2 / 3, (points[i] + points[i + 1]) / 2) for i in range(self.windows)
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)
@@ -142,11 +183,15 @@ class FourBars(jj.Scene):
 
 
 class Bricard(jj.Scene):
-    """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis of symmetry: z."""
+    """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis
+    of symmetry: z.
+    """
 
     lengths: object = jj.parameter((1.0,) * 6, positive=True)
     domain_near: tuple[float, ...] = eqx.field(static=True, default=())
-    coordinates = jj.coordinates(*(f"{name}{axis}" for name in ("a", "b", "c", "ai", "bi", "ci") for axis in "xyz"))  # "ai": the image of "a"
+    coordinates = jj.coordinates(
+        *(f"{name}{axis}" for name in ("a", "b", "c", "ai", "bi", "ci") for axis in "xyz")
+    )  # "ai": the image of "a"
 
     @property
     def domain(self):
@@ -159,7 +204,10 @@ class Bricard(jj.Scene):
         return dict(zip(("a", "b", "c", "ai", "bi", "ci"), q.array.reshape(6, 3), strict=True))
 
     def bodies(self, t, q):
-        return {name: jj.Particle(mass, at) for (name, at), mass in zip(self.points(q).items(), (1.0, 1.5, 0.7) * 2, strict=True)}
+        return {
+            name: jj.Particle(mass, at)
+            for (name, at), mass in zip(self.points(q).items(), (1.0, 1.5, 0.7) * 2, strict=True)
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -167,7 +215,11 @@ class Bricard(jj.Scene):
     def geometric_constraints(self, pose):
         points, rows = self.points(pose.q), {}
         images = {name: name[0] if name.endswith("i") else f"{name}i" for name in points}
-        for (first, second), length in zip((("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci")), self.lengths, strict=True):
+        for (first, second), length in zip(
+            (("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci")),
+            self.lengths,
+            strict=True,
+        ):
             rows[f"{first}{second}"] = jj.rod(points[first], points[second], length)
             rows[f"{first}{second} image"] = jj.rod(points[images[first]], points[images[second]], length)
         return rows

@@ -1,4 +1,6 @@
-"""Scenes of the atlas about long, stiff and singular motions: balls, discs, rattlebacks in quaternions, contact oscillators, a soft contact."""
+"""Scenes of the atlas about long, stiff and singular motions: balls, discs, rattlebacks in quaternions,
+contact oscillators, a soft contact.
+"""
 
 import equinox as eqx
 import jax
@@ -30,7 +32,9 @@ class InSpace(jj.Scene):
 
 
 class CeltInQuaternion(InSpace):
-    """The rattleback (B15) with a quaternion and a height row: no attitude is singular. z up; body axis 3 down at identity of the table's angles."""
+    """The rattleback (B15) with a quaternion and a height row: no attitude is singular. z up; body axis 3
+    down at identity of the table's angles.
+    """
 
     gravity: object = jj.parameter(9.81)
     scale: float = eqx.field(static=True, default=1.0)  # units of length per metre
@@ -63,7 +67,9 @@ class CeltInQuaternion(InSpace):
 
 
 class EccentricBall(InSpace):
-    """A ball of radius 1 m that rolls on a plane, its mass centre off its middle along the body axis z, about which its inertia is symmetric."""
+    """A ball of radius 1 m that rolls on a plane, its mass centre off its middle along the body axis z, about
+    which its inertia is symmetric.
+    """
 
     offset: object = jj.parameter(0.3)
     axial: object = jj.parameter(0.5, positive=True)
@@ -87,7 +93,9 @@ class EccentricBall(InSpace):
 
 
 class DragDisc(InSpace):
-    """Euler's disc (B7): a rolling disc in quaternions that loses the power `drag psidot^2`; theta^2 then falls linearly, to zero in finite time."""
+    """Euler's disc (B7): a rolling disc in quaternions that loses the power `drag psidot^2`; theta^2 then
+    falls linearly, to zero in finite time.
+    """
 
     drag: object = jj.parameter(1.7e-4, non_negative=True)
     domain = {"z": (0.05, 0.3), **_turning()}
@@ -99,21 +107,29 @@ class DragDisc(InSpace):
     def loads(self, motion):
         disc = motion["disc"]
         axle = disc.orientation[:, 1]
-        up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle  # of length sin(theta), along the line from the contact to the centre
+        up = (
+            jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle
+        )  # of length sin(theta), along the line from the contact to the centre
         squared = up @ up
         # psidot = w . up / sin^2, and M . w = -drag psidot^2
-        return (*super().loads(motion), jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up))
+        return (
+            *super().loads(motion),
+            jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up),
+        )
 
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["disc"], 0.3, height="row")}
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps}  # as the model `tilting_disc_quaternion`
+        return {
+            "flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps
+        }  # as the model `tilting_disc_quaternion`
 
 
 class ContactOscillator(jj.Scene):
-    """McLachlan and Perlmutter's contact oscillator, `xdot + y zdot = 0`, V = (x^2 + y^2 + z^2)/2 + strength x^2 z^2/2, masses 1 kg.
+    """McLachlan and Perlmutter's contact oscillator, `xdot + y zdot = 0`, V = (x^2 + y^2 + z^2)/2 + strength
+    x^2 z^2/2, masses 1 kg.
 
     With `pairs` = 3 the chaotic one: `xdot + sum y_i zdot_i = 0` and a coupling of x^2 with all z_i^2.
     """
@@ -134,7 +150,10 @@ class ContactOscillator(jj.Scene):
     def bodies(self, t, q):
         zero = 0.0 * q.x
         bodies = {"x": jj.Particle(1.0, jnp.stack([q.x, zero, zero]))}
-        return bodies | {f"pair {i}": jj.Particle(1.0, jnp.stack([zero, q[f"y{i}"], q[f"z{i}"]])) for i in range(self.pairs)}
+        return bodies | {
+            f"pair {i}": jj.Particle(1.0, jnp.stack([zero, q[f"y{i}"], q[f"z{i}"]]))
+            for i in range(self.pairs)
+        }
 
     def potential(self, pose):
         q = pose.q
@@ -147,7 +166,8 @@ class ContactOscillator(jj.Scene):
 
 
 class PendulumDrivenGear(Point):
-    """A continuously variable transmission: a driver y, on its own, sets the ratio between two oscillators, `xdot + f(y) zdot = 0`.
+    """A continuously variable transmission: a driver y, on its own, sets the ratio between two oscillators,
+    `xdot + f(y) zdot = 0`.
 
     f(y) = 1 + sin(y), which is neither even nor odd; V = 1 - cos(y) + y/5 + (x^2 + z^2)/2; masses 1 kg.
     """
@@ -172,7 +192,8 @@ class SteepEdge(OnLine):
 
 
 class SoftWheel(jj.Scene):
-    """The vertical disc (B4) with a contact of springs instead of rows: normal stiffness k and damping, slip resisted by `stiffness` times 1 s.
+    """The vertical disc (B4) with a contact of springs instead of rows: normal stiffness k and damping, slip
+    resisted by `stiffness` times 1 s.
 
     What penalty methods do. Its limit is rolling.
     """
@@ -190,17 +211,35 @@ class SoftWheel(jj.Scene):
         contact = jnp.array([0.0, 0.0, -1.0])
         slip = disc.velocity + jnp.cross(disc.angular_velocity, contact)
         normal = k * (1.0 - q.z) + 9.81 - 0.1 * jnp.sqrt(k) * u.z_rate
-        return (jj.gravity(motion, 9.81), jj.point_force(disc.point(disc.orientation.T @ contact), jnp.stack([-k * slip[0], -k * slip[1], normal])))
+        return (
+            jj.gravity(motion, 9.81),
+            jj.point_force(
+                disc.point(disc.orientation.T @ contact), jnp.stack([-k * slip[0], -k * slip[1], normal])
+            ),
+        )
 
 
 class SwitchedTurntable(jj.Scene):
-    """A ball (radius 0.05 m, solid) on a flat turntable whose turning is reversed smoothly: Om(t) = -2 tanh(3 (t - 1)) rad/s."""
+    """A ball (radius 0.05 m, solid) on a flat turntable whose turning is reversed smoothly: Om(t) = -2 tanh(3
+    (t - 1)) rad/s.
+    """
 
     coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(1.0, 0.05, position=jnp.stack([q.x, q.y, 0.05 + 0.0 * q.x]), orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {
+            "ball": jj.RigidBody.ball(
+                1.0,
+                0.05,
+                position=jnp.stack([q.x, q.y, 0.05 + 0.0 * q.x]),
+                orientation=jj.quaternion_to_matrix(q.attitude),
+            )
+        }
 
     def contacts(self, pose):
         turning = -2.0 * jnp.tanh(3.0 * (pose.t - 1.0))
-        return {"table": jj.ball_contact(pose["ball"], 0.05, ground=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0])))}
+        return {
+            "table": jj.ball_contact(
+                pose["ball"], 0.05, ground=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0]))
+            )
+        }

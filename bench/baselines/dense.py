@@ -1,11 +1,12 @@
-"""Rolling disc and nonlinear Whipple bicycle as a JAX user would write them: dense matrices by autodiff, one linear solve, diffrax, vmap.
+"""Rolling disc and nonlinear Whipple bicycle as a JAX user would write them: dense matrices by autodiff, one
+linear solve, diffrax, vmap.
 
     [M A'] [qddot ]   [Q - h ]      M = sum m Jv' Jv + Jw' I Jw,    h = sum m Jv' a0 + Jw' (I alpha0 + omega x I omega)
     [A 0 ] [lambda] = [-drift]      v = Jv qdot, omega = Jw qdot, rows A qdot = 0;    a0, alpha0, drift: their rates at qddot = 0
 
-Poses are written by hand, everything else is differentiated. The state of one lane is the flat array y = (q, qdot).
-Frozen: this file is the mark to beat, so it stays as it is; it imports nothing of the package. Double precision is switched on by whoever imports
-it (`JAX_ENABLE_X64=1`, or `import jourdain_jax` first).
+Poses are written by hand, everything else is differentiated. The state of one lane is the flat array y = (q,
+qdot). Frozen: this file is the mark to beat, so it stays as it is; it imports nothing of the package. Double
+precision is switched on by whoever imports it (`JAX_ENABLE_X64=1`, or `import jourdain_jax` first).
 """
 
 from typing import NamedTuple
@@ -49,7 +50,9 @@ def rot_z(angle):
 
 
 def slip(axle, radius, velocity, angular_velocity):
-    """Velocity of the material point of a wheel at its lowest point; its third entry is also the rate of that point's height."""
+    """Velocity of the material point of a wheel at its lowest point; its third entry is also the rate of that
+    point's height.
+    """
     up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle
     return velocity - jnp.cross(angular_velocity, radius * up / jnp.sqrt(up @ up))
 
@@ -57,12 +60,14 @@ def slip(axle, radius, velocity, angular_velocity):
 def accelerations(poses, rows, mass, inertia, force, q, qdot):
     """Accelerations of all coordinates, from one saddle-point system.
 
-    **Arguments:** `poses(q)`; `rows(poses, velocity, angular_velocity)`; `mass` (bodies,); `inertia` (bodies, 3, 3) in body axes; `force`
-    (bodies, 3), impressed at the mass centres.
+    **Arguments:** `poses(q)`; `rows(poses, velocity, angular_velocity)`; `mass` (bodies,); `inertia` (bodies,
+    3, 3) in body axes; `force` (bodies, 3), impressed at the mass centres.
     """
 
     def kinematics(here, rate):
-        W = jnp.einsum("bij...,bkj->bik...", rate.orientation, here.orientation)  # Rdot R', the matrix of omega x
+        W = jnp.einsum(
+            "bij...,bkj->bik...", rate.orientation, here.orientation
+        )  # Rdot R', the matrix of omega x
         omega = jnp.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], axis=1)
         return rate.position, omega
 
@@ -108,33 +113,50 @@ def disc_rates(p, t, y):
     q, qdot = y[:5], y[5:]
     mass = jnp.array([p["mass"]])
     inertia = p["mass"] * p["radius"] ** 2 * jnp.diag(jnp.array([0.25, 0.5, 0.25]))[None]
-    qddot = accelerations(lambda q: disc_poses(p, q), lambda *at: disc_rows(p, *at), mass, inertia, weights(mass, p["gravity"]), q, qdot)
+    qddot = accelerations(
+        lambda q: disc_poses(p, q),
+        lambda *at: disc_rows(p, *at),
+        mass,
+        inertia,
+        weights(mass, p["gravity"]),
+        q,
+        qdot,
+    )
     return jnp.concatenate([qdot, qddot])
 
 
-# The bicycle: q = (x, y, yaw, lean, pitch, steer, rear_spin, front_spin), x, y of the rear contact; bodies R, B, H, F.
+# The bicycle: q = (x, y, yaw, lean, pitch, steer, rear_spin, front_spin), x, y of the rear contact; bodies R,
+# B, H, F.
 
 
 def bicycle_poses(p, q):
-    """The rear frame in yaw, lean, pitch; the front frame turned about the steer axis, which is tilted back by lam."""
+    """The rear frame in yaw, lean, pitch; the front frame turned about the steer axis, which is tilted back
+    by lam.
+    """
     x, y, yaw, lean, pitch, steer, rear_spin, front_spin = q
     wheel_plane = rot_z(yaw) @ rot_x(lean)
     rear = wheel_plane @ rot_y(pitch)
     front = rear @ rot_y(-p["lam"]) @ rot_z(-steer) @ rot_y(p["lam"])
     rear_hub = jnp.stack([x, y, 0.0]) + p["rR"] * wheel_plane[:, 2]
-    steer_axis = rear_hub + rear @ jnp.array([p["w"] + p["c"], 0.0, -p["rR"]])  # where it meets the ground when upright
+    steer_axis = rear_hub + rear @ jnp.array(
+        [p["w"] + p["c"], 0.0, -p["rR"]]
+    )  # where it meets the ground when upright
     positions = [
         rear_hub,
         rear_hub + rear @ jnp.array([p["xB"], 0.0, -p["zB"] - p["rR"]]),
         steer_axis + front @ jnp.array([p["xH"] - p["w"] - p["c"], 0.0, -p["zH"]]),
         steer_axis + front @ jnp.array([-p["c"], 0.0, p["rF"]]),
     ]
-    return Bodies(jnp.stack(positions), jnp.stack([rear @ rot_y(rear_spin), rear, front, front @ rot_y(front_spin)]))
+    return Bodies(
+        jnp.stack(positions), jnp.stack([rear @ rot_y(rear_spin), rear, front, front @ rot_y(front_spin)])
+    )
 
 
 def bicycle_rows(p, here, v, omega):
     """Neither wheel slips; the front contact stays at its height."""
-    rear, front = (slip(here.orientation[b, :, 1], radius, v[b], omega[b]) for b, radius in ((0, p["rR"]), (3, p["rF"])))
+    rear, front = (
+        slip(here.orientation[b, :, 1], radius, v[b], omega[b]) for b, radius in ((0, p["rR"]), (3, p["rF"]))
+    )
     return jnp.concatenate([rear[:2], front])
 
 
@@ -153,14 +175,23 @@ def bicycle_rates(p, t, y):
     """`d (q, qdot) / dt` of the bicycle, y of 16 numbers."""
     q, qdot = y[:8], y[8:]
     mass = jnp.array([p["mR"], p["mB"], p["mH"], p["mF"]])
-    qddot = accelerations(lambda q: bicycle_poses(p, q), lambda *at: bicycle_rows(p, *at), mass, bicycle_inertia(p), weights(mass, p["g"]), q, qdot)
+    qddot = accelerations(
+        lambda q: bicycle_poses(p, q),
+        lambda *at: bicycle_rows(p, *at),
+        mass,
+        bicycle_inertia(p),
+        weights(mass, p["g"]),
+        q,
+        qdot,
+    )
     return jnp.concatenate([qdot, qddot])
 
 
 def integrate(rates, p, starts, end, solver="Dopri8", tolerance=1e-8):
     """Final states (lanes, states) at time `end` of a batch of starts at t = 0.
 
-    **Arguments:** `rates(p, t, y)` of one lane; `solver`, a name in `SOLVERS`; `tolerance`, both absolute and relative.
+    **Arguments:** `rates(p, t, y)` of one lane; `solver`, a name in `SOLVERS`; `tolerance`, both absolute and
+    relative.
     """
 
     def one(y):

@@ -1,7 +1,9 @@
-"""The run on which batches of the tilting disc are timed: 10 s, a thousand starts, their final states to 1e-12.
+"""The run on which batches of the tilting disc are timed: 10 s, a thousand starts, their final states to
+1e-12.
 
-The start is leant by 0.3 rad and has yaw, lean and spin rates 0.5, 0.2, -3 rad/s; each lane's four numbers differ from it by 5 % (standard
-deviation). States are minimal, y = (x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate).
+The start is leant by 0.3 rad and has yaw, lean and spin rates 0.5, 0.2, -3 rad/s; each lane's four numbers
+differ from it by 5 % (standard deviation). States are minimal, y = (x, y, yaw, lean, spin, yaw_rate,
+lean_rate, spin_rate).
 """
 
 from collections.abc import Callable
@@ -24,13 +26,20 @@ def starts(lanes: int) -> np.ndarray:
 
 
 def with_all_speeds(y: np.ndarray) -> np.ndarray:
-    """The states (q, qdot), (lanes, 10), of minimal ones: the contact point moves by `radius spin_rate` along the heading."""
+    """The states (q, qdot), (lanes, 10), of minimal ones: the contact point moves by `radius spin_rate` along
+    the heading.
+    """
     forward = dense.DISC_PARAMETERS["radius"] * y[:, 7]
-    return np.concatenate([y[:, :5], (forward * np.cos(y[:, 2]))[:, None], (forward * np.sin(y[:, 2]))[:, None], y[:, 5:]], axis=1)
+    return np.concatenate(
+        [y[:, :5], (forward * np.cos(y[:, 2]))[:, None], (forward * np.sin(y[:, 2]))[:, None], y[:, 5:]],
+        axis=1,
+    )
 
 
 def final_states(method: str) -> Callable[[float, np.ndarray], np.ndarray]:
-    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by diffrax; `method`: "dense" or "flat"."""
+    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by diffrax;
+    `method`: "dense" or "flat".
+    """
     rates = {"dense": dense.disc_rates, "flat": flat.disc_rates}[method]
 
     @jax.jit
@@ -56,7 +65,9 @@ def error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def loosest(final: Callable[[float], np.ndarray], expected: np.ndarray, first: float) -> float:
-    """The loosest tolerance whose final states have an error of 1e-8, on a grid of four per decade from `first` down; ValueError where none does."""
+    """The loosest tolerance whose final states have an error of 1e-8, on a grid of four per decade from
+    `first` down; ValueError where none does.
+    """
     for tolerance in 10.0 ** -np.arange(-np.log10(first), 15.01, 0.25):
         if error(final(float(tolerance)), expected) <= 1e-8:
             return float(tolerance)

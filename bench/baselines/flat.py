@@ -1,6 +1,7 @@
 """The hand-derived equations of the tilting disc on a flat array, as one would first hand them to diffrax.
 
-The state of one lane is y = (x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate); `dense.integrate` runs a batch of them.
+The state of one lane is y = (x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate); `dense.integrate` runs a
+batch of them.
 """
 
 import jax.numpy as jnp

@@ -1,10 +1,13 @@
-"""Reduced equations of motion of six models as an expert would write them, in the models' own coordinates and privileged speeds.
+"""Reduced equations of motion of six models as an expert would write them, in the models' own coordinates and
+privileged speeds.
 
-Each function is `(parameters, t, q, v, xp=jnp) -> (qdot, vdot)`: scalars by name in `parameters`, one scalar (or one array over lanes) per
-coordinate in the tuple `q` and per privileged speed in `v`; all rates of the minimal state come back as two tuples. `xp` has `sin`, `cos` and
-`zeros_like`. Expressions of parameters alone stand first; `operations(name)` counts the rest, each common subexpression once.
+Each function is `(parameters, t, q, v, xp=jnp) -> (qdot, vdot)`: scalars by name in `parameters`, one scalar
+(or one array over lanes) per coordinate in the tuple `q` and per privileged speed in `v`; all rates of the
+minimal state come back as two tuples. `xp` has `sin`, `cos` and `zeros_like`. Expressions of parameters alone
+stand first; `operations(name)` counts the rest, each common subexpression once.
 
-Sources: the docstrings of the models; Wang and Pao (2003), sections V and VI; Neimark and Fufaev (1972), ch. III.
+Sources: the docstrings of the models; Wang and Pao (2003), sections V and VI; Neimark and Fufaev (1972), ch.
+III.
 """
 
 from collections.abc import Callable
@@ -16,7 +19,9 @@ from .count import count_operations
 
 
 def two_wheel_axle(parameters, t, q, v, xp=jnp):
-    """Two wheels on a rigid axle, (61) and (64): `phi'' = 0`, `psi1'' = M g sin(alpha) cos(phi) / (a (M + m'))`."""
+    """Two wheels on a rigid axle, (61) and (64): `phi'' = 0`,
+    `psi1'' = M g sin(alpha) cos(phi) / (a (M + m'))`.
+    """
     a, M = parameters["radius"], parameters["mass"]
     l_over_a = parameters["length"] / a
     push = M * parameters["gravity"] * xp.sin(parameters["slope"]) / (a * (M + parameters["rim_mass"]))
@@ -29,7 +34,9 @@ def two_wheel_axle(parameters, t, q, v, xp=jnp):
 
 
 def skate(parameters, t, q, v, xp=jnp):
-    """The skate in all three speeds, regular at every heading: acceleration G cos(heading) along the blade, w v across it."""
+    """The skate in all three speeds, regular at every heading: acceleration G cos(heading) along the blade, w
+    v across it.
+    """
     G = parameters["gravity"] * xp.sin(parameters["slope"])
     x_rate, y_rate, w = v
     s, c = xp.sin(q[2]), xp.cos(q[2])
@@ -38,10 +45,11 @@ def skate(parameters, t, q, v, xp=jnp):
 
 
 def chaplygin_sleigh(parameters, t, q, v, xp=jnp):
-    """The sleigh in x_rate, y_rate: the blade pushes across the heading only, `x'' = -s k v w`, `y'' = c k v w`.
+    """The sleigh in x_rate, y_rate: the blade pushes across the heading only, `x'' = -s k v w`,
+    `y'' = c k v w`.
 
-    v is the forward speed, w the turn rate, k = I/(I + m a^2). With the mass centre's speed across the heading `b = c ydot - s xdot = a w`,
-    `s v = ydot - c b` and `c v = xdot + s b`.
+    v is the forward speed, w the turn rate, k = I/(I + m a^2). With the mass centre's speed across the
+    heading `b = c ydot - s xdot = a w`, `s v = ydot - c b` and `c v = xdot + s b`.
     """
     m, I, a = parameters["mass"], parameters["inertia"], parameters["offset"]
     per_a = 1 / a
@@ -68,7 +76,8 @@ def tilting_disc(parameters, t, q, v, xp=jnp):
         lean''          = yaw' c (yaw' s + 6/5 spin') + 4g/(5a) s
         spin''          = -5/3 lean' yaw' c - yaw'' s
 
-    These are Euler's equations about the centre with the force at the contact eliminated, axial moment m a^2/2, diametral m a^2/4.
+    These are Euler's equations about the centre with the force at the contact eliminated, axial moment m
+    a^2/2, diametral m a^2/4.
     """
     a = parameters["radius"]
     fall = 0.8 * parameters["gravity"] / a
@@ -83,7 +92,8 @@ def tilting_disc(parameters, t, q, v, xp=jnp):
 
 
 def ball_on_turntable(parameters, t, q, v, xp=jnp):
-    """The ball on a tilted turntable: `R'' = n z x R' + push x`, and the attitude `e' = (0, omega/2) e` with omega in space axes.
+    """The ball on a tilted turntable: `R'' = n z x R' + push x`, and the attitude `e' = (0, omega/2) e` with
+    omega in space axes.
 
     No slip gives omega = `((Om x - y')/r, (x' + Om y)/r, spin)` in the axes of the table.
     """
@@ -91,7 +101,12 @@ def ball_on_turntable(parameters, t, q, v, xp=jnp):
     push = parameters["gravity"] * xp.sin(tilt) / (1 + kappa)
     n = Om * kappa / (1 + kappa)
     per_2r = 0.5 / r
-    cos_2r, sin_2r, cos_2, sin_2 = xp.cos(tilt) * per_2r, xp.sin(tilt) * per_2r, xp.cos(tilt) / 2, xp.sin(tilt) / 2
+    cos_2r, sin_2r, cos_2, sin_2 = (
+        xp.cos(tilt) * per_2r,
+        xp.sin(tilt) * per_2r,
+        xp.cos(tilt) / 2,
+        xp.sin(tilt) / 2,
+    )
     x, y, e0, e1, e2, e3 = q
     x_rate, y_rate, spin = v
     along = Om * x - y_rate
@@ -121,18 +136,30 @@ def _entry(rates: Callable, parameters: str, coordinates: str, speeds: str) -> H
 
 
 HAND_DERIVED = {
-    "two-wheel-axle-coordinates": _entry(two_wheel_axle, "radius length mass rim_mass slope gravity", "x1 y1 psi1 x2 y2 psi2 phi", "psi1_rate phi_rate"),
+    "two-wheel-axle-coordinates": _entry(
+        two_wheel_axle,
+        "radius length mass rim_mass slope gravity",
+        "x1 y1 psi1 x2 y2 psi2 phi",
+        "psi1_rate phi_rate",
+    ),
     "skate": _entry(skate, "slope gravity", "x y heading", "x_rate y_rate heading_rate"),
     "chaplygin-sleigh": _entry(chaplygin_sleigh, "mass inertia offset", "x y heading", "x_rate y_rate"),
     "vertical-disc": _entry(vertical_disc, "radius", "x y heading roll", "heading_rate roll_rate"),
-    "tilting-disc": _entry(tilting_disc, "radius gravity", "x y yaw lean spin", "yaw_rate lean_rate spin_rate"),
+    "tilting-disc": _entry(
+        tilting_disc, "radius gravity", "x y yaw lean spin", "yaw_rate lean_rate spin_rate"
+    ),
     "ball-on-turntable": _entry(
-        ball_on_turntable, "radius inertia_ratio turn_rate tilt gravity", "x y attitude_w attitude_x attitude_y attitude_z", "x_rate y_rate spin"
+        ball_on_turntable,
+        "radius inertia_ratio turn_rate tilt gravity",
+        "x y attitude_w attitude_x attitude_y attitude_z",
+        "x_rate y_rate spin",
     ),
 }
 
 
 def operations(name: str) -> int:
-    """Number of operations of the equations called `name`, after common subexpressions, without those of parameters alone."""
+    """Number of operations of the equations called `name`, after common subexpressions, without those of
+    parameters alone.
+    """
     known = HAND_DERIVED[name]
     return count_operations(known.rates, known.parameters, len(known.coordinates), len(known.speeds)).total()

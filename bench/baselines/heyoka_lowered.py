@@ -1,4 +1,5 @@
-"""heyoka on the scalar program of a scene, as the engine prints it (`jj.lower(scene).python_source()`): Taylor series, alone and in SIMD batches.
+"""heyoka on the scalar program of a scene, as the engine prints it (`jj.lower(scene).python_source()`):
+Taylor series, alone and in SIMD batches.
 
 Source: F. Biscani and D. Izzo, Mon. Not. R. Astron. Soc. 504 (2021) 2614.
 """
@@ -41,23 +42,34 @@ def equations(scene: jj.Scene) -> list:
     y = heyoka.make_vars(*names(scene))
     inputs = [0.0] * (len(taken) - len(y))
     rates = in_symbols["rates"](in_numbers["fixed"](*parameters), heyoka.time, *y, *inputs)
-    return list(zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True))
+    return list(
+        zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True)
+    )
 
 
-def final_states(system: list, end: float, tolerance: float, width: int, compact: bool = False) -> Callable[[np.ndarray], np.ndarray]:
+def final_states(
+    system: list, end: float, tolerance: float, width: int, compact: bool = False
+) -> Callable[[np.ndarray], np.ndarray]:
     """A compiled function from initial states (lanes, states) to those at the time `end`.
 
-    **Arguments:** `width`, trajectories per SIMD batch, which must divide the number of lanes (1: one by one); `compact`, heyoka's mode for long equations.
+    **Arguments:** `width`, trajectories per SIMD batch, which must divide the number of lanes (1: one by
+    one); `compact`, heyoka's mode for long equations.
     **Raises:** `ValueError` where an integration does not reach its end.
     """
-    options = {"tol": tolerance, "fast_math": True, "compact_mode": compact}  # sums reordered: faster by a quarter on the disc, with the same error
+    options = {
+        "tol": tolerance,
+        "fast_math": True,
+        "compact_mode": compact,
+    }  # sums reordered: faster by a quarter on the disc, with the same error
     if width == 1:
         solver = heyoka.taylor_adaptive(system, np.zeros(len(system)), **options)
     else:
         solver = heyoka.taylor_adaptive_batch(system, np.zeros((len(system), width)), **options)
 
     def run(starts: np.ndarray) -> np.ndarray:
-        groups = np.ascontiguousarray(starts.reshape(-1, width, len(system)).transpose(0, 2, 1))  # (groups, states, width)
+        groups = np.ascontiguousarray(
+            starts.reshape(-1, width, len(system)).transpose(0, 2, 1)
+        )  # (groups, states, width)
         found = np.empty_like(groups)
         for start, final in zip(groups, found, strict=True):
             solver.state[:] = start.reshape(solver.state.shape)
@@ -67,7 +79,10 @@ def final_states(system: list, end: float, tolerance: float, width: int, compact
                 solver.set_time(0.0)
             solver.propagate_until(end)
             if np.any(solver.time != end):
-                raise ValueError(f"heyoka stopped at t = {solver.time}, expected {end}; a state is not finite or the tolerance is too small")
+                raise ValueError(
+                    f"heyoka stopped at t = {solver.time}, expected {end}; a state is not finite or the"
+                    " tolerance is too small"
+                )
             final[:] = solver.state.reshape(final.shape)
         return found.transpose(0, 2, 1).reshape(starts.shape)
 
@@ -76,7 +91,13 @@ def final_states(system: list, end: float, tolerance: float, width: int, compact
 
 def extended(system: list, end: float, starts: np.ndarray) -> np.ndarray:
     """Final states in long double with a tolerance of 1e-18."""
-    solver = heyoka.taylor_adaptive(system, starts[0].astype(np.longdouble), tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
+    solver = heyoka.taylor_adaptive(
+        system,
+        starts[0].astype(np.longdouble),
+        tol=np.longdouble("1e-18"),
+        fp_type=np.longdouble,
+        compact_mode=True,
+    )
     found = np.empty_like(starts)
     for start, final in zip(starts, found, strict=True):
         solver.time = np.longdouble(0.0)

@@ -1,4 +1,6 @@
-"""Rigid bodies with quaternions, wheeled robots that turn through full headings, rolling discs, and bodies that are carried along."""
+"""Rigid bodies with quaternions, wheeled robots that turn through full headings, rolling discs, and bodies
+that are carried along.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,11 @@ class Top(jj.Scene):
 
     def bodies(self, t, q):
         frame = jj.quaternion_to_matrix(q.attitude)
-        return {"top": jj.RigidBody(1.0, jnp.stack([self.i1 - 0.01, self.i2 - 0.01, self.i3]), 0.1 * frame[:, 2], frame)}
+        return {
+            "top": jj.RigidBody(
+                1.0, jnp.stack([self.i1 - 0.01, self.i2 - 0.01, self.i3]), 0.1 * frame[:, 2], frame
+            )
+        }
 
     def loads(self, motion):
         return (jj.gravity(motion, self.weight / 0.1),)
@@ -31,7 +37,12 @@ def _top_truth(n, ts):
     """Euler's equations with the torque of the weight, -weight e3 x (R' k)."""
 
     def rates(_, a, x, y, z, u, v, w):
-        turning = (-x * u - y * v - z * w) / 2, (a * u + y * w - z * v) / 2, (a * v + z * u - x * w) / 2, (a * w + x * v - y * u) / 2
+        turning = (
+            (-x * u - y * v - z * w) / 2,
+            (a * u + y * w - z * v) / 2,
+            (a * v + z * u - x * w) / 2,
+            (a * w + x * v - y * u) / 2,
+        )
         up = 2 * (x * z - a * y), 2 * (y * z + a * x)  # R' k
         first, second = n.weight * up[1] - (n.i3 - n.i2) * v * w, -n.weight * up[0] - (n.i1 - n.i3) * w * u
         return *turning, first / n.i1, second / n.i2, -(n.i2 - n.i1) * u * v / n.i3
@@ -44,7 +55,12 @@ ATTITUDE = "attitude_w attitude_x attitude_y attitude_z"
 
 
 def _top_start(n):
-    turned = {"attitude_w": jnp.cos(n.tilt / 2), "attitude_x": jnp.sin(n.tilt / 2), "attitude_y": 0.0, "attitude_z": 0.0}
+    turned = {
+        "attitude_w": jnp.cos(n.tilt / 2),
+        "attitude_x": jnp.sin(n.tilt / 2),
+        "attitude_y": 0.0,
+        "attitude_z": 0.0,
+    }
     return turned | {speed: getattr(n, name) for name, speed in OMEGA.items()}
 
 
@@ -56,11 +72,15 @@ def _top(name, what, weight):
         rest = {"tilt": r.uniform(0, 3.1), "weight": weight * r.uniform(0.5, 4), "span": r.uniform(1, 5)}
         return dict(zip(("i1", "i2", "i3"), map(float, moments), strict=True)) | spins | rest
 
-    return Family(name, what, Top, draw, _top_truth, f"{ATTITUDE} {' '.join(OMEGA.values())}", _top_start, slack=3.0)
+    return Family(
+        name, what, Top, draw, _top_truth, f"{ATTITUDE} {' '.join(OMEGA.values())}", _top_start, slack=3.0
+    )
 
 
 class Robot(Weighted):
-    """A differential drive: a body and two wheels (uniform discs) on one axle; mass centre of the body ahead of the axle by `ahead`."""
+    """A differential drive: a body and two wheels (uniform discs) on one axle; mass centre of the body ahead
+    of the axle by `ahead`.
+    """
 
     coordinates = jj.coordinates("x y heading left right")
     inputs = jj.inputs("tau_left tau_right")
@@ -75,7 +95,9 @@ class Robot(Weighted):
         frame, r = jj.rot_z(q.heading), jnp.asarray(self.radius)
         axle = jnp.stack([q.x, q.y, r + 0.0 * q.x])
         side = self.half * frame[:, 1]
-        wheel = lambda place, spin: jj.RigidBody.thin_disc(self.wheel, r, axis="y", position=place, orientation=frame @ jj.rot_y(spin))  # noqa: E731
+        wheel = lambda place, spin: jj.RigidBody.thin_disc(
+            self.wheel, r, axis="y", position=place, orientation=frame @ jj.rot_y(spin)
+        )
         body = jj.RigidBody(self.mass, self.inertia * jnp.ones(3), axle + self.ahead * frame[:, 0], frame)
         return {"body": body, "left": wheel(axle + side, q.left), "right": wheel(axle - side, q.right)}
 
@@ -94,7 +116,9 @@ class RobotAhead(Robot):
 
 
 def _robot_truth(n, ts):
-    """M v' = m a w^2 + (tl + tr)/R,  I w' = -m a v w + (tr - tl) b/R, with the wheels' inertia reduced to v and w."""
+    """M v' = m a w^2 + (tl + tr)/R, I w' = -m a v w + (tr - tl) b/R, with the wheels' inertia reduced to v
+    and w.
+    """
     M = n.mass + 2 * n.wheel + n.wheel  # 2 J/R^2 = m_w
     inertia = n.inertia + n.mass * n.ahead**2 + 3 * n.wheel * n.half**2 + n.wheel * n.radius**2 / 2
     moved, R, b = n.mass * n.ahead, n.radius, n.half
@@ -149,7 +173,9 @@ SLEIGH = {
 
 
 def _disc_truth(n, ts):
-    """Uniform disc in yaw, lean, spin: Appell's equations for w1 = lean', w2 = yaw' cos lean, w3 = spin' + yaw' sin lean (tests/oracles/rolling_disc.py)."""
+    """Uniform disc in yaw, lean, spin: Appell's equations for w1 = lean', w2 = yaw' cos lean, w3 = spin' +
+    yaw' sin lean (tests/oracles/rolling_disc.py).
+    """
     m, a = n.mass, n.radius
     A, C, ring = m * a * a / 4, m * a * a / 2, m * a * a
 
@@ -159,7 +185,16 @@ def _disc_truth(n, ts):
         # as in the oracle with theta = lean + pi/2, cot(theta) = -tan(lean), w3 there = -w3 here
         dw1 = (-A * w2**2 * tan + (C + ring) * w2 * w3 + m * G * a * np.sin(lean)) / (A + ring)
         dw2 = w1 * (-C * w3 + A * w2 * tan) / A
-        return a * rolling * np.cos(yaw), a * rolling * np.sin(yaw), turn, w1, rolling, dw1, dw2, -ring * w1 * w2 / (C + ring)
+        return (
+            a * rolling * np.cos(yaw),
+            a * rolling * np.sin(yaw),
+            turn,
+            w1,
+            rolling,
+            dw1,
+            dw2,
+            -ring * w1 * w2 / (C + ring),
+        )
 
     speeds = n.lean_rate, n.yaw_rate * np.cos(n.lean), n.spin_rate + n.yaw_rate * np.sin(n.lean)
     return integrate(rates, (0.0, 0.0, 0.0, n.lean, 0.0, *speeds), ts, width=0.03)[:5]
@@ -178,7 +213,14 @@ class CarriedPendulum(Weighted):
 
     def bob(self, place, q):
         """The body, with the cart at a place."""
-        return {"bob": jj.Particle(1.0, jnp.stack([place + self.length * jnp.sin(q.angle), 0.0 * q.angle, -self.length * jnp.cos(q.angle)]))}
+        return {
+            "bob": jj.Particle(
+                1.0,
+                jnp.stack(
+                    [place + self.length * jnp.sin(q.angle), 0.0 * q.angle, -self.length * jnp.cos(q.angle)]
+                ),
+            )
+        }
 
     def bodies(self, t, q):
         return self.bob(self.cart(t), q)
@@ -212,8 +254,8 @@ class SampledWagon(Wagon):
 
 def _wagon_truth(n, ts):
     """l angle'' = -g sin(angle) - cart'' cos(angle)."""
-    push = lambda t: n.size * n.rate**2 * np.sin(n.rate * t)  # noqa: E731
-    rates = lambda t, angle, w: (w, (-G * np.sin(angle) + push(t) * np.cos(angle)) / n.length)  # noqa: E731
+    push = lambda t: n.size * n.rate**2 * np.sin(n.rate * t)
+    rates = lambda t, angle, w: (w, (-G * np.sin(angle) + push(t) * np.cos(angle)) / n.length)
     return integrate(rates, (n.angle, n.angle_rate), ts)
 
 

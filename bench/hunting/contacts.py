@@ -1,7 +1,8 @@
-"""Contacts with friction: a disc with its mass centre off its axle, in a plane, that flies, rolls, slips and strikes, against SciPy.
+"""Contacts with friction: a disc with its mass centre off its axle, in a plane, that flies, rolls, slips and
+strikes, against SciPy.
 
-SciPy steps from one phase to the next. The equations are written from forces, as Newton and Euler have them; impacts are Newton's with Coulomb's law on the
-slip afterwards, or go step by step along the normal impulse.
+SciPy steps from one phase to the next. The equations are written from forces, as Newton and Euler have them;
+impacts are Newton's with Coulomb's law on the slip afterwards, or go step by step along the normal impulse.
 """
 
 from functools import partial
@@ -37,16 +38,32 @@ class Eccentric(jj.Scene):
         R = jj.rot_y(q.turn)
         centre = jnp.stack([q.x, 0.0 * q.x, q.z])
         I = self.gyration**2 * jnp.diag(jnp.array([0.5, 1.0, 0.5]))
-        return {"disc": jj.RigidBody(1.0, I, centre + R @ jnp.stack([0.0 * q.x, 0.0 * q.x, self.offset + 0.0 * q.x]), R)}
+        return {
+            "disc": jj.RigidBody(
+                1.0, I, centre + R @ jnp.stack([0.0 * q.x, 0.0 * q.x, self.offset + 0.0 * q.x]), R
+            )
+        }
 
     def loads(self, motion):
         down = jnp.stack([jnp.sin(self.slope), 0.0 * self.slope, -jnp.cos(self.slope)])
-        push = jj.generalized_force(motion, x_rate=self.push * jnp.sin(3 * motion.t), turn_rate=self.torque * jnp.cos(2 * motion.t))
+        push = jj.generalized_force(
+            motion, x_rate=self.push * jnp.sin(3 * motion.t), turn_rate=self.torque * jnp.cos(2 * motion.t)
+        )
         return (jj.gravity(motion, G, down), push)
 
     def contacts(self, pose):
         disc, centre = pose["disc"], jnp.stack([0.0 * self.offset, 0.0 * self.offset, -self.offset])
-        return {"rim": jj.disc_contact(disc, self.radius, centre=centre, height="row", friction=self.friction, restitution=self.bounce, impact=self.impact)}
+        return {
+            "rim": jj.disc_contact(
+                disc,
+                self.radius,
+                centre=centre,
+                height="row",
+                friction=self.friction,
+                restitution=self.bounce,
+                impact=self.impact,
+            )
+        }
 
 
 class _Disc:
@@ -58,10 +75,18 @@ class _Disc:
 
     def equations(self, t, y):
         n, (c, s), w = self.n, (np.cos(y[2]), np.sin(y[2])), y[5]
-        M = np.array([[1, 0, n.offset * c], [0, 1, -n.offset * s], [n.offset * c, -n.offset * s, n.offset**2 + n.gyration**2]])
+        M = np.array(
+            [
+                [1, 0, n.offset * c],
+                [0, 1, -n.offset * s],
+                [n.offset * c, -n.offset * s, n.offset**2 + n.gyration**2],
+            ]
+        )
         h = np.array([-n.offset * s * w**2, -n.offset * c * w**2, 0.0])
         gx, gz = G * np.sin(n.slope), -G * np.cos(n.slope)
-        Q = np.array([gx + n.push * np.sin(3 * t), gz, n.offset * (gx * c - gz * s) + n.torque * np.cos(2 * t)])
+        Q = np.array(
+            [gx + n.push * np.sin(3 * t), gz, n.offset * (gx * c - gz * s) + n.torque * np.cos(2 * t)]
+        )
         return M, Q - h
 
     def forces(self, t, y, mode, side):
@@ -78,7 +103,9 @@ class _Disc:
         return a[:3], normal, a[4] if mode == ROLLS else -self.n.friction * side * normal
 
     def law(self, G, b, target):
-        """Forces or impulses of a closed contact with the response G L + b, and the sign of slip afterwards: 0 where it sticks, NaN without an answer."""
+        """Forces or impulses of a closed contact with the response G L + b, and the sign of slip afterwards:
+        0 where it sticks, NaN without an answer.
+        """
         L = np.linalg.solve(G, np.array([target - b[0], -b[1]]))
         if L[0] >= 0 and abs(L[1]) <= self.n.friction * L[0]:
             return L, 0.0
@@ -110,7 +137,10 @@ class _Disc:
                 left = bounce**2 * spent - work
                 lengths.append((np.sqrt(w[0] ** 2 + 2 * slope[0] * left) - w[0]) / slope[0])
             s = min(lengths)
-            done, lasts = spent is not None and s == lengths[-1], spent is None and slope[0] > 0 and s == lengths[-1]
+            done, lasts = (
+                spent is not None and s == lengths[-1],
+                spent is None and slope[0] > 0 and s == lengths[-1],
+            )
             L, work, w = L + s * step, work + s * (w[0] + slope[0] * s / 2), w + s * slope
             if done:
                 return L, side if abs(w[1]) > 1e-9 else 0.0
@@ -196,9 +226,21 @@ def _phase(disc, t, y, mode, side, end):
     def run(t, y, end, *events):
         for event in events:
             event.terminal, event.direction = True, -1
-        return solve_ivp(rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02, events=events or None, dense_output=True)
+        return solve_ivp(
+            rates,
+            (t, end),
+            y,
+            "DOP853",
+            rtol=1e-12,
+            atol=1e-13,
+            max_step=0.02,
+            events=events or None,
+            dense_output=True,
+        )
 
-    if mode == FLIES and y[1] - disc.n.radius < 1e-9:  # from the ground: the first half of a flight has no event
+    if (
+        mode == FLIES and y[1] - disc.n.radius < 1e-9
+    ):  # from the ground: the first half of a flight has no event
         falls = -disc.forces(t, y, FLIES, 0.0)[0][1]
         half = min(y[4] / falls if falls > 0 and y[4] > 0 else 1e-4, 1e-3, end - t)
         yield (first := run(t, y, t + half))

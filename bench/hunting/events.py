@@ -1,4 +1,6 @@
-"""Events: several in one step, without a value beyond their boundary, at short excursions, and in stiff motions."""
+"""Events: several in one step, without a value beyond their boundary, at short excursions, and in stiff
+motions.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,9 @@ def _earliest(candidates: dict[str, np.ndarray], span) -> tuple[np.ndarray, list
     """Time (cases, 1) and name of the first of the events; the span and "" where none comes."""
     names, times = list(candidates), np.concatenate(list(candidates.values()), axis=1)
     first = np.min(times, axis=1, keepdims=True)
-    found = [names[k] if t < s else "" for k, (t,), (s,) in zip(np.argmin(times, axis=1), first, span, strict=True)]
+    found = [
+        names[k] if t < s else "" for k, (t,), (s,) in zip(np.argmin(times, axis=1), first, span, strict=True)
+    ]
     return np.minimum(first, span), found
 
 
@@ -44,13 +48,24 @@ def _room_truth(n, ts):
         "back wall": _first_root(0, n.x_rate, 1.0),
         "wall": _first_root(0, -n.x_rate, n.width),
     }
-    return stopped(lambda t: (n.x_rate * t, n.z + n.z_rate * t - G / 2 * t**2, n.x_rate, n.z_rate - G * t), *_earliest(events, ts[:, -1:]), ts)
+    return stopped(
+        lambda t: (n.x_rate * t, n.z + n.z_rate * t - G / 2 * t**2, n.x_rate, n.z_rate - G * t),
+        *_earliest(events, ts[:, -1:]),
+        ts,
+    )
 
 
 def _grazing_drawn(r):
     """Its path passes the ceiling by a little, for a short time; nothing else is near."""
     vz, over = r.uniform(3.0, 7.0), 10 ** r.uniform(-3.5, -0.5)
-    return {"z": 1.0, "x_rate": r.uniform(0.1, 0.3), "z_rate": vz, "width": 3.0, "height": 1.0 + vz**2 / (2 * G) - over, "span": 2.1 * vz / G}
+    return {
+        "z": 1.0,
+        "x_rate": r.uniform(0.1, 0.3),
+        "z_rate": vz,
+        "width": 3.0,
+        "height": 1.0 + vz**2 / (2 * G) - over,
+        "span": 2.1 * vz / G,
+    }
 
 
 class Spring(OnLine):
@@ -97,7 +112,11 @@ def _stop_truth(n, ts):
     with np.errstate(invalid="ignore"):
         hit = (phase - np.arccos(n.stop / size)) % (2 * np.pi) / w
     events = {"stop": np.where(np.isfinite(hit), hit, np.inf)}
-    return stopped(lambda t: (size * np.cos(w * t - phase), -size * w * np.sin(w * t - phase)), *_earliest(events, ts[:, -1:]), ts)
+    return stopped(
+        lambda t: (size * np.cos(w * t - phase), -size * w * np.sin(w * t - phase)),
+        *_earliest(events, ts[:, -1:]),
+        ts,
+    )
 
 
 class StiffDrop(OnPlane):
@@ -107,14 +126,19 @@ class StiffDrop(OnPlane):
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (jj.generalized_force(motion, x_rate=-self.k * (q.x - jnp.sin(q.y)) - self.k * u.x_rate, y_rate=-1.0 + 0.0 * q.y),)
+        return (
+            jj.generalized_force(
+                motion, x_rate=-self.k * (q.x - jnp.sin(q.y)) - self.k * u.x_rate, y_rate=-1.0 + 0.0 * q.y
+            ),
+        )
 
     def events(self, motion):
         return {"floor": motion.q.y}
 
 
 def _stiff_truth(n, ts):
-    """y in closed form; x' = -(x - sin y) + O(1/k): integrated with the next order, x'' = -k (x - sin y) - k x', by its slow manifold.
+    """y in closed form; x' = -(x - sin y) + O(1/k): integrated with the next order, x'' = -k (x - sin y) - k
+    x', by its slow manifold.
 
     On the slow manifold p = x' obeys p = s - x - p'/k, s = sin y: two Picard steps leave O(k^-3).
     """
@@ -129,15 +153,32 @@ def _stiff_truth(n, ts):
     t_end, event = _earliest({"floor": np.sqrt(2 * n.y)}, ts[:, -1:])
     every = np.sort(np.concatenate([np.minimum(ts, t_end), t_end], axis=1), axis=1)
     x = integrate(rates, (n.x,), every, width=0.1)[0]
-    at = lambda t: np.take_along_axis(x, np.argmax(every[:, None, :] == np.minimum(t, t_end)[..., None], axis=2), axis=1)  # noqa: E731
+    at = lambda t: np.take_along_axis(
+        x, np.argmax(every[:, None, :] == np.minimum(t, t_end)[..., None], axis=2), axis=1
+    )
     return stopped(lambda t: (at(t), n.y - t**2 / 2, -t), t_end, event, ts)
 
 
-ASKS = (Ask("simulate"), Ask("jit", 9), Ask("rollout", 9, 1e-6), Ask("vmap", 33), Ask("simulate", 33, 1e-6), Ask("rollout", 1), Ask("jit rollout", 2, 1e-6))
+ASKS = (
+    Ask("simulate"),
+    Ask("jit", 9),
+    Ask("rollout", 9, 1e-6),
+    Ask("vmap", 33),
+    Ask("simulate", 33, 1e-6),
+    Ask("rollout", 1),
+    Ask("jit rollout", 2, 1e-6),
+)
 RADAU = {"solver": jj.RadauIIA()}
-IMPLICIT = (Ask("simulate", 1, 1e-6), Ask("simulate", 9, 1e-6, RADAU), Ask("rollout", 1, 1e-6), Ask("jit", 9, 1e-6, RADAU))
+IMPLICIT = (
+    Ask("simulate", 1, 1e-6),
+    Ask("simulate", 9, 1e-6, RADAU),
+    Ask("rollout", 1, 1e-6),
+    Ask("jit", 9, 1e-6, RADAU),
+)
 ROOM = {"scene": Room, "truth": _room_truth, "names": "x z x_rate z_rate", "asks": ASKS}
-ROOM_DRAWN = drawn(z=(0.5, 2.5), x_rate=either(0.5, 8.0), z_rate=(-4.0, 4.0), width=(0.5, 3.0), height=3.0, span=3.0)
+ROOM_DRAWN = drawn(
+    z=(0.5, 2.5), x_rate=either(0.5, 8.0), z_rate=(-4.0, 4.0), width=(0.5, 3.0), height=3.0, span=3.0
+)
 STOP = {
     "truth": _stop_truth, "names": "x x_rate", "asks": ASKS, "cases": 42,
     "draw": drawn(k=(1, 30), stop=(0.6, 1.2), x=(-0.5, 0.4), x_rate=either(4.0, 8.0), span=4.0),

@@ -1,6 +1,19 @@
 """All families of generated cases, in one list."""
 
-from hunting import bodies, contacts, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, transitions, uses
+from hunting import (
+    bodies,
+    contacts,
+    events,
+    gradients,
+    linkages,
+    oscillators,
+    pendulums,
+    refusals,
+    short_features,
+    sliders,
+    transitions,
+    uses,
+)
 
 FAMILIES = (
     *linkages.FAMILIES,

@@ -1,4 +1,6 @@
-"""A family of generated motions: numbers are drawn by seed, the truth is computed apart from the engine, and cases that ask alike share a compiled program."""
+"""A family of generated motions: numbers are drawn by seed, the truth is computed apart from the engine, and
+cases that ask alike share a compiled program.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +13,9 @@ G = 9.81  # m/s^2
 
 @dataclass(frozen=True)
 class Truth:
-    """Right motions: values of the compared names at the saved times (NaN after an event), and where and how they end."""
+    """Right motions: values of the compared names at the saved times (NaN after an event), and where and how
+    they end.
+    """
 
     values: np.ndarray  # (cases, times, names)
     t_end: np.ndarray | None = None  # (cases,), s; None: the last time
@@ -32,7 +36,12 @@ def columns(*values) -> np.ndarray:
 def stopped(values_at: Callable, t_end, event: list[str], ts) -> Truth:
     """Values at the saved times up to the end (cases, 1), NaN after it."""
     reached = ts <= t_end * (1 + 1e-12)
-    return Truth(np.where(reached[..., None], columns(*values_at(ts)), np.nan), t_end[:, 0], columns(*values_at(t_end))[:, 0], event)
+    return Truth(
+        np.where(reached[..., None], columns(*values_at(ts)), np.nan),
+        t_end[:, 0],
+        columns(*values_at(t_end))[:, 0],
+        event,
+    )
 
 
 @dataclass(frozen=True)
@@ -49,7 +58,15 @@ class Ask:
         return f"{self.way}, {self.times} times, rtol={self.rtol:g}{more}"
 
 
-SOME = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 33, 1e-6), Ask("vmap"), Ask("simulate", 33, 1e-6), Ask("rollout"), Ask("jit rollout", 1, 1e-6))
+SOME = (
+    Ask("simulate"),
+    Ask("jit", 33),
+    Ask("rollout", 33, 1e-6),
+    Ask("vmap"),
+    Ask("simulate", 33, 1e-6),
+    Ask("rollout"),
+    Ask("jit rollout", 1, 1e-6),
+)
 FEW = SOME[:4]  # of scenes that take long to build
 
 
@@ -70,32 +87,47 @@ def power(low: float, high: float) -> Callable:
 
 def drawn(**numbers) -> Callable:
     """Numbers one after another: between the two of a pair, by a function of the generator, or as they are."""
-    return lambda r: {name: float(r.uniform(*x) if isinstance(x, tuple) else x(r) if callable(x) else x) for name, x in numbers.items()}
+    return lambda r: {
+        name: float(r.uniform(*x) if isinstance(x, tuple) else x(r) if callable(x) else x)
+        for name, x in numbers.items()
+    }
 
 
 @dataclass(frozen=True)
 class Family:
     """Scenes of one class with drawn numbers; see the fields.
 
-    Numbers that are called as a parameter, coordinate or speed of the scene are its value; others serve `start` and `truth`. `span` is the length of a motion,
-    `t0` its start. A function of numbers has them as attributes, floats or arrays of cases alike.
+    Numbers that are called as a parameter, coordinate or speed of the scene are its value; others serve
+    `start` and `truth`. `span` is the length of a motion, `t0` its start. A function of numbers has them as
+    attributes, floats or arrays of cases alike.
     """
 
     name: str
     what: str  # in words
     scene: Callable[[], object]
     draw: Callable[[np.random.Generator], dict[str, float]]
-    truth: Callable[[SimpleNamespace, np.ndarray], tuple | Truth]  # numbers (cases, 1), ts (cases, times) -> values of `names`, or all of it
+    truth: Callable[
+        [SimpleNamespace, np.ndarray], tuple | Truth
+    ]  # numbers (cases, 1), ts (cases, times) -> values of `names`, or all of it
     names: str  # coordinates and speeds that are compared
-    start: Callable[[SimpleNamespace], dict] = lambda n: {}  # further start values; coordinates without one are zero
+    start: Callable[[SimpleNamespace], dict] = (
+        lambda n: {}
+    )  # further start values; coordinates without one are zero
     inputs: Callable[[SimpleNamespace], dict] | None = None
-    times: Callable[[SimpleNamespace, int], np.ndarray] | None = None  # numbers of one case, count -> ts; default: even ones
+    times: Callable[[SimpleNamespace, int], np.ndarray] | None = (
+        None  # numbers of one case, count -> ts; default: even ones
+    )
     asks: tuple[Ask, ...] = SOME
     cases: int = 70  # of a full search, in proportion
     shared: tuple[str, ...] = ("span", "t0")  # numbers that the lanes of a rollout have in common
-    fixed: tuple[str, ...] = ("span", "t0")  # numbers that are not varied to see how much a motion amplifies errors
+    fixed: tuple[str, ...] = (
+        "span",
+        "t0",
+    )  # numbers that are not varied to see how much a motion amplifies errors
     slack: float = 1.0
-    size: Callable[[SimpleNamespace], tuple] | None = None  # numbers -> of what counts as small in each name; default 1
+    size: Callable[[SimpleNamespace], tuple] | None = (
+        None  # numbers -> of what counts as small in each name; default 1
+    )
     single: bool = True  # whether it is asked in float32, too
 
     def numbers(self, seed: int, single: bool = False) -> tuple[Ask, dict[str, float]]:
@@ -123,8 +155,13 @@ class Family:
     def begin(self, numbers: dict) -> dict:
         """Values at the start, each as long as the numbers."""
         coordinates, speeds = self.scene().coordinate_names.entries, self.scene().speed_names.entries
-        given = dict.fromkeys(coordinates, 0.0) | {name: numbers[name] for name in (*coordinates, *speeds) if name in numbers}
-        return {name: value + 0.0 * numbers["span"] for name, value in (given | self.start(SimpleNamespace(**numbers))).items()}
+        given = dict.fromkeys(coordinates, 0.0) | {
+            name: numbers[name] for name in (*coordinates, *speeds) if name in numbers
+        }
+        return {
+            name: value + 0.0 * numbers["span"]
+            for name, value in (given | self.start(SimpleNamespace(**numbers))).items()
+        }
 
     def given_inputs(self, numbers: dict) -> dict:
         """The option `inputs` of `simulate`, where there are any."""
@@ -132,7 +169,9 @@ class Family:
 
     def right(self, numbers: dict[str, np.ndarray], ts: np.ndarray) -> Truth:
         """The truth of cases whose numbers are arrays."""
-        found = self.truth(SimpleNamespace(**{name: np.asarray(value)[:, None] for name, value in numbers.items()}), ts)
+        found = self.truth(
+            SimpleNamespace(**{name: np.asarray(value)[:, None] for name, value in numbers.items()}), ts
+        )
         return found if isinstance(found, Truth) else Truth(columns(*found))
 
     def saved(self, ask: Ask, numbers: dict, single: bool = False) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Derivatives through simulations, against complex steps through references: exact to round-off.
 
-A derivative that is NaN while the motion claims success is wrong; `SensitivityWarning` and errors of the engine's own are flags.
+A derivative that is NaN while the motion claims success is wrong; `SensitivityWarning` and errors of the
+engine's own are flags.
 """
 
 import time
@@ -34,7 +35,10 @@ class Slopes:
     name: str
     what: str
     family: Family
-    end: Callable | None = None  # numbers (complex, (cases, 1)), ts -> values of the names at the end; default: the family's truth
+    end: Callable | None = (
+        # numbers (complex, (cases, 1)), ts -> values of the names at the end; default: the family's truth
+        None
+    )
     slack: float = 1e4  # error of a derivative over rtol
     cases: int = 30
     single: bool = False
@@ -47,7 +51,10 @@ class Slopes:
 
     def ends(self, numbers: dict) -> np.ndarray:
         """Weighted ends of cases."""
-        f, spans = replace(self.family, truth=self.end or self.family.truth), np.real(numbers["span"])[:, None]
+        f, spans = (
+            replace(self.family, truth=self.end or self.family.truth),
+            np.real(numbers["span"])[:, None],
+        )
         return f.right(numbers, spans).values[:, -1] @ weights(f)
 
     def _asked(self, mode: str, seeds: list[int]) -> list[Record]:
@@ -55,12 +62,21 @@ class Slopes:
         numbers = [f.draw(np.random.default_rng([seed, 79])) for seed in seeds]
         rows = together(numbers)
         names = [name for name in rows if name not in f.fixed]
-        expected = np.stack([np.imag(self.ends(rows | {name: rows[name] + 1j * STEP})) / STEP for name in names], axis=1)
+        expected = np.stack(
+            [np.imag(self.ends(rows | {name: rows[name] + 1j * STEP})) / STEP for name in names], axis=1
+        )
         exact = np.real(self.ends(rows))
 
         def value(x, span):
             own = numbers[0] | dict(zip(names, x, strict=True)) | {"span": span}
-            motion = jj.simulate(f.scene().replace(**f.parameters(own)), f.begin(own), t1=span, ts=span[None], rtol=RTOL, atol=RTOL)
+            motion = jj.simulate(
+                f.scene().replace(**f.parameters(own)),
+                f.begin(own),
+                t1=span,
+                ts=span[None],
+                rtol=RTOL,
+                atol=RTOL,
+            )
             end = jnp.stack([getattr(motion, f"{kind}_end")[i] for kind, i in places_of(f)]) @ weights(f)
             return end, (end, motion.result)
 
@@ -77,21 +93,32 @@ class Slopes:
                 if mode == MODES[2]:
                     slopes, (ends, codes) = jax.jit(jax.grad(of_batch, has_aux=True))(x, spans)
                 else:
-                    slopes, (ends, codes) = jax.tree.map(lambda *one: jnp.stack(one), *(slope(*one) for one in zip(x, spans, strict=True)))
+                    slopes, (ends, codes) = jax.tree.map(
+                        lambda *one: jnp.stack(one), *(slope(*one) for one in zip(x, spans, strict=True))
+                    )
             except Exception as error:
                 failed = refusal(error)
         told = "; ".join(str(w.message) for w in said if issubclass(w.category, jj.SensitivityWarning))
         seconds, records = (time.process_time() - begin) / len(seeds), []
         for i, seed in enumerate(seeds):
-            asked = f"gradient, {mode}, rtol={RTOL:g}; " + ", ".join(f"{name}={float(value)!r}" for name, value in numbers[i].items())
+            asked = f"gradient, {mode}, rtol={RTOL:g}; " + ", ".join(
+                f"{name}={float(value)!r}" for name, value in numbers[i].items()
+            )
             outcome, error, words = (failed[0], None, failed[1]) if failed else (None, None, "")
             if not failed:
                 got, right = np.asarray(slopes[i]), expected[i]
                 # a derivative need not be better than its motion
                 tolerance = max(RTOL, abs(float(ends[i]) - exact[i]) / (1.0 + abs(exact[i])))
-                error = float(np.max(np.abs(got - right)) / (self.slack * tolerance * (np.max(np.abs(right)) + 1.0)))
+                error = float(
+                    np.max(np.abs(got - right)) / (self.slack * tolerance * (np.max(np.abs(right)) + 1.0))
+                )
                 outcome = outcome_of(int(codes[i]), error, told)
-                words = {BY_CODE: f"code {int(codes[i])}", RIGHT: "", BY_WARNING: told[:160], WRONG: f"slopes {got} for {right}"}[outcome]
+                words = {
+                    BY_CODE: f"code {int(codes[i])}",
+                    RIGHT: "",
+                    BY_WARNING: told[:160],
+                    WRONG: f"slopes {got} for {right}",
+                }[outcome]
             records.append(Record(self.name, seed, "float64", asked, outcome, error, words, seconds))
         return records
 
@@ -115,15 +142,28 @@ def _bar_end(n, ts):
     return a, 0 * a, a, w, 0 * a, w
 
 
-SLEIGH, FLAT = (next(f for f in families if f.name == name) for families, name in ((BODIES, "sleigh"), (LINKAGES, "parallelogram")))
+SLEIGH, FLAT = (
+    next(f for f in families if f.name == name)
+    for families, name in ((BODIES, "sleigh"), (LINKAGES, "parallelogram"))
+)
 FLIGHT = drawn(z=(0.5, 2.5), x_rate=(0.5, 8.0), z_rate=(-4.0, 4.0), width=(0.5, 3.0), span=3.0, height=100.0)
 LENGTHS = {"r1": 1.0, "r2": 2.0, "r3": 1.0, "d": 2.0, "m1": 1.0, "m2": 1.0, "m3": 1.0, "g": G}
-ROD_PENDULUM = Family(name="rod", what="", draw=drawn(length=1.0, mass=1.0, v=(2, 9), span=(0.3, 2)), fixed=("span", "mass"), **ROD)
+ROD_PENDULUM = Family(
+    name="rod",
+    what="",
+    draw=drawn(length=1.0, mass=1.0, v=(2, 9), span=(0.3, 2)),
+    fixed=("span", "mass"),
+    **ROD,
+)
 FLYING = Family(name="room", what="", draw=FLIGHT, fixed=("span", "height"), **ROOM)
-BAR = replace(FLAT, draw=drawn(**LENGTHS, s=(0.5, 2.0), s_rate=(3.0, 6.0), span=(0.3, 1.0)), fixed=("span", *LENGTHS))
+BAR = replace(
+    FLAT, draw=drawn(**LENGTHS, s=(0.5, 2.0), s_rate=(3.0, 6.0), span=(0.3, 1.0)), fixed=("span", *LENGTHS)
+)
 FAMILIES = (
     Slopes("gradient-rod", "gradients of the pendulum with a rod and a narrow domain", ROD_PENDULUM),
     Slopes("gradient-sleigh", "gradients of Chaplygin's sleigh", SLEIGH),
     Slopes("gradient-room", "gradients of where a ball in a room is stopped", FLYING, _flight_end),
-    Slopes("gradient-parallelogram", "gradients of a parallelogram laid flat", BAR, _bar_end, cases=15, slack=1e5),
+    Slopes(
+        "gradient-parallelogram", "gradients of a parallelogram laid flat", BAR, _bar_end, cases=15, slack=1e5
+    ),
 )

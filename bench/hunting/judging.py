@@ -1,7 +1,8 @@
 """Cases of a family: drawn, asked, and judged against the truth.
 
-A value may be off by `2 (steps + 10) rtol (size + growth)`: so much may add up from what step-size control lets pass per step (at most 1000 steps count);
-`growth` is how much the truth amplifies small changes of the numbers that define it. Five per cent of the size is wrong in any case.
+A value may be off by `2 (steps + 10) rtol (size + growth)`: so much may add up from what step-size control
+lets pass per step (at most 1000 steps count); `growth` is how much the truth amplifies small changes of the
+numbers that define it. Five per cent of the size is wrong in any case.
 """
 
 import time
@@ -36,13 +37,17 @@ def search(family: Family, seeds: list[int]) -> list[Record]:
         seconds = (time.process_time() - begin) / len(own)
         for i, seed in enumerate(own):
             outcome, error, said = _judged(family, ask, motions[i], i, numbers, truth, growth)
-            told = f"{ask}; ts to {float(ts[i, -1])!r}; " + ", ".join(f"{name}={value!r}" for name, value in numbers[i].items())
+            told = f"{ask}; ts to {float(ts[i, -1])!r}; " + ", ".join(
+                f"{name}={value!r}" for name, value in numbers[i].items()
+            )
             found.append(Record(family.name, seed, dtype, told, outcome, error, said, seconds))
     return sorted(found, key=lambda record: record.seed)
 
 
 def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
-    """The truth, and how much its values (cases, times + 1, names + 1: the end, and the time, too) grow from a relative change of 1."""
+    """The truth, and how much its values (cases, times + 1, names + 1: the end, and the time, too) grow from
+    a relative change of 1.
+    """
     draw = np.random.default_rng(5)
     rows, count = together(numbers), len(numbers)
     every = {name: [value] for name, value in rows.items()}
@@ -51,7 +56,9 @@ def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
             off = NUDGE * np.where(draw.uniform(size=count) < 0.5, -1.0, 1.0)
             absolute = off if family.size is None else 0.0
             every[name].append(value if name in family.fixed else value * (1 + off) + absolute)
-    truth = family.right({name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1)))
+    truth = family.right(
+        {name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1))
+    )
     whole = _whole(truth, np.tile(ts, (1 + NUDGES, 1))).reshape(1 + NUDGES, count, ts.shape[1] + 1, -1)
     growth = np.nan_to_num(np.max(np.abs(whole[1:] - whole[0]), axis=0) / NUDGE)
     return truth, growth
@@ -83,24 +90,41 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
     rtol = tolerance(ask)
     count = min(int(motion.accepted), 1000) + 10
     expected, size = truth.values[i], _size(family, numbers, truth, i)
-    wide = lambda grown: np.minimum(family.slack * 2 * count * rtol * (size + grown), MOST * size)  # noqa: E731
+    wide = lambda grown: np.minimum(family.slack * 2 * count * rtol * (size + grown), MOST * size)
     allowed = wide(np.nan_to_num(np.max(growth[i, :, :-1], axis=0)))
     reached = np.isfinite(expected)
     if truth.event is None and not np.all(reached):
         return UNDECIDED, None, "the reference did not settle"
     if not np.array_equal(np.isfinite(values), reached) and truth.event is None:
-        return _wrong(motion, np.inf, "values are not finite where the motion exists, or finite after its end")
+        return _wrong(
+            motion, np.inf, "values are not finite where the motion exists, or finite after its end"
+        )
     both = reached & np.isfinite(values)
     off = np.where(both, np.abs(values - np.where(reached, expected, 0.0)) / allowed, 0.0)
-    error = max(float(np.max(off, initial=0.0)), float(np.max(np.abs(end - truth.last[i]) / allowed)) if np.all(np.isfinite(end)) else np.inf)
-    worst = f"`{family.names.split()[int(np.argmax(np.max(off, axis=0)))]}` is off by {float(np.max(off * allowed, initial=0.0)):.2e}"
-    worst += f", the end {np.array2string(end, precision=6)} for {np.array2string(truth.last[i], precision=6)}"
+    error = max(
+        float(np.max(off, initial=0.0)),
+        float(np.max(np.abs(end - truth.last[i]) / allowed)) if np.all(np.isfinite(end)) else np.inf,
+    )
+    worst = (
+        f"`{family.names.split()[int(np.argmax(np.max(off, axis=0)))]}` is off by"
+        f" {float(np.max(off * allowed, initial=0.0)):.2e}"
+    )
+    worst += (
+        f", the end {np.array2string(end, precision=6)} for {np.array2string(truth.last[i], precision=6)}"
+    )
     if truth.event is not None:
         named = motion.event_names[int(motion.event)] if code == EVENT else ""
         if named != truth.event[i]:
-            return _wrong(motion, np.inf, f"ends by `{named}` at {float(motion.t_end):.6g} s instead of `{truth.event[i]}` at {truth.t_end[i]:.6g} s")
+            return _wrong(
+                motion,
+                np.inf,
+                f"ends by `{named}` at {float(motion.t_end):.6g} s instead of `{truth.event[i]}` at"
+                f" {truth.t_end[i]:.6g} s",
+            )
         scale = abs(truth.t_end[i] - numbers[i].get("t0", 0.0)) + 1e-3
-        late = abs(float(motion.t_end) - truth.t_end[i]) / min(family.slack * 2 * count * rtol * (scale + growth[i, -1, -1]), MOST * scale)
+        late = abs(float(motion.t_end) - truth.t_end[i]) / min(
+            family.slack * 2 * count * rtol * (scale + growth[i, -1, -1]), MOST * scale
+        )
         if late > error:
             error, worst = late, f"ends at {float(motion.t_end)!r} s instead of {float(truth.t_end[i])!r} s"
     elif code == EVENT:
@@ -113,7 +137,9 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
 def _size(family: Family, numbers, truth: Truth, i: int) -> np.ndarray:
     """What counts as the size of each name: the largest value, or what the family says; at least `size` or 1."""
     least = 1.0 if family.size is None else np.array(family.size(SimpleNamespace(**numbers[i])))
-    return np.maximum(np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0, where=np.isfinite(truth.values[i])), least)
+    return np.maximum(
+        np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0, where=np.isfinite(truth.values[i])), least
+    )
 
 
 def _wrong(motion, error: float, said: str):

@@ -1,7 +1,8 @@
 """Linkages of one freedom, through positions where their rows lose rank, and near them.
 
-Where two branches of configurations cross, the smooth motion stays on its own branch: the momentum with which it arrives is tangent to that branch alone. On
-a branch with coordinates q(s), with T = I(s) s'^2/2:  I s'' + I'(s) s'^2/2 + V'(s) = 0.
+Where two branches of configurations cross, the smooth motion stays on its own branch: the momentum with which
+it arrives is tangent to that branch alone. On a branch with coordinates q(s), with T = I(s) s'^2/2: I s'' +
+I'(s) s'^2/2 + V'(s) = 0.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,12 @@ from hunting.reference import along, integrate
 
 def rod(mass, length, position, angle):
     """A uniform rod in the plane of x and y."""
-    return jj.RigidBody(mass, mass * length**2 / 12 * jnp.array([1e-3, 1.0, 1.0]), jnp.stack([position[0], position[1], 0.0 * angle]), jj.rot_z(angle))
+    return jj.RigidBody(
+        mass,
+        mass * length**2 / 12 * jnp.array([1e-3, 1.0, 1.0]),
+        jnp.stack([position[0], position[1], 0.0 * angle]),
+        jj.rot_z(angle),
+    )
 
 
 def ahead(length, angle):
@@ -42,7 +48,9 @@ class InPlane(jj.Scene):
 
 
 class FourBarInAngles(InPlane):
-    """Crank r1 at the origin, coupler r2, rocker r3 at (d, 0), uniform rods: three angles, the loop closed by a pin."""
+    """Crank r1 at the origin, coupler r2, rocker r3 at (d, 0), uniform rods: three angles, the loop closed by
+    a pin.
+    """
 
     r1: object = jj.parameter(1.0, positive=True)
     r2: object = jj.parameter(2.0, positive=True)
@@ -59,7 +67,15 @@ class FourBarInAngles(InPlane):
         }
 
     def geometric_constraints(self, pose):
-        return {"loop": jj.pin(*(pose[name].place(on_axis(0.5 * r)) for name, r in (("coupler", self.r2), ("rocker", self.r3))), axes="xy")}
+        return {
+            "loop": jj.pin(
+                *(
+                    pose[name].place(on_axis(0.5 * r))
+                    for name, r in (("coupler", self.r2), ("rocker", self.r3))
+                ),
+                axes="xy",
+            )
+        }
 
 
 class FourBarWithPins(FourBarInAngles):
@@ -85,7 +101,7 @@ class FourBarWithPins(FourBarInAngles):
         }
 
 
-# Coordinates and their slopes along a branch, as analytic functions of s; `space`: whose functions. -------------------
+# Coordinates and their slopes along a branch, as analytic functions of s; `space`: whose functions. ---------
 
 
 def parallelogram(n, s, space=np):
@@ -128,13 +144,17 @@ def potential(n, q):
     return n.g * (n.m1 * n.r1 / 2 * a + n.m2 * (n.r1 * a + n.r2 / 2 * b) + n.m3 * n.r3 / 2 * c)
 
 
-def on_branch(branch: Callable, twice_kinetic: Callable = twice_kinetic, potential: Callable = potential) -> Callable:
+def on_branch(
+    branch: Callable, twice_kinetic: Callable = twice_kinetic, potential: Callable = potential
+) -> Callable:
     """The truth of motions on a branch."""
 
     def truth(n, ts):
         def rates(_, s, w):
-            inertia = lambda s: twice_kinetic(n, *branch(n, s))  # noqa: E731
-            push = along(inertia, (s,), (1.0,)) * w**2 / 2 + along(lambda s: potential(n, branch(n, s)[0]), (s,), (1.0,))
+            inertia = lambda s: twice_kinetic(n, *branch(n, s))
+            push = along(inertia, (s,), (1.0,)) * w**2 / 2 + along(
+                lambda s: potential(n, branch(n, s)[0]), (s,), (1.0,)
+            )
             return w, -push / inertia(s)
 
         s, w = integrate(rates, (n.s, n.s_rate), ts, width=0.02)
@@ -150,14 +170,25 @@ def starting(branch: Callable, names: str = "abc", pins: bool = False) -> Callab
     def start(n):
         q, dq = branch(n, jnp.asarray(n.s), jnp)
         rates = [slope * n.s_rate for slope in dq]
-        found = dict(zip(names, q, strict=True)) | {f"{name}_rate": rate for name, rate in zip(names, rates, strict=True)}
+        found = dict(zip(names, q, strict=True)) | {
+            f"{name}_rate": rate for name, rate in zip(names, rates, strict=True)
+        }
         if not pins:
             return found
         c, s = n.r1 * jnp.cos(q[0]), n.r1 * jnp.sin(q[0])
-        joints = ((0.0, 0.0, 0.0, 0.0, n.r1), (c, s, -s * rates[0], c * rates[0], n.r2), (n.d, 0.0, 0.0, 0.0, n.r3))
+        joints = (
+            (0.0, 0.0, 0.0, 0.0, n.r1),
+            (c, s, -s * rates[0], c * rates[0], n.r2),
+            (n.d, 0.0, 0.0, 0.0, n.r3),
+        )
         for k, ((x, y, vx, vy, r), angle, rate) in enumerate(zip(joints, q, rates, strict=True), start=1):
             c, s = r / 2 * jnp.cos(angle), r / 2 * jnp.sin(angle)
-            found |= {f"x{k}": x + c, f"y{k}": y + s, f"x{k}_rate": vx - s * rate, f"y{k}_rate": vy + c * rate}
+            found |= {
+                f"x{k}": x + c,
+                f"y{k}": y + s,
+                f"x{k}_rate": vx - s * rate,
+                f"y{k}_rate": vy + c * rate,
+            }
         return found
 
     return start
@@ -170,10 +201,19 @@ def lengths_drawn(kind: str) -> Callable:
     """Lengths, masses and a start of a parallelogram or a kite."""
 
     def draw(r):
-        short, long = (r.uniform(0.5, 1.5), r.uniform(1.3, 2.5)) if r.uniform() < 0.5 else (float(r.choice([0.5, 1.0])), float(r.choice([1.5, 2.0, 3.0])))
-        lengths = {"parallel": (short, short * long, short, short * long), "kite": (short, short * long, short * long, short)}[kind]
+        short, long = (
+            (r.uniform(0.5, 1.5), r.uniform(1.3, 2.5))
+            if r.uniform() < 0.5
+            else (float(r.choice([0.5, 1.0])), float(r.choice([1.5, 2.0, 3.0])))
+        )
+        lengths = {
+            "parallel": (short, short * long, short, short * long),
+            "kite": (short, short * long, short * long, short),
+        }[kind]
         turn = float(r.choice([-1.0, 1.0]))
-        found = dict(zip(("r1", "r2", "r3", "d"), lengths, strict=True)) | drawn(**MASSES, s=(0.3, np.pi - 0.3), s_rate=(2.0, 12.0))(r)
+        found = dict(zip(("r1", "r2", "r3", "d"), lengths, strict=True)) | drawn(
+            **MASSES, s=(0.3, np.pi - 0.3), s_rate=(2.0, 12.0)
+        )(r)
         found |= {"s": turn * found["s"], "s_rate": turn * found["s_rate"] * r.choice([-1.0, 1.0, 1.0])}
         return found | {"span": r.uniform(0.5, 2.5)}
 
@@ -188,14 +228,39 @@ ANGLES = {"scene": FourBarInAngles, "asks": SOME}
 def _linkage(name, what, branch, kind, pins=False, **more):
     fixed = ("span", "r1", "r2", "r3", "d")
     common = FOUR_BAR | (PINS if pins else ANGLES) | more
-    return Family(name=name, what=what, draw=lengths_drawn(kind), start=starting(branch, pins=pins), truth=on_branch(branch), fixed=fixed, **common)
+    return Family(
+        name=name,
+        what=what,
+        draw=lengths_drawn(kind),
+        start=starting(branch, pins=pins),
+        truth=on_branch(branch),
+        fixed=fixed,
+        **common,
+    )
 
 
 FAMILIES = (
-    _linkage("parallelogram", "parallelogram linkage laid flat, in angles", parallelogram, "parallel", cases=140),
-    _linkage("parallelogram-pins", "parallelogram linkage laid flat, nine coordinates with pins", parallelogram, "parallel", pins=True, cases=105),
-    _linkage("antiparallelogram", "antiparallelogram linkage laid flat, in angles", antiparallelogram, "parallel"),
-    _linkage("antiparallelogram-pins", "antiparallelogram linkage laid flat, with pins", antiparallelogram, "parallel", pins=True),
+    _linkage(
+        "parallelogram", "parallelogram linkage laid flat, in angles", parallelogram, "parallel", cases=140
+    ),
+    _linkage(
+        "parallelogram-pins",
+        "parallelogram linkage laid flat, nine coordinates with pins",
+        parallelogram,
+        "parallel",
+        pins=True,
+        cases=105,
+    ),
+    _linkage(
+        "antiparallelogram", "antiparallelogram linkage laid flat, in angles", antiparallelogram, "parallel"
+    ),
+    _linkage(
+        "antiparallelogram-pins",
+        "antiparallelogram linkage laid flat, with pins",
+        antiparallelogram,
+        "parallel",
+        pins=True,
+    ),
     _linkage("kite", "kite linkage through its fold, in angles", kite, "kite"),
     _linkage("folded-kite", "kite linkage folded onto its ground", folded_kite, "kite"),
     _linkage("folded-kite-pins", "the same with pins", folded_kite, "kite", pins=True, cases=35),

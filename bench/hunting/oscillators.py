@@ -1,4 +1,5 @@
-"""Oscillators with exact solutions: stiff ones, pushed by samples with short features, at far times, and in other units.
+"""Oscillators with exact solutions: stiff ones, pushed by samples with short features, at far times, and in
+other units.
 
 x'' + 2 c x' + k x = f(t), f linear between knots: exact from knot to knot by the exponential of a matrix.
 """
@@ -30,7 +31,9 @@ class Oscillator(OnLine):
 def _one(n, ts, knots, values) -> np.ndarray:
     """States (2, times) of one oscillator; the push is constant beyond its knots."""
     n = SimpleNamespace(**{"mass": 1.0, "c": 0.0, "t0": 0.0} | vars(n))
-    A = np.array([[0, 1, 0, 0], [-n.k / n.mass, -n.c / n.mass, 1 / n.mass, 0], [0, 0, 0, 1], [0, 0, 0, 0]], float)  # x, v, f, f'
+    A = np.array(
+        [[0, 1, 0, 0], [-n.k / n.mass, -n.c / n.mass, 1 / n.mass, 0], [0, 0, 0, 1], [0, 0, 0, 0]], float
+    )  # x, v, f, f'
     y, t, found = np.array([n.x, n.x_rate]), n.t0, []
     for stop in np.unique(np.concatenate([ts, knots[(knots > n.t0) & (knots < ts[-1])]])):
         f = np.interp([t, stop], knots, values)
@@ -44,8 +47,13 @@ def pushed_by(push):
     """The truth of oscillators; `push(numbers of one case)` gives knots and values."""
 
     def truth(n, ts):
-        cases = [SimpleNamespace(**{name: float(x[i, 0]) for name, x in vars(n).items()}) for i in range(len(ts))]
-        return np.stack([_one(one, times, *map(np.asarray, push(one))) for one, times in zip(cases, ts, strict=True)], axis=1)
+        cases = [
+            SimpleNamespace(**{name: float(x[i, 0]) for name, x in vars(n).items()}) for i in range(len(ts))
+        ]
+        return np.stack(
+            [_one(one, times, *map(np.asarray, push(one))) for one, times in zip(cases, ts, strict=True)],
+            axis=1,
+        )
 
     return truth
 
@@ -63,33 +71,69 @@ def _record(n, space=np):
 
 
 def _pushed(push, shared: tuple[str, ...]) -> dict:
-    inputs = lambda n: {"push": jj.Sampled(*push(n, jnp))}  # noqa: E731
-    return OSCILLATOR | {"truth": pushed_by(push), "inputs": inputs, "shared": ("span", *shared), "fixed": ("span", "when"), "cases": 72}
+    inputs = lambda n: {"push": jj.Sampled(*push(n, jnp))}
+    return OSCILLATOR | {
+        "truth": pushed_by(push),
+        "inputs": inputs,
+        "shared": ("span", *shared),
+        "fixed": ("span", "when"),
+        "cases": 72,
+    }
 
 
 def _blow_drawn(r):
     span, length = float(r.choice([2.0, 10.0])), 10 ** r.uniform(-3.5, -1.0)
-    rest = {"k": r.uniform(0.2, 4.0), "x": r.uniform(0, 0.3), "x_rate": 0.0, "when": r.uniform(0.1, 0.8) * span, "length": length}
+    rest = {
+        "k": r.uniform(0.2, 4.0),
+        "x": r.uniform(0, 0.3),
+        "x_rate": 0.0,
+        "when": r.uniform(0.1, 0.8) * span,
+        "length": length,
+    }
     return rest | {"force": r.uniform(0.5, 3.0) / length, "span": span}
 
 
 def _far_drawn(r):
     k = 10 ** r.uniform(0.0, 6.0)
-    start = {"x": r.uniform(-1, 1), "x_rate": r.uniform(-1, 1) * np.sqrt(k), "t0": float(r.choice([1.7e9, 1e6, -3e4, 1e12]))}
+    start = {
+        "x": r.uniform(-1, 1),
+        "x_rate": r.uniform(-1, 1) * np.sqrt(k),
+        "t0": float(r.choice([1.7e9, 1e6, -3e4, 1e12])),
+    }
     return {"k": k} | start | {"span": 10 ** r.uniform(1.0, 2.5) / np.sqrt(k)}
 
 
 def _stiff_drawn(r):
     k, c = 10 ** r.uniform(3.0, 9.0), 10 ** r.uniform(0.0, 3.0)
-    return {"k": k, "c": c * np.sqrt(k), "x": r.uniform(0.5, 1.0), "x_rate": 0.0, "span": r.uniform(1.0, 10.0)}
+    return {
+        "k": k,
+        "c": c * np.sqrt(k),
+        "x": r.uniform(0.5, 1.0),
+        "x_rate": 0.0,
+        "span": r.uniform(1.0, 10.0),
+    }
 
 
 def _units_drawn(r):
     m, w, size = 10 ** r.uniform(-20, 20), 10 ** r.uniform(-6, 6), 10 ** r.uniform(-12, 12)
-    return {"mass": m, "k": m * w * w, "x": size, "x_rate": 0.3 * size * w, "span": r.uniform(1, 10) / w, "atol": 1e-8 * size * min(w, 1.0)}
+    return {
+        "mass": m,
+        "k": m * w * w,
+        "x": size,
+        "x_rate": 0.3 * size * w,
+        "span": r.uniform(1, 10) / w,
+        "atol": 1e-8 * size * min(w, 1.0),
+    }
 
 
-WAYS = (Ask("simulate"), Ask("jit", 33), Ask("vmap"), Ask("simulate", 33, 1e-6), Ask("rollout", 33, 1e-6), Ask("jit rollout"))
+WAYS = (
+    Ask("simulate"),
+    Ask("jit", 33),
+    Ask("vmap"),
+    Ask("simulate", 33, 1e-6),
+    Ask("rollout", 33, 1e-6),
+    Ask("jit rollout"),
+)
 OSCILLATOR = {"scene": Oscillator, "names": "x x_rate", "asks": WAYS}
 FREE = OSCILLATOR | {"truth": pushed_by(lambda n: ([0.0, 1.0], [0.0, 0.0]))}
 FAMILIES = (

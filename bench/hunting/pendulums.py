@@ -1,4 +1,6 @@
-"""Particles and blades whose scenes state narrow domains, which the motions leave: the chosen independent speeds then stop determining the others."""
+"""Particles and blades whose scenes state narrow domains, which the motions leave: the chosen independent
+speeds then stop determining the others.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +32,7 @@ class RodPendulum(Weighted, Upright):
 
 def _rod_truth(n, ts):
     """By the angle from the vertical, from the lowest position at t0."""
-    rates = lambda t, angle, rate: (rate, -G / n.length * np.sin(angle))  # noqa: E731
+    rates = lambda t, angle, rate: (rate, -G / n.length * np.sin(angle))
     angle, rate = integrate(rates, (0.0, n.v / n.length), ts, width=0.03)
     s, c = n.length * np.sin(angle), n.length * np.cos(angle)
     return s, -c, c * rate, s * rate
@@ -47,10 +49,19 @@ SWING = drawn(length=LENGTH, mass=(0.2, 4.0), v=either(5.0, 10.0), span=one_of(2
 
 
 def _turning_drawn(r):
-    return SWING(r) | {"v": r.uniform(6.8, 11.0), "length": r.uniform(0.7, 1.0), "whole": float(r.uniform() < 0.5)}
+    return SWING(r) | {
+        "v": r.uniform(6.8, 11.0),
+        "length": r.uniform(0.7, 1.0),
+        "whole": float(r.uniform() < 0.5),
+    }
 
 
-ROD = {"scene": RodPendulum, "start": lambda n: {"z": -n.length, "x_rate": n.v, "z_rate": 0.0}, "truth": _rod_truth, "names": "x z x_rate z_rate"}
+ROD = {
+    "scene": RodPendulum,
+    "start": lambda n: {"z": -n.length, "x_rate": n.v, "z_rate": 0.0},
+    "truth": _rod_truth,
+    "names": "x z x_rate z_rate",
+}
 
 
 class SphericalPendulum(RodPendulum):
@@ -124,7 +135,11 @@ class Blade(jj.Scene):
     domain = {"heading": (-0.3, 0.3)}
 
     def bodies(self, t, q):
-        return {"body": jj.RigidBody(1.0, 0.3 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading))}
+        return {
+            "body": jj.RigidBody(
+                1.0, 0.3 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading)
+            )
+        }
 
     def velocity_constraints(self, motion):
         body = motion["body"]
@@ -136,7 +151,7 @@ class Blade(jj.Scene):
 
 def _blade_truth(n, ts):
     w = n.heading_rate
-    rates = lambda _, x, y, th, v: (v * np.cos(th), v * np.sin(th), w, n.push * np.cos(th))  # noqa: E731
+    rates = lambda _, x, y, th, v: (v * np.cos(th), v * np.sin(th), w, n.push * np.cos(th))
     x, y, th, v = integrate(rates, (0.0, 0.0, n.heading, n.v), ts, width=0.05)
     return x, y, th, v * np.cos(th), v * np.sin(th), w
 
@@ -149,8 +164,11 @@ class RodChain(Weighted):
     second: object = jj.parameter(1.0, positive=True)
 
     def bodies(self, t, q):
-        place = lambda x, z: jnp.stack([x, 0.0 * x, z])  # noqa: E731
-        return {"upper": jj.Particle(1.0, place(q.x1, q.z1)), "lower": jj.Particle(self.second, place(q.x2, q.z2))}
+        place = lambda x, z: jnp.stack([x, 0.0 * x, z])
+        return {
+            "upper": jj.Particle(1.0, place(q.x1, q.z1)),
+            "lower": jj.Particle(self.second, place(q.x2, q.z2)),
+        }
 
     def geometric_constraints(self, pose):
         upper, lower = pose["upper"].position, pose["lower"].position
@@ -158,7 +176,9 @@ class RodChain(Weighted):
 
 
 def _chain_truth(n, ts):
-    """Double pendulum of unit rods in angles; (1 + m) a'' + m cos(a - b) b'' = ..., Landau & Lifshitz, Mechanics, section 5."""
+    """Double pendulum of unit rods in angles; (1 + m) a'' + m cos(a - b) b'' = ..., Landau & Lifshitz,
+    Mechanics, section 5.
+    """
     m = n.second
 
     def rates(_, a, b, da, db):

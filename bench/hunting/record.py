@@ -1,7 +1,8 @@
 """What can become of a generated case, and the record of it.
 
-A motion is `right` where its error is within a bound; otherwise it must say so: by a result code (`flagged by code`, what also a lane under `jit` has), by
-`motion.warnings` (`flagged by warning`), or by an error of the engine's own kind (`refused`). Else it is `wrong`; any other error is `crashed`.
+A motion is `right` where its error is within a bound; otherwise it must say so: by a result code
+(`flagged by code`, what also a lane under `jit` has), by `motion.warnings` (`flagged by warning`), or by an
+error of the engine's own kind (`refused`). Else it is `wrong`; any other error is `crashed`.
 """
 
 from dataclasses import asdict, dataclass
@@ -9,7 +10,14 @@ from traceback import walk_tb
 
 import numpy as np
 
-RIGHT, BY_CODE, BY_WARNING, REFUSED, WRONG, CRASHED = "right", "flagged by code", "flagged by warning", "refused", "wrong", "crashed"
+RIGHT, BY_CODE, BY_WARNING, REFUSED, WRONG, CRASHED = (
+    "right",
+    "flagged by code",
+    "flagged by warning",
+    "refused",
+    "wrong",
+    "crashed",
+)
 UNDECIDED = "no reference"  # it did not settle: neither right nor wrong
 OUTCOMES = (RIGHT, BY_CODE, BY_WARNING, REFUSED, WRONG, CRASHED, UNDECIDED)
 LOST = (WRONG, CRASHED)  # what a search is for
@@ -35,7 +43,9 @@ class Record:
 
 
 def outcome_of(code: int, error: float, said: str) -> str:
-    """What became of a motion: by its result code, its error over what is allowed, and what is said against it."""
+    """What became of a motion: by its result code, its error over what is allowed, and what is said against
+    it.
+    """
     return BY_CODE if code not in (0, 1) else RIGHT if error <= 1 else BY_WARNING if said else WRONG
 
 

@@ -1,6 +1,8 @@
-"""Slow references of many motions at once: Dormand and Prince's method of order 8 in NumPy, with steps that suit the worst of them.
+"""Slow references of many motions at once: Dormand and Prince's method of order 8 in NumPy, with steps that
+suit the worst of them.
 
-Nothing here knows the engine. Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, II.5 and II.10 (coefficients from SciPy).
+Nothing here knows the engine. Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, II.5
+and II.10 (coefficients from SciPy).
 """
 
 from collections.abc import Callable
@@ -15,15 +17,18 @@ MOST = 20_000  # steps
 
 
 def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: float = 0.05) -> np.ndarray:
-    """States (n, cases, times) of y' = rates(t, *y) from n numbers at times ts (cases, times); first step `width` s.
+    """States (n, cases, times) of y' = rates(t, *y) from n numbers at times ts (cases, times); first step
+    `width` s.
 
-    Every number, and the time, is a column of cases, (cases, 1). A start may be complex, for derivatives by a complex step. A case that is given up is NaN
-    from then on.
+    Every number, and the time, is a column of cases, (cases, 1). A start may be complex, for derivatives by a
+    complex step. A case that is given up is NaN from then on.
     """
     y, t = (np.stack([np.broadcast_to(x, (len(ts), 1)) for x in some]) for some in (start, [t0]))
     t = t[0].astype(float)
     whole, found, left = ts[:, -1:] - t, [], MOST
-    part = min(1.0, width / max(float(np.max(np.abs(whole))), 1e-300))  # length of a step, as a part of the whole span
+    part = min(
+        1.0, width / max(float(np.max(np.abs(whole))), 1e-300)
+    )  # length of a step, as a part of the whole span
     with np.errstate(all="ignore"):
         for stop in ts.T[:, :, None]:
             done, span = 0.0, stop - t
@@ -38,7 +43,11 @@ def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: f
                     continue
                 y = np.where(off > 1.0, np.nan, new)
                 done = 1.0 if 1.0 - done - step < 1e-14 else done + step
-                part = max(part, step * share * min(5.0, 0.9 * max(worst, 1e-9) ** -0.125)) if worst <= 1.0 else 1e-3
+                part = (
+                    max(part, step * share * min(5.0, 0.9 * max(worst, 1e-9) ** -0.125))
+                    if worst <= 1.0
+                    else 1e-3
+                )
             t = stop
             found.append(y)
     return np.concatenate(found, axis=-1)
@@ -47,13 +56,15 @@ def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: f
 def _step(rates: Callable, t, y, h):
     """The next state, and its error (cases, 1) relative to what is let pass; zero where a case was given up."""
     stages: list[np.ndarray] = []
-    at = lambda t, y: np.stack([np.broadcast_to(x, t.shape) for x in rates(t, *y)])  # noqa: E731
+    at = lambda t, y: np.stack([np.broadcast_to(x, t.shape) for x in rates(t, *y)])
     for i in range(table.N_STAGES):
         slope = sum((A[i, j] * stages[j] for j in range(i) if A[i, j]), np.zeros_like(y))
         stages.append(at(t + C[i] * h, y + h * slope))
     new = y + h * sum(b * k for b, k in zip(B, stages, strict=True) if b)
     stages.append(at(t + h, new))
-    fifth, third = (np.abs(h * sum(e * k for e, k in zip(row, stages, strict=True) if e)) for row in (table.E5, table.E3))
+    fifth, third = (
+        np.abs(h * sum(e * k for e, k in zip(row, stages, strict=True) if e)) for row in (table.E5, table.E3)
+    )
     scale = CLOSE * (1 + np.maximum(np.abs(y), np.abs(new)))
     off = np.max(fifth**2 / np.sqrt(fifth**2 + 0.01 * third**2 + 1e-300) / scale, axis=0)
     given_up = ~np.all(np.isfinite(y), axis=0)
@@ -61,5 +72,7 @@ def _step(rates: Callable, t, y, h):
 
 
 def along(value: Callable, x, direction) -> np.ndarray:
-    """Derivative of an analytic `value` at x (a tuple of arrays) along `direction`, by a complex step: exact to round-off."""
+    """Derivative of an analytic `value` at x (a tuple of arrays) along `direction`, by a complex step: exact
+    to round-off.
+    """
     return np.imag(value(*(a + 1e-30j * d for a, d in zip(x, direction, strict=True)))) / 1e-30

@@ -1,6 +1,8 @@
-"""What must be refused, flagged or noticed: impossible bodies in lanes, changed files, starts outside the domain, robot files with faults.
+"""What must be refused, flagged or noticed: impossible bodies in lanes, changed files, starts outside the
+domain, robot files with faults.
 
-A case counts as right only where the truth exists and is met; otherwise the engine must say that something is wrong.
+A case counts as right only where the truth exists and is met; otherwise the engine must say that something is
+wrong.
 """
 
 import json
@@ -25,17 +27,22 @@ WAYS = ("simulate", "jit", "rollout", "jit rollout")
 
 
 def _asked(scene, parameters: dict[str, float], start: dict, way: str, **options):
-    """The motion of a scene whose `parameters` are numbers, in one of the ways; of two lanes the second is the one that is meant."""
-    one = lambda p: jj.simulate(scene.replace(**p), start, **options)  # noqa: E731
+    """The motion of a scene whose `parameters` are numbers, in one of the ways; of two lanes the second is
+    the one that is meant.
+    """
+    one = lambda p: jj.simulate(scene.replace(**p), start, **options)
 
     def lanes(p):
-        both = {name: jnp.stack([jnp.asarray(getattr(scene, name)), jnp.asarray(value)]) for name, value in p.items()}
+        both = {
+            name: jnp.stack([jnp.asarray(getattr(scene, name)), jnp.asarray(value)])
+            for name, value in p.items()
+        }
         return jj.rollout(scene, start, parameters=both, **options).lanes
 
     return in_way(way, one, lanes, parameters)
 
 
-# Impossible bodies. ------------------------------------------------------------------------------------------------
+# Impossible bodies. -----------------------------------------------------------------------------------------
 
 
 def _beyond(x):
@@ -44,7 +51,9 @@ def _beyond(x):
 
 
 class Block(jj.Scene):
-    """A block that slides and turns, under gravity along x; each parameter beyond 1e4 makes it impossible in a way of its own."""
+    """A block that slides and turns, under gravity along x; each parameter beyond 1e4 makes it impossible in
+    a way of its own.
+    """
 
     coordinates = jj.coordinates("x turn")
     above: object = jj.parameter(1.0)  # Ixy, not Iyx
@@ -58,7 +67,9 @@ class Block(jj.Scene):
         inertia = jnp.array([[1.0, 0.1, 0.0], [0.1, 1.2, 0.0], [0.0, 0.0, 1.1]])
         inertia = inertia.at[0, 1].add(_beyond(self.above)).at[0, 0].add(-_beyond(self.smallest))
         side = jnp.where(self.mirror > 1e4, -1.0, 1.0)
-        turned = (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) @ jnp.diag(jnp.stack([1.0 + o, 1.0 + o, side + o]))
+        turned = (
+            (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) @ jnp.diag(jnp.stack([1.0 + o, 1.0 + o, side + o]))
+        )
         return {"block": jj.RigidBody(1.0, inertia, jnp.stack([q.x, o, o]), turned)}
 
     def loads(self, motion):
@@ -85,7 +96,11 @@ class Wheel(jj.Scene):
 
     def bodies(self, t, q):
         at = jnp.stack([q.x, q.y, 0.0 * q.x + self.sizes()[1]])
-        return {"wheel": jj.RigidBody(1.0, jnp.array([0.03, 0.05, 0.03]), at, jj.rot_z(q.heading) @ jj.rot_y(q.spin))}
+        return {
+            "wheel": jj.RigidBody(
+                1.0, jnp.array([0.03, 0.05, 0.03]), at, jj.rot_z(q.heading) @ jj.rot_y(q.spin)
+            )
+        }
 
     def contacts(self, pose):
         return {"floor": jj.disc_contact(pose["wheel"], self.sizes()[0], ground=self.ground())}
@@ -134,11 +149,13 @@ def _impossible(seed: int):
     return f"{way}: {what}, {change}", np.inf, int(motion.result), warnings_of(motion)
 
 
-# Rows that vanish with the speeds. ---------------------------------------------------------------------------------
+# Rows that vanish with the speeds. --------------------------------------------------------------------------
 
 
 class Lawful(OnPlane):
-    """A particle in a plane whose speed is c(t) = 1 - t/stop; at rest its row has no slope, and nothing says where it goes."""
+    """A particle in a plane whose speed is c(t) = 1 - t/stop; at rest its row has no slope, and nothing says
+    where it goes.
+    """
 
     stop: object = jj.parameter(1.0)
     pull: object = jj.parameter(1.0)
@@ -157,18 +174,33 @@ def _at_rest(seed: int):
     count, angle, way = int(r.integers(1, 60)), r.uniform(0, 2 * np.pi), WAYS[seed % len(WAYS)]
     ts = np.linspace(0, 2, count + 1)[1:]
     stop = float(r.choice([r.choice(ts), r.uniform(0.2, 1.9), r.uniform(2.1, 4.0)]))
-    parameters = {"stop": stop, "pull": float(r.choice([0.0, r.uniform(0.1, 3)])), "power": float(10 ** r.uniform(-3, 3))}
-    options = {"ts": ts, "rtol": float(10 ** r.uniform(-10, -4)), "backend": str(r.choice(["auto", "auto", "xla", "dense"]))}
+    parameters = {
+        "stop": stop,
+        "pull": float(r.choice([0.0, r.uniform(0.1, 3)])),
+        "power": float(10 ** r.uniform(-3, 3)),
+    }
+    options = {
+        "ts": ts,
+        "rtol": float(10 ** r.uniform(-10, -4)),
+        "backend": str(r.choice(["auto", "auto", "xla", "dense"])),
+    }
     motion = _asked(Lawful(), parameters, {"x_rate": np.cos(angle), "y_rate": np.sin(angle)}, way, **options)
     off = abs(np.hypot(*np.asarray(motion.u_end)) - (1 - 2 / stop))
-    return f"{way}: {parameters}, {count} times, {options['backend']}", off / 1e-3 if stop > 2 else np.inf, int(motion.result), warnings_of(motion)
+    return (
+        f"{way}: {parameters}, {count} times, {options['backend']}",
+        off / 1e-3 if stop > 2 else np.inf,
+        int(motion.result),
+        warnings_of(motion),
+    )
 
 
-# Starts outside the domain. ----------------------------------------------------------------------------------------
+# Starts outside the domain. ---------------------------------------------------------------------------------
 
 
 class CrankAndSlider(jj.Scene):
-    """A crank and a slider in its line, joined by a rod; in its domain the slider is to the right of the crank, or below it."""
+    """A crank and a slider in its line, joined by a rod; in its domain the slider is to the right of the
+    crank, or below it.
+    """
 
     coordinates = jj.coordinates("crank slide")
     length: object = jj.parameter(1.5)
@@ -176,7 +208,10 @@ class CrankAndSlider(jj.Scene):
 
     def bodies(self, t, q):
         pin = jnp.stack([jnp.cos(q.crank), jnp.sin(q.crank), 0.0 * q.crank])
-        return {"pin": jj.Particle(1.0, pin), "slider": jj.Particle(1.0, jnp.stack([q.slide, 0.0 * q.slide, 0.0 * q.slide]))}
+        return {
+            "pin": jj.Particle(1.0, pin),
+            "slider": jj.Particle(1.0, jnp.stack([q.slide, 0.0 * q.slide, 0.0 * q.slide])),
+        }
 
     def geometric_constraints(self, pose):
         return {"rod": jj.rod(pose["pin"].position, pose["slider"].position, self.length)}
@@ -191,15 +226,21 @@ class Hanging(SphericalPendulum):
 def _outside(seed: int):
     """What `start` finds lies in the domain (a tenth of its width beyond is let pass), or it is refused."""
     r = np.random.default_rng([seed, 91])
-    scene = (CrankAndSlider, Hanging)[seed % 2](length=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2))
-    named = {"crank": r.uniform(-1.0, 1.0)} if seed % 2 == 0 else {"x": r.uniform(-0.5, 0.5), "y": r.uniform(-0.5, 0.5)}
+    scene = (CrankAndSlider, Hanging)[seed % 2](
+        length=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2)
+    )
+    named = (
+        {"crank": r.uniform(-1.0, 1.0)}
+        if seed % 2 == 0
+        else {"x": r.uniform(-0.5, 0.5), "y": r.uniform(-0.5, 0.5)}
+    )
     state = jj.start(scene, named)
     q = dict(zip(scene.coordinate_names.entries, np.asarray(state.q), strict=True))
     off = max(max(low - q[name], q[name] - high) / (high - low) for name, (low, high) in scene.domain.items())
     return f"start of {scene} with {named}: {q}", max(off, 0.0) / 0.1, 0, ""
 
 
-# Robot files. ------------------------------------------------------------------------------------------------------
+# Robot files. -----------------------------------------------------------------------------------------------
 
 ARM = """<robot name="arm">
   <link name="base"/>
@@ -214,9 +255,20 @@ FAULTS = (
     ("two dynamics", '<dynamics damping="0.3"/>', '<dynamics damping="0.3"/><dynamics damping="3"/>'),
     ("a spring", '<dynamics damping="0.3"/>', '<dynamics damping="0.3" spring="9"/>'),
     ("a misspelt damping", 'damping="0.3"', 'dampnig="0.3"'),
-    ("two inertials", "</inertial>", '</inertial><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'),
+    (
+        "two inertials",
+        "</inertial>",
+        (
+            '</inertial><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"'
+            ' iyz="0"/></inertial>'
+        ),
+    ),
     ("two links of one name", '<link name="base"/>', '<link name="base"/><link name="upper"/>'),
-    ("a loop joint", "</robot>", '<loop_joint name="l" type="revolute"><link1 link="base"/><link2 link="upper"/></loop_joint></robot>'),
+    (
+        "a loop joint",
+        "</robot>",
+        '<loop_joint name="l" type="revolute"><link1 link="base"/><link2 link="upper"/></loop_joint></robot>',
+    ),
     ("a force element", "</robot>", '<force_element name="f"><spring k="3"/></force_element></robot>'),
     ("a mass as text", '<mass value="2.0"/>', "<mass>2.0</mass>"),
     ("a number of Python's", 'value="2.0"', 'value="2_0"'),
@@ -224,7 +276,11 @@ FAULTS = (
     ("a moment above the others", 'izz="0.01"', 'izz="0.9"'),
     ("a misspelt product", 'ixz="0"', 'izx="0"'),
     ("two origins", '<origin xyz="0 0 -0.5"/>', '<origin xyz="0 0 -0.5"/><origin xyz="0 0 0.5"/>'),
-    ("an angle of the frame in degrees", '<origin xyz="0 0 -0.5"/>', '<origin xyz="0 0 -0.5" rpy_deg="90 0 0"/>'),
+    (
+        "an angle of the frame in degrees",
+        '<origin xyz="0 0 -0.5"/>',
+        '<origin xyz="0 0 -0.5" rpy_deg="90 0 0"/>',
+    ),
 )
 
 
@@ -237,25 +293,39 @@ def _robot(seed: int):
     return f"{what} in a URDF file: {scene.__name__}", np.inf, 0, said
 
 
-# Files of studies. -------------------------------------------------------------------------------------------------
+# Files of studies. ------------------------------------------------------------------------------------------
 
 
 @cache
 def _study() -> tuple[Path, dict]:
     path = Path(tempfile.mkdtemp()) / "discs.zarr"
-    study = jj.Study(jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3)
-    result = study.run(path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": End("lean", "rad")}, progress=False)
+    study = jj.Study(
+        jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3
+    )
+    result = study.run(
+        path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": End("lean", "rad")}, progress=False
+    )
     return path, _facts(result)
 
 
 def _facts(result) -> dict:
     found = result.statistics
-    numbers = {"mean": found.mean, "covariance": found.covariance, "counts": found.counts, "edges": found.histogram("lean")[1]}
-    return {name: x.tolist() for name, x in numbers.items()} | {"values": result.to_xarray()["lean"].values.tolist(), "complete": result.complete}
+    numbers = {
+        "mean": found.mean,
+        "covariance": found.covariance,
+        "counts": found.counts,
+        "edges": found.histogram("lean")[1],
+    }
+    return {name: x.tolist() for name, x in numbers.items()} | {
+        "values": result.to_xarray()["lean"].values.tolist(),
+        "complete": result.complete,
+    }
 
 
 def _study_file(seed: int):
-    """One character of one file of a study's folder is another: the study says so, or its numbers are what they were."""
+    """One character of one file of a study's folder is another: the study says so, or its numbers are what
+    they were.
+    """
     r = np.random.default_rng([seed, 92])
     path, before = _study()
     files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size and "lock" not in p.name)
@@ -265,7 +335,11 @@ def _study_file(seed: int):
     whole = changed.read_bytes()
     digits = [k for k, byte in enumerate(whole) if 48 <= byte <= 57] or list(range(len(whole)))
     at = int(r.choice(digits))
-    other = bytes([48 + (whole[at] - 48 + int(r.integers(1, 10))) % 10]) if 48 <= whole[at] <= 57 else bytes([whole[at] ^ 1])
+    other = (
+        bytes([48 + (whole[at] - 48 + int(r.integers(1, 10))) % 10])
+        if 48 <= whole[at] <= 57
+        else bytes([whole[at] ^ 1])
+    )
     changed.write_bytes(whole[:at] + other + whole[at + 1 :])
     try:
         with warnings.catch_warnings(record=True) as heard:
@@ -273,13 +347,15 @@ def _study_file(seed: int):
             result = jj.load_study(path)
             after, shown = _facts(result), str(result)
         same = json.dumps(after) == json.dumps(before)
-        said = "; ".join(str(w.message).splitlines()[0] for w in heard) or ("" if after["complete"] else shown.splitlines()[0])
+        said = "; ".join(str(w.message).splitlines()[0] for w in heard) or (
+            "" if after["complete"] else shown.splitlines()[0]
+        )
     finally:
         changed.write_bytes(whole)
     return f"byte {at} of {kind}", 0.0 if same else np.inf, 0, said
 
 
-# Machine code on disk. ---------------------------------------------------------------------------------------------
+# Machine code on disk. --------------------------------------------------------------------------------------
 
 TWO_MOTIONS = """
 import json, warnings; warnings.simplefilter("ignore")
@@ -297,7 +373,9 @@ def _run_twice(folder: Path):
 
 
 def _cache_file(seed: int):
-    """Files of machine code are exchanged, torn, or hold something else: the next process returns the same motions."""
+    """Files of machine code are exchanged, torn, or hold something else: the next process returns the same
+    motions.
+    """
     r = np.random.default_rng([seed, 93])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -319,9 +397,19 @@ def _cache_file(seed: int):
 
 
 FAMILIES = (
-    Single("impossible", "bodies, contacts and directions that cannot be, alone, in lanes and under `jit`", _impossible, 48),
+    Single(
+        "impossible",
+        "bodies, contacts and directions that cannot be, alone, in lanes and under `jit`",
+        _impossible,
+        48,
+    ),
     Single("at-rest", "a row for the speed of a particle, which loses its slope at rest", _at_rest, 40),
-    Single("outside", "starts of linkages and pendulums, of which only some coordinates are named, against the domain", _outside, 20),
+    Single(
+        "outside",
+        "starts of linkages and pendulums, of which only some coordinates are named, against the domain",
+        _outside,
+        20,
+    ),
     Single("robot-files", "URDF files with faults", _robot, len(FAULTS)),
     Single("cache-files", "machine code on disk that is exchanged or damaged", _cache_file, 8),
     Single("study-files", "a study one of whose files has another digit", _study_file, 60),

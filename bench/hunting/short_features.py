@@ -1,4 +1,5 @@
-"""Features that act in a small part of the way or of the time, and constraints that lose their slope between two steps.
+"""Features that act in a small part of the way or of the time, and constraints that lose their slope between
+two steps.
 
 Motions are free between the features, where nothing bounds a step but the rules for its length.
 """
@@ -52,7 +53,11 @@ def _strip_truth(n, ts):
     v, f, a, w = n.x_rate, n.force, n.at, n.width
     behind, enters = np.sqrt(v * v - 2 * f * w), a / v
     leaves, inside = enters + (v - behind) / f, ts - enters
-    x = np.where(ts < enters, v * ts, np.where(ts < leaves, a + v * inside - f / 2 * inside**2, a + w + behind * (ts - leaves)))
+    x = np.where(
+        ts < enters,
+        v * ts,
+        np.where(ts < leaves, a + v * inside - f / 2 * inside**2, a + w + behind * (ts - leaves)),
+    )
     return x, np.where(ts < enters, v, np.where(ts < leaves, v - f * inside, behind))
 
 
@@ -86,20 +91,38 @@ def _bump_truth(n, ts):
 
 def _strip_drawn(r):
     v, width = r.uniform(1.0, 4.0), 10 ** r.uniform(-2.2, -0.7)
-    return {"x_rate": v, "width": width, "force": r.uniform(0.1, 0.4) * v * v / (2 * width), "at": r.uniform(0.5, 2.0), "span": 3.0}
+    return {
+        "x_rate": v,
+        "width": width,
+        "force": r.uniform(0.1, 0.4) * v * v / (2 * width),
+        "at": r.uniform(0.5, 2.0),
+        "span": 3.0,
+    }
 
 
 def _pulse_drawn(r):
     width = 3.0 * 10 ** r.uniform(-2.2, -0.9)
-    return {"x_rate": r.uniform(-2.0, 2.0), "width": width, "force": r.uniform(-2.0, 2.0) / width, "at": r.uniform(0.3, 2.5), "span": 3.0}
+    return {
+        "x_rate": r.uniform(-2.0, 2.0),
+        "width": width,
+        "force": r.uniform(-2.0, 2.0) / width,
+        "at": r.uniform(0.3, 2.5),
+        "span": 3.0,
+    }
 
 
 def _bump_drawn(r):
     v, width = r.uniform(2.0, 4.0), 10 ** r.uniform(-1.5, -0.5)
-    return {"x_rate": v, "width": width, "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)), "at": r.uniform(0.5, 3.0), "span": 3.0}
+    return {
+        "x_rate": v,
+        "width": width,
+        "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)),
+        "at": r.uniform(0.5, 3.0),
+        "span": 3.0,
+    }
 
 
-# Events with a short negative part. ------------------------------------------------------------------------------
+# Events with a short negative part. -------------------------------------------------------------------------
 
 
 class Window(Strip):
@@ -126,10 +149,15 @@ def _window_truth(n, ts):
 
 
 def _window_drawn(r):
-    return {"x_rate": r.uniform(0.7, 4.0), "at": r.uniform(0.5, 2.0), "width": 10 ** r.uniform(-4.0, -1.0), "span": 3.0}
+    return {
+        "x_rate": r.uniform(0.7, 4.0),
+        "at": r.uniform(0.5, 2.0),
+        "width": 10 ** r.uniform(-4.0, -1.0),
+        "span": 3.0,
+    }
 
 
-# Speeds and constraints that lose their slope. -------------------------------------------------------------------
+# Speeds and constraints that lose their slope. --------------------------------------------------------------
 
 
 class TurnedSpeed(jj.Scene):
@@ -165,7 +193,9 @@ def _turned(name, scene, weight, weight_of_start, first):
 
 
 class EvenPace(Weighted):
-    """Appell and Hamel's constraint zdot^2 = k^2 (xdot^2 + ydot^2): without slope where the speeds vanish, at the top of the throw."""
+    """Appell and Hamel's constraint zdot^2 = k^2 (xdot^2 + ydot^2): without slope where the speeds vanish, at
+    the top of the throw.
+    """
 
     coordinates = jj.coordinates("x y z")
     slope: object = jj.parameter(1.0)
@@ -179,7 +209,9 @@ class EvenPace(Weighted):
 
 
 def _pace_truth(n, ts):
-    """Along its straight line the mass is slowed by g k^2/(1 + k^2) in z; at the top the constraint no longer determines the motion, which has no truth."""
+    """Along its straight line the mass is slowed by g k^2/(1 + k^2) in z; at the top the constraint no longer
+    determines the motion, which has no truth.
+    """
     k, c, s = n.slope, np.cos(n.turn), np.sin(n.turn)
     pull = G * k * k / (1 + k * k)
     z, up = k * n.v * ts - pull / 2 * ts**2, k * n.v - pull * ts
@@ -189,11 +221,18 @@ def _pace_truth(n, ts):
 def _pace_drawn(r):
     k, v = r.uniform(0.5, 2.0), r.uniform(1.0, 3.0)
     top = k * v / (G * k * k / (1 + k * k))
-    return {"slope": k, "v": v, "turn": r.uniform(0.0, 6.0), "span": float(r.choice([0.7, r.uniform(1.2, 2.0)])) * top}
+    return {
+        "slope": k,
+        "v": v,
+        "turn": r.uniform(0.0, 6.0),
+        "span": float(r.choice([0.7, r.uniform(1.2, 2.0)])) * top,
+    }
 
 
 class SetPace(OnPlane):
-    """A mass whose speed is prescribed by xdot^2 + ydot^2 = (pace cos t)^2: without slope where the pace passes zero."""
+    """A mass whose speed is prescribed by xdot^2 + ydot^2 = (pace cos t)^2: without slope where the pace
+    passes zero.
+    """
 
     pace: object = jj.parameter(1.0)
 

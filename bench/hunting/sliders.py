@@ -1,10 +1,26 @@
-"""Slider-cranks, whose rows lose rank where rod and crank are of one length, and four-bar linkages that do not, or hardly."""
+"""Slider-cranks, whose rows lose rank where rod and crank are of one length, and four-bar linkages that do
+not, or hardly.
+"""
 
 import numpy as np
 
 import jourdain_jax as jj
 from hunting.family import Family, drawn, either
-from hunting.linkages import ANGLES, FOUR_BAR, MASSES, PINS, InPlane, ahead, coupled, on_axis, on_branch, potential, rod, starting, twice_kinetic
+from hunting.linkages import (
+    ANGLES,
+    FOUR_BAR,
+    MASSES,
+    PINS,
+    InPlane,
+    ahead,
+    coupled,
+    on_axis,
+    on_branch,
+    potential,
+    rod,
+    starting,
+    twice_kinetic,
+)
 from hunting.reference import along, integrate
 
 
@@ -24,7 +40,9 @@ class SliderCrank(InPlane):
         }
 
     def geometric_constraints(self, pose):
-        return {"slide": jj.pin(pose["rod"].place(on_axis(0.5 * self.r2)), pose["slider"].position, axes="xy")}
+        return {
+            "slide": jj.pin(pose["rod"].place(on_axis(0.5 * self.r2)), pose["slider"].position, axes="xy")
+        }
 
 
 def _still(n, s, space=np):
@@ -40,7 +58,11 @@ def _longer(n, s, space=np):
     r, l = n.r1, n.r2
     b = -space.arcsin(r / l * space.sin(s))
     slope = -r * space.cos(s) / (l * space.cos(b))
-    return (s, b, r * space.cos(s) + l * space.cos(b)), (1.0, slope, -r * space.sin(s) - l * space.sin(b) * slope)
+    return (s, b, r * space.cos(s) + l * space.cos(b)), (
+        1.0,
+        slope,
+        -r * space.sin(s) - l * space.sin(b) * slope,
+    )
 
 
 def _slider_kinetic(n, q, dq):
@@ -55,12 +77,25 @@ def _slider_potential(n, q):
 def _slider(name, what, branch):
     def draw(r):
         length, turn = float(r.choice([0.5, 1.0, r.uniform(0.4, 1.6)])), float(r.choice([-1.0, 1.0]))
-        found = {"r1": length, "r2": length * (1.0 + 10 ** r.uniform(-3.0, 0.3) if branch is _longer else 1.0)}
+        found = {
+            "r1": length,
+            "r2": length * (1.0 + 10 ** r.uniform(-3.0, 0.3) if branch is _longer else 1.0),
+        }
         found |= drawn(**MASSES, s=(0.0, 1.3), s_rate=(2.0, 12.0), span=(0.5, 2.0))(r)
         return found | {"s": turn * found["s"], "s_rate": turn * found["s_rate"]}
 
     truth, start = on_branch(branch, _slider_kinetic, _slider_potential), starting(branch, "abx")
-    return Family(name, what, SliderCrank, draw, truth, "a b x a_rate b_rate x_rate", start, slack=10.0, fixed=("span", "r1", "r2"))
+    return Family(
+        name,
+        what,
+        SliderCrank,
+        draw,
+        truth,
+        "a b x a_rate b_rate x_rate",
+        start,
+        slack=10.0,
+        fixed=("span", "r1", "r2"),
+    )
 
 
 def _slopes(n, a, b, c, sin=np.sin):
@@ -96,7 +131,9 @@ def _crank_rocker(r):
     middle = short * r.uniform(1.3, 2.5), short * r.uniform(1.3, 2.5)
     long = max(sum(middle) - short - margin, *middle)  # short + long < sum of the others, by the margin
     lengths = {name: (*middle, long)[k] for name, k in zip(("r2", "r3", "d"), r.permutation(3), strict=True)}
-    return {"r1": short} | lengths | drawn(**MASSES, s=(-3.0, 3.0), s_rate=either(4.0, 12.0), span=(0.3, 1.2))(r)
+    return (
+        {"r1": short} | lengths | drawn(**MASSES, s=(-3.0, 3.0), s_rate=either(4.0, 12.0), span=(0.3, 1.2))(r)
+    )
 
 
 FAMILIES = (
@@ -104,7 +141,15 @@ FAMILIES = (
     _slider("slider-crank-still", "slider-crank with r = l, the slider at rest", _still),
     _slider("slider-crank", "slider-crank with l/r - 1 from 1e-3 on", _longer),
     *(
-        Family(name=name, what=what, draw=_crank_rocker, start=starting(_closed, pins=how is PINS), truth=_four_bar_truth, **FOUR_BAR, **how)
+        Family(
+            name=name,
+            what=what,
+            draw=_crank_rocker,
+            start=starting(_closed, pins=how is PINS),
+            truth=_four_bar_truth,
+            **FOUR_BAR,
+            **how,
+        )
         for name, what, how in (
             ("four-bar", "crank-rocker linkages, down to 1e-3 m from laying flat, in angles", ANGLES),
             ("four-bar-pins", "the same with pins", PINS),

@@ -30,7 +30,11 @@ def as_markdown(records: list[dict]) -> Iterator[str]:
     what = {f.name: f.what for f in FAMILIES}
     yield from (f"| family | what | {' | '.join(HEAD[1:])} |", "|---|---|" + "---|" * (len(HEAD) - 1))
     for row in rows(records):
-        yield f"| {row[0]} | {what.get(row[0], '')} | " + " | ".join(str(entry) if entry or k == 0 else "" for k, entry in enumerate(row[1:])) + " |"
+        yield (
+            f"| {row[0]} | {what.get(row[0], '')} | "
+            + " | ".join(str(entry) if entry or k == 0 else "" for k, entry in enumerate(row[1:]))
+            + " |"
+        )
 
 
 def losses(records: list[dict]) -> Iterator[str]:

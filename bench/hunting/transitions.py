@@ -29,7 +29,10 @@ class Switched(OnPlane):
         q, mode = motion.q, motion.modes.spring
         k = self.stiff + (self.soft - self.stiff) * mode
         x, y = (-k * q.x - self.cube * q.x**3 + jnp.cos(2 * motion.t), -3 * q.y + mode * q.x)
-        return (jj.generalized_force(motion, x_rate=x, y_rate=y), jj.gravity(motion, mode, jnp.array([1.0, 0.0, 0.0])))
+        return (
+            jj.generalized_force(motion, x_rate=x, y_rate=y),
+            jj.gravity(motion, mode, jnp.array([1.0, 0.0, 0.0])),
+        )
 
     def events(self, motion):
         q, u = motion.q, motion.u
@@ -53,14 +56,16 @@ def _followed(n, ts):
 
     def rates(t, y):
         k = n.soft if mode else n.stiff
-        return np.array([y[2], y[3], np.cos(2 * t) - k * y[0] - n.cube * y[0] ** 3 + mode, mode * y[0] - 3 * y[1]])
+        return np.array(
+            [y[2], y[3], np.cos(2 * t) - k * y[0] - n.cube * y[0] ** 3 + mode, mode * y[0] - 3 * y[1]]
+        )
 
     def values(t, y):
         over, under, side = _values(n, t, *y)
         return np.array([over, side, under if mode else 1.0])
 
     def falls(j):
-        fall = lambda t, y: values(t, y)[j] - 2e-10 * off[j]  # noqa: E731
+        fall = lambda t, y: values(t, y)[j] - 2e-10 * off[j]
         fall.terminal, fall.direction = True, 1 if off[j] else -1
         return fall
 
@@ -78,7 +83,17 @@ def _followed(n, ts):
             else:
                 mode = 0
             continue
-        run = solve_ivp(rates, (t, ts[-1]), y, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02, events=[*map(falls, range(3))], dense_output=True)
+        run = solve_ivp(
+            rates,
+            (t, ts[-1]),
+            y,
+            "DOP853",
+            rtol=1e-12,
+            atol=1e-13,
+            max_step=0.02,
+            events=[*map(falls, range(3))],
+            dense_output=True,
+        )
         t, y = run.t[-1], run.y[:, -1]
         found += [run.sol(at) for at in ts[len(found) :] if way * at <= way * t]
         if len(found) == len(ts):

@@ -1,4 +1,6 @@
-"""Uses that are no plain motions: times that do not go together, changed globals, rows that set in later, tiny coefficients."""
+"""Uses that are no plain motions: times that do not go together, changed globals, rows that set in later,
+tiny coefficients.
+"""
 
 import importlib
 import time
@@ -19,7 +21,9 @@ from hunting.reference import integrate
 
 @dataclass(frozen=True)
 class Single:
-    """A family whose cases are asked one by one: `ask(seed)` gives words, error over its bound, result code and what is said against it."""
+    """A family whose cases are asked one by one: `ask(seed)` gives words, error over its bound, result code
+    and what is said against it.
+    """
 
     name: str
     what: str
@@ -39,21 +43,27 @@ class Single:
             except Exception as problem:
                 asked, error = "", None
                 outcome, said = refusal(problem)
-            found.append(Record(self.name, seed, "float64", asked, outcome, error, said, time.process_time() - begin))
+            found.append(
+                Record(self.name, seed, "float64", asked, outcome, error, said, time.process_time() - begin)
+            )
         return found
 
 
 def in_way(way: str, one: Callable, lanes: Callable, given):
-    """The motion by `one` or, of lanes, the last; inside `jit` where the way says so, with what is given traced."""
+    """The motion by `one` or, of lanes, the last; inside `jit` where the way says so, with what is given
+    traced.
+    """
     call = (lambda given: jax.tree.map(lambda x: x[-1], lanes(given))) if "rollout" in way else one
     return jax.jit(call)(jax.tree.map(jnp.asarray, given)) if "jit" in way else call(given)
 
 
-# Times. ------------------------------------------------------------------------------------------------------------
+# Times. -----------------------------------------------------------------------------------------------------
 
 
 def _times(seed: int):
-    """Times outside of the span, against it, or before the start: refused, flagged, NaN, or right at every one of them."""
+    """Times outside of the span, against it, or before the start: refused, flagged, NaN, or right at every
+    one of them.
+    """
     r = np.random.default_rng([seed, 80])
     t0, way = float(r.choice([0.0, 0.8])), ("simulate", "rollout", "jit", "jit rollout")[seed % 4]
     ts = {0: [-0.5, 0.5, 1.0], 1: [0.5, 1.0], 2: [1.0, 0.5], 3: [0.2, 0.9, 1.6]}[seed // 4 % 4]
@@ -62,21 +72,22 @@ def _times(seed: int):
     start = {"x": r.uniform(0.5, 1.0), "x_rate": 0.0}
     asked = f"{way}, t0={t0}, t1={t1}, ts={ts}, x={start['x']!r}"
     many = {name: np.full(2, value) for name, value in start.items()}
-    one = lambda ts: jj.simulate(scene, start, ts=ts, **options)  # noqa: E731
+    one = lambda ts: jj.simulate(scene, start, ts=ts, **options)
     motion = in_way(way, one, lambda ts: jj.rollout(scene, many, ts=ts, **options).lanes, np.array(ts))
     x = np.asarray(motion.q[:, 0])
     error = np.nanmax(np.abs(x - start["x"] * np.cos(2 * (np.array(ts) - t0))), initial=0.0)
     return asked, np.inf if np.any(np.isnan(x)) else error / 1e-6, int(motion.result), ""
 
 
-# What a scene reads besides its numbers. ---------------------------------------------------------------------------
+# What a scene reads besides its numbers. --------------------------------------------------------------------
 
 NOTEBOOK = """
 class Spring(Oscillator):
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-({read}) * motion.q.x),)
 """
-# what a cell of a notebook says, what the method reads, and what a later cell says; "" where the first is refused already
+# what a cell of a notebook says, what the method reads, and what a later cell says; "" where the first is
+# refused already
 READ = {
     "number": ("k = 1.0", "k", "k = {k}"),
     "integer": ("k = 1", "k", "k = {k}"),
@@ -100,25 +111,40 @@ READ = {
 
 
 def _changed(seed: int):
-    """The motion after a change of what a method reads is that of the new value, or what it reads is refused where it has state."""
+    """The motion after a change of what a method reads is that of the new value, or what it reads is refused
+    where it has state.
+    """
     r = np.random.default_rng([seed, 81])
     kind, way = list(READ)[seed % len(READ)], ("simulate", "rollout")[seed // len(READ) % 2]
     k, (first, read, later) = r.uniform(2.0, 9.0), READ[kind]
     cell = {"Oscillator": Oscillator, "jj": jj, "np": np, "jnp": jnp, "__name__": "__main__"}
-    cell |= {name: importlib.import_module(name) for name in ("argparse", "array", "collections", "contextvars", "types")}
+    cell |= {
+        name: importlib.import_module(name)
+        for name in ("argparse", "array", "collections", "contextvars", "types")
+    }
     exec(first.format(k=1.0), cell)
     exec(NOTEBOOK.format(read=read), cell)
 
     def run():
-        one = lambda ts: jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=ts)  # noqa: E731
-        return in_way(way, one, lambda ts: jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=ts).lanes, [1.0])
+        one = lambda ts: jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=ts)
+        return in_way(
+            way,
+            one,
+            lambda ts: jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=ts).lanes,
+            [1.0],
+        )
 
     motion = run()
     if not later:
         return f"{way}, {kind}", np.inf, int(motion.result), ""
     exec(later.format(k=repr(k)), cell)
     motion = run()
-    return f"{way}, {kind}, k={k!r}", abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5, int(motion.result), warnings_of(motion)
+    return (
+        f"{way}, {kind}, k={k!r}",
+        abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5,
+        int(motion.result),
+        warnings_of(motion),
+    )
 
 
 def warnings_of(motion) -> str:
@@ -126,11 +152,13 @@ def warnings_of(motion) -> str:
     return "; ".join(jax.tree.map(jnp.asarray, motion).warnings)
 
 
-# Rows that set in later. -------------------------------------------------------------------------------------------
+# Rows that set in later. ------------------------------------------------------------------------------------
 
 
 class LateRow(OnPlane):
-    """Until `late` s the second row says no more than the first; then it holds the speed along y, against a force that sets in with it."""
+    """Until `late` s the second row says no more than the first; then it holds the speed along y, against a
+    force that sets in with it.
+    """
 
     late: object = jj.parameter(1.0)
     speed: object = jj.parameter(0.3)
@@ -141,7 +169,10 @@ class LateRow(OnPlane):
 
     def velocity_constraints(self, motion):
         u = motion.u
-        return {"first": u.x_rate - 1.0, "second": u.x_rate - 1.0 + self.passed(motion) * (u.y_rate - self.speed)}
+        return {
+            "first": u.x_rate - 1.0,
+            "second": u.x_rate - 1.0 + self.passed(motion) * (u.y_rate - self.speed),
+        }
 
     def loads(self, motion):
         return (jj.generalized_force(motion, y_rate=4.0 * jnp.maximum(motion.t - self.late, 0.0)),)
@@ -161,7 +192,7 @@ LATE = {
 }  # fmt: skip
 
 
-# Tiny and huge coefficients. ---------------------------------------------------------------------------------------
+# Tiny and huge coefficients. --------------------------------------------------------------------------------
 
 
 class TinyForce(OnLine):
@@ -191,7 +222,12 @@ def _pushed(push):
     return lambda n, ts: integrate(lambda _, x, v: (v, push(x)), (n.x, n.x_rate), ts)
 
 
-ALONE = {"names": "x x_rate", "cases": 20, "single": False, "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap"))}
+ALONE = {
+    "names": "x x_rate",
+    "cases": 20,
+    "single": False,
+    "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap")),
+}
 FAMILIES = (
     Single("times", "times before the start, against the span or beyond it", _times, 32),
     Single("changed", "what methods read besides their arguments: numbers and functions that change between calls, and objects with state", _changed, 36),

@@ -1,4 +1,6 @@
-"""Batches of 1, 100 and 10,000 trajectories with starts that differ by 5 %: time per trajectory against the largest error over the first 100 lanes."""
+"""Batches of 1, 100 and 10,000 trajectories with starts that differ by 5 %: time per trajectory against the
+largest error over the first 100 lanes.
+"""
 
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -30,12 +32,21 @@ LONGEST = 60.0  # s: a method that would take longer than that for a batch is le
 
 def starts(problem: Problem, lanes: int) -> np.ndarray:
     """Minimal states (lanes, states), every number of the start changed by 5 % (standard deviation)."""
-    return problem.minimal_start * (1 + SCATTER * np.random.default_rng(SEED).normal(size=(max(lanes, JUDGED), len(problem.minimal_start))))[:lanes]
+    return (
+        problem.minimal_start
+        * (
+            1
+            + SCATTER
+            * np.random.default_rng(SEED).normal(size=(max(lanes, JUDGED), len(problem.minimal_start)))
+        )[:lanes]
+    )
 
 
 def by_rollout(problem: Problem, solver=None) -> Callable:
     """`rollout` under `jit`, by Dopri8 unless said; the consistent starts are given."""
-    run = final_states(problem.scene, problem.end, solver=solver or diffrax.Dopri8(), events=False, max_steps=MAX_STEPS)
+    run = final_states(
+        problem.scene, problem.end, solver=solver or diffrax.Dopri8(), events=False, max_steps=MAX_STEPS
+    )
 
     def prepared(y):
         starts = starts_at(problem.scene, y)
@@ -58,15 +69,19 @@ def by_series(problem: Problem) -> Callable:
 def by_vmap(problem: Problem) -> Callable:
     """diffrax under `vmap` on the equations by hand."""
     rates = peer_diffrax.rates_by_hand(problem)
-    one = lambda tolerance, y: peer_diffrax.final(rates, problem.end, diffrax.Dopri8(), tolerance, y)[0]  # noqa: E731
+    one = lambda tolerance, y: peer_diffrax.final(rates, problem.end, diffrax.Dopri8(), tolerance, y)[0]
     compiled = jax.jit(jax.vmap(one, in_axes=(None, 0)))
     return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
 
 
 def in_blocks(problem: Problem) -> Callable:
-    """diffrax on the equations by hand, states as tuples of scalars, eight lanes side by side, one block of them after another."""
+    """diffrax on the equations by hand, states as tuples of scalars, eight lanes side by side, one block of
+    them after another.
+    """
     known = peer_diffrax.rates_by_hand(problem, stacked=False)
-    one = lambda tolerance, y: jnp.stack(peer_diffrax.final(known, problem.end, diffrax.Dopri8(), tolerance, tuple(y))[0])  # noqa: E731
+    one = lambda tolerance, y: jnp.stack(
+        peer_diffrax.final(known, problem.end, diffrax.Dopri8(), tolerance, tuple(y))[0]
+    )
     compiled = jax.jit(lambda tolerance, y: jax.lax.map(lambda y: one(tolerance, y), y, batch_size=SIMD))
     return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
 
@@ -81,7 +96,11 @@ def by_heyoka(system: Callable[[Problem], list]) -> Callable[[Problem], Callable
     """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone."""
 
     def of(problem: Problem) -> Callable:
-        made = cache(lambda tolerance, width: heyoka_lowered.final_states(system(problem), problem.end, tolerance, width))
+        made = cache(
+            lambda tolerance, width: heyoka_lowered.final_states(
+                system(problem), problem.end, tolerance, width
+            )
+        )
 
         def prepared(y):
             width = SIMD if len(y) >= SIMD else 1
@@ -105,7 +124,9 @@ def methods(problem: Problem) -> list[tuple[str, Callable, tuple[str, ...]]]:
     ]
     if heyoka_lowered.heyoka is not None:
         if problem.name == "tilting-disc":
-            found.append(("heyoka, equations by hand", by_heyoka(lambda problem: heyoka_disc.system()), ("heyoka",)))
+            found.append(
+                ("heyoka, equations by hand", by_heyoka(lambda problem: heyoka_disc.system()), ("heyoka",))
+            )
         found.append(("heyoka, the engine's equations", by_heyoka(peer_heyoka.system), ("heyoka",)))
     return found
 
@@ -130,7 +151,10 @@ def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Itera
                 found = run(tolerance)
                 error = float(np.max(np.abs(found[:JUDGED] - expected[: len(found)])))
                 each = fastest(lambda run=run, tolerance=tolerance: run(tolerance)) / size
-                say(f"  batch {size:6d}  {method:32s} {tolerance:8.1e}  error {error:9.1e}  {1e3 * each:9.4f} ms per trajectory")
+                say(
+                    f"  batch {size:6d}  {method:32s} {tolerance:8.1e}  error {error:9.1e}  {1e3 * each:9.4f}"
+                    " ms per trajectory"
+                )
                 yield records.record(
                     problem=problem.name, method=method, kind=kind, setting=tolerance, setting_unit="tolerance", batch=size, error=error, seconds=each,
                     note=f"starts scattered by 5 %; largest error over {min(size, JUDGED)} lanes", versions=records.versions(*packages),

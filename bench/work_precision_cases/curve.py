@@ -35,7 +35,9 @@ class NotApplicable(Exception):
 
 @dataclass(frozen=True)
 class Curve:
-    """A method on a problem. `prepare` may raise `NotApplicable` or `ImportError`, whose text is printed and recorded."""
+    """A method on a problem. `prepare` may raise `NotApplicable` or `ImportError`, whose text is printed and
+    recorded.
+    """
 
     method: str
     settings: tuple[float, ...]

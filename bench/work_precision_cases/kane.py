@@ -1,6 +1,8 @@
-"""Two scenes in SymPy's `KanesMethod`, in speeds that leave no row over, as an expert of it would choose them.
+"""Two scenes in SymPy's `KanesMethod`, in speeds that leave no row over, as an expert of it would choose
+them.
 
-The equations come as `M(q) udot = f(q, u)` with `qdot(q, u)`. Source of the method: T. R. Kane and D. A. Levinson, Dynamics (1985).
+The equations come as `M(q) udot = f(q, u)` with `qdot(q, u)`. Source of the method: T. R. Kane and D. A.
+Levinson, Dynamics (1985).
 """
 
 from collections.abc import Callable
@@ -17,7 +19,9 @@ except ImportError:
 
 @dataclass(frozen=True)
 class KaneEquations:
-    """Expressions of SymPy, numbers of the parameters, and the change of speeds from and to the engine's minimal state."""
+    """Expressions of SymPy, numbers of the parameters, and the change of speeds from and to the engine's
+    minimal state.
+    """
 
     q: list
     u: list
@@ -37,7 +41,9 @@ def _formed(frame, angles, speeds, kinematic, bodies, loads):
 
 
 def tilting_disc(scene) -> KaneEquations:
-    """Speeds: components of the disc's angular velocity along the heading, the axle and the radius to the contact."""
+    """Speeds: components of the disc's angular velocity along the heading, the axle and the radius to the
+    contact.
+    """
     x, y, yaw, lean, spin, w1, w2, w3 = me.dynamicsymbols("x y yaw lean spin w1 w2 w3")
     m, a, g = sp.symbols("m a g", positive=True)
     space = me.ReferenceFrame("S")
@@ -50,22 +56,41 @@ def tilting_disc(scene) -> KaneEquations:
     contact.set_vel(space, 0)
     centre = contact.locatenew("C", a * tilted.z)
     centre.v2pt_theory(contact, space, wheel)
-    body = me.RigidBody("disc", centre, wheel, m, (me.inertia(tilted, m * a**2 / 4, m * a**2 / 2, m * a**2 / 4), centre))
+    body = me.RigidBody(
+        "disc", centre, wheel, m, (me.inertia(tilted, m * a**2 / 4, m * a**2 / 2, m * a**2 / 4), centre)
+    )
     kinematic = [me.dot(wheel.ang_vel_in(space) - by_rates, axis) for axis in tilted]
-    kane, rates = _formed(space, [yaw, lean, spin], [w1, w2, w3], kinematic, [body], [(centre, -m * g * space.z)])
+    kane, rates = _formed(
+        space, [yaw, lean, spin], [w1, w2, w3], kinematic, [body], [(centre, -m * g * space.z)]
+    )
     forward = a * rates[spin.diff()]
-    qdot = [forward * sp.cos(yaw), forward * sp.sin(yaw), *(rates[angle.diff()] for angle in (yaw, lean, spin))]
+    qdot = [
+        forward * sp.cos(yaw),
+        forward * sp.sin(yaw),
+        *(rates[angle.diff()] for angle in (yaw, lean, spin)),
+    ]
     numbers = {m: float(scene.mass), a: float(scene.radius), g: float(scene.gravity)}
 
     def from_minimal(s):
         yaw_rate, lean_rate, spin_rate = s[5:]
-        return np.concatenate([s[:5], [lean_rate, spin_rate + yaw_rate * np.sin(s[3]), yaw_rate * np.cos(s[3])]])
+        return np.concatenate(
+            [s[:5], [lean_rate, spin_rate + yaw_rate * np.sin(s[3]), yaw_rate * np.cos(s[3])]]
+        )
 
     def to_minimal(s):
         yaw_rate = s[7] / np.cos(s[3])
         return np.concatenate([s[:5], [yaw_rate, s[5], s[6] - yaw_rate * np.sin(s[3])]])
 
-    return KaneEquations([x, y, yaw, lean, spin], [w1, w2, w3], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal)
+    return KaneEquations(
+        [x, y, yaw, lean, spin],
+        [w1, w2, w3],
+        qdot,
+        kane.mass_matrix,
+        kane.forcing,
+        numbers,
+        from_minimal,
+        to_minimal,
+    )
 
 
 def chaplygin_sleigh(scene) -> KaneEquations:
@@ -94,7 +119,9 @@ def chaplygin_sleigh(scene) -> KaneEquations:
         c, s = np.cos(z[2]), np.sin(z[2])
         return np.array([*z[:3], z[3] * c - offset * z[4] * s, z[3] * s + offset * z[4] * c])
 
-    return KaneEquations([x, y, turn], [v, w], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal)
+    return KaneEquations(
+        [x, y, turn], [v, w], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal
+    )
 
 
 SCENES = {"tilting-disc": tilting_disc, "chaplygin-sleigh": chaplygin_sleigh}

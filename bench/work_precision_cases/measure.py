@@ -14,7 +14,9 @@ MOST_REPEATS, LONGEST = 25, 8.0  # s: after a run as long as that, smaller setti
 
 
 def fastest(run: Callable[[], object], seconds: float = SECONDS_PER_POINT) -> float:
-    """Wall time of the fastest of some warm runs, s: as many as fit in `seconds`, at least two, at most 25; one where a run takes longer than that."""
+    """Wall time of the fastest of some warm runs, s: as many as fit in `seconds`, at least two, at most 25;
+    one where a run takes longer than that.
+    """
     laps: list[float] = []
     while (len(laps) < MOST_REPEATS and sum(laps) < seconds) or (len(laps) < 2 and laps[0] < seconds):
         begin = time.perf_counter()
@@ -27,11 +29,15 @@ def error_of(problem: Problem, solved: Solved) -> float | None:
     """None where the run failed."""
     if solved.failed:
         return None
-    return problem.error(*(problem.completed(jnp.asarray(solved.y)) if solved.y is not None else (solved.q, solved.u)))
+    return problem.error(
+        *(problem.completed(jnp.asarray(solved.y)) if solved.y is not None else (solved.q, solved.u))
+    )
 
 
 def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[list[dict], Prepared | None]:
-    """Records of a curve, and the method ready to run again; none where it cannot be run, with the reason said."""
+    """Records of a curve, and the method ready to run again; none where it cannot be run, with the reason
+    said.
+    """
     try:
         ready = curve.prepare(problem)
     except (NotApplicable, ImportError) as reason:
@@ -43,7 +49,10 @@ def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[
         try:
             raw = ready.run(setting)
         except Exception as failure:  # a peer that breaks down is told, and the others go on
-            say(f"  {curve.method}, {setting:.1e}: {type(failure).__name__}: {str(failure).splitlines()[0] if str(failure) else ''}")
+            say(
+                f"  {curve.method}, {setting:.1e}: {type(failure).__name__}:"
+                f" {str(failure).splitlines()[0] if str(failure) else ''}"
+            )
             return found, None
         first = time.perf_counter() - begin
         solved = ready.read(raw)

@@ -1,4 +1,6 @@
-"""The engine: explicit solvers and Taylor series, as compiled under the user's `jit`, and `simulate` as most people would call it."""
+"""The engine: explicit solvers and Taylor series, as compiled under the user's `jit`, and `simulate` as most
+people would call it.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -31,7 +33,17 @@ def _by_simulate(solver, **options) -> Callable[[Problem], Prepared]:
 
         @jax.jit
         def compiled(setting, start):
-            motion = jj.simulate(scene, start, ts=ends, events=False, max_steps=MAX_STEPS, solver=solver, rtol=setting, atol=setting, **options)
+            motion = jj.simulate(
+                scene,
+                start,
+                ts=ends,
+                events=False,
+                max_steps=MAX_STEPS,
+                solver=solver,
+                rtol=setting,
+                atol=setting,
+                **options,
+            )
             return motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result
 
         start = dataclasses.replace(problem.state)
@@ -46,7 +58,9 @@ def _by_simulate(solver, **options) -> Callable[[Problem], Prepared]:
 
 def _by_series(problem: Problem) -> Prepared:
     """As `_by_simulate`, by Taylor series of the order for each tolerance."""
-    prepared = {TOLERANCES[-1]: _by_simulate(jj.Taylor(order_for(TOLERANCES[-1])))(problem)}  # refused where the series are too long
+    prepared = {
+        TOLERANCES[-1]: _by_simulate(jj.Taylor(order_for(TOLERANCES[-1])))(problem)
+    }  # refused where the series are too long
 
     def run(tolerance: float):
         if tolerance not in prepared:
@@ -57,14 +71,18 @@ def _by_series(problem: Problem) -> Prepared:
 
 
 def as_it_comes(problem: Problem) -> Prepared:
-    """`simulate` called from Python with nothing chosen but the tolerance, one saved time; its Python is part of the time.
+    """`simulate` called from Python with nothing chosen but the tolerance, one saved time; its Python is part
+    of the time.
 
-    The engine compiles some of what precedes the motion only after several calls: hence the calls before anything is timed.
+    The engine compiles some of what precedes the motion only after several calls: hence the calls before
+    anything is timed.
     """
 
     def run(tolerance: float):
         motion = jj.simulate(problem.scene, problem.state, ts=[problem.end], rtol=tolerance, atol=tolerance)
-        return jax.block_until_ready((motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result))
+        return jax.block_until_ready(
+            (motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result)
+        )
 
     for _ in range(10):
         run(TOLERANCES[0])

@@ -1,7 +1,9 @@
-"""Equations by hand in C: Dormand and Prince's method of order 8 as one compiled loop over steps, for one motion or for eight side by side.
+"""Equations by hand in C: Dormand and Prince's method of order 8 as one compiled loop over steps, for one
+motion or for eight side by side.
 
-What an expert gets who writes everything for one problem and needs no derivatives: the measure of what machine code costs. Its steps are those of the engine's
-Dopri8 without projection: the same tableau, norm and control, each lane with steps of its own; lanes that have ended wait for the others of their block.
+What an expert gets who writes everything for one problem and needs no derivatives: the measure of what
+machine code costs. Its steps are those of the engine's Dopri8 without projection: the same tableau, norm and
+control, each lane with steps of its own; lanes that have ended wait for the others of their block.
 """
 
 import ctypes
@@ -103,34 +105,55 @@ long solve(double tolerance, double end, long lanes, const double *start, double
 
 
 def _rates(problem: Problem, side_by_side: int) -> tuple[int, str]:
-    """How many states there are, and `rates(y, f)` of all lanes: each common subexpression once, parameters as numbers."""
+    """How many states there are, and `rates(y, f)` of all lanes: each common subexpression once, parameters
+    as numbers.
+    """
     sp, known = kane.sp, HAND_DERIVED[problem.name]
     if sp is None:
         raise ImportError(MISSING)
     y = sp.symbols(f"y:{len(known.coordinates) + len(known.speeds)}")
     parameters = {name: sp.Float(float(getattr(problem.scene, name)), 17) for name in known.parameters}
     xp = SimpleNamespace(sin=sp.sin, cos=sp.cos, zeros_like=lambda x: sp.Integer(0))
-    qdot, vdot = known.rates(parameters, sp.Symbol("t"), y[: len(known.coordinates)], y[len(known.coordinates) :], xp=xp)
+    qdot, vdot = known.rates(
+        parameters, sp.Symbol("t"), y[: len(known.coordinates)], y[len(known.coordinates) :], xp=xp
+    )
     found = [sp.sympify(x) for x in (*qdot, *vdot)]
     # sines apart from cosines: GCC makes one call of both, for which it has no vectors
-    waves = sorted(set().union(*(x.atoms(sp.sin, sp.cos) for x in found)), key=str) if side_by_side > 1 else []
+    waves = (
+        sorted(set().union(*(x.atoms(sp.sin, sp.cos) for x in found)), key=str) if side_by_side > 1 else []
+    )
     names = dict(zip(waves, sp.symbols(f"w:{len(waves)}"), strict=True))
     shared, found = sp.cse([x.subs(names) for x in found], sp.numbered_symbols("s"))
-    states = {str(x): f"y[{i} * W + l]" for i, x in enumerate(y)} | {str(w): f"{w}[l]" for w in names.values()}
-    code = lambda x: re.sub(r"\b[yw]\d+\b", lambda name: states[name[0]], sp.ccode(x))  # noqa: E731
+    states = {str(x): f"y[{i} * W + l]" for i, x in enumerate(y)} | {
+        str(w): f"{w}[l]" for w in names.values()
+    }
+    code = lambda x: re.sub(r"\b[yw]\d+\b", lambda name: states[name[0]], sp.ccode(x))
     lines = [f"double {name}[W];\n    EACH_LANE {name}[l] = {code(wave)};" for wave, name in names.items()]
-    inner = [f"const double {name} = {code(value)};" for name, value in shared] + [f"f[{i} * W + l] = {code(value)};" for i, value in enumerate(found)]
+    inner = [f"const double {name} = {code(value)};" for name, value in shared] + [
+        f"f[{i} * W + l] = {code(value)};" for i, value in enumerate(found)
+    ]
     lines.append("EACH_LANE {\n        " + "\n        ".join(inner) + "\n    }")
-    return len(y), "static void rates(const double *restrict y, double *restrict f) {\n    " + "\n    ".join(lines) + "\n}\n"
+    return (
+        len(y),
+        "static void rates(const double *restrict y, double *restrict f) {\n    "
+        + "\n    ".join(lines)
+        + "\n}\n",
+    )
 
 
 def source(problem: Problem, side_by_side: int) -> str:
     """The whole of it."""
     (size, rates), stages = _rates(problem, side_by_side), DOPRI8.needed
-    row = lambda numbers: "{" + ", ".join(repr(float(x)) for x in numbers) + "}"  # noqa: E731
+    row = lambda numbers: "{" + ", ".join(repr(float(x)) for x in numbers) + "}"
     A = ", ".join(row(DOPRI8.A[i, :stages]) for i in range(stages))
-    tables = f"static const double A[S][S] = {{{A}}}, B[S] = {row(DOPRI8.b[:stages])}, E[S] = {row(DOPRI8.b_error[:stages])};\n"
-    return f"#include <math.h>\nenum {{ N = {size}, W = {side_by_side}, S = {stages} }};\n{tables}{MACROS}{rates}{LOOP}"
+    tables = (
+        f"static const double A[S][S] = {{{A}}}, B[S] = {row(DOPRI8.b[:stages])}, E[S] ="
+        f" {row(DOPRI8.b_error[:stages])};\n"
+    )
+    return (
+        f"#include <math.h>\nenum {{ N = {size}, W = {side_by_side}, S = {stages}"
+        f" }};\n{tables}{MACROS}{rates}{LOOP}"
+    )
 
 
 def library_of(source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
@@ -141,17 +164,24 @@ def library_of(source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
         text, library = Path(folder) / "source.c", Path(folder) / "library.so"
         text.write_text(source)
-        done = subprocess.run([compiler, *flags, "-o", str(library), str(text), "-lm"], capture_output=True, text=True)
+        done = subprocess.run(
+            [compiler, *flags, "-o", str(library), str(text), "-lm"], capture_output=True, text=True
+        )
         if done.returncode != 0:
             raise NotApplicable(f"{compiler} does not compile it: {done.stderr.strip().splitlines()[-1]}")
         return ctypes.CDLL(str(library))
 
 
 def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray], tuple[np.ndarray, int]]:
-    """A function of a tolerance and starts, (lanes, states), that returns the states at the end, and how many steps were tried."""
+    """A function of a tolerance and starts, (lanes, states), that returns the states at the end, and how many
+    steps were tried.
+    """
     flags = (*FLAGS, WIDE) if platform.machine() in ("x86_64", "AMD64") else FLAGS
     solve = library_of(source(problem, side_by_side), flags).solve
-    solve.argtypes, solve.restype = [ctypes.c_double, ctypes.c_double, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
+    solve.argtypes, solve.restype = (
+        [ctypes.c_double, ctypes.c_double, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p],
+        ctypes.c_long,
+    )
 
     def run(tolerance: float, starts: np.ndarray) -> tuple[np.ndarray, int]:
         starts = np.ascontiguousarray(starts, float)
@@ -165,7 +195,9 @@ def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray
 def _alone(problem: Problem) -> Prepared:
     run, start = compiled(problem, 1), problem.minimal_start[None]
 
-    return Prepared(lambda tolerance: run(tolerance, start), lambda raw: Solved(y=raw[0][0], steps=float(raw[1])))
+    return Prepared(
+        lambda tolerance: run(tolerance, start), lambda raw: Solved(y=raw[0][0], steps=float(raw[1]))
+    )
 
 
 def curves(problem: Problem) -> list[Curve]:

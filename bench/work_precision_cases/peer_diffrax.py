@@ -14,7 +14,9 @@ BY_HAND = ("tilting-disc", "chaplygin-sleigh")
 
 
 def rates_by_hand(problem: Problem, stacked: bool = True):
-    """`(t, y) -> dy/dt` of the minimal state, from `baselines/hand_derived.py`; `stacked`: in a flat array, otherwise in a tuple of scalars."""
+    """`(t, y) -> dy/dt` of the minimal state, from `baselines/hand_derived.py`; `stacked`: in a flat array,
+    otherwise in a tuple of scalars.
+    """
     known, scene = HAND_DERIVED[problem.name], problem.scene
     parameters = {name: float(getattr(scene, name)) for name in known.parameters}
     n = len(known.coordinates)
@@ -46,7 +48,7 @@ def by_hand(problem: Problem) -> Prepared:
     """The minimal state in a flat array."""
     rates, solver, y0 = rates_by_hand(problem), diffrax.Dopri8(), jnp.asarray(problem.minimal_start)
     compiled = jax.jit(lambda tolerance, y: final(rates, problem.end, solver, tolerance, y))
-    read = lambda raw: Solved(y=np.asarray(raw[0]), steps=float(raw[1]))  # noqa: E731
+    read = lambda raw: Solved(y=np.asarray(raw[0]), steps=float(raw[1]))
     return Prepared(lambda tolerance: jax.block_until_ready(compiled(jnp.asarray(tolerance), y0)), read)
 
 

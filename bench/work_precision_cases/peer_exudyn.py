@@ -1,6 +1,8 @@
-"""Exudyn's rolling disc: as a joint (no slip, implicit integrators of index-3 systems) and as a penalty connector.
+"""Exudyn's rolling disc: as a joint (no slip, implicit integrators of index-3 systems) and as a penalty
+connector.
 
-The version without range checks is asked for. Source: J. Gerstmayr, Multibody Syst. Dyn. 60 (2024) 553 (Exudyn).
+The version without range checks is asked for. Source: J. Gerstmayr, Multibody Syst. Dyn. 60 (2024) 553
+(Exudyn).
 """
 
 import sys
@@ -23,8 +25,14 @@ except ImportError:
 MISSING = "exudyn cannot be imported, so it is not measured; `pip install exudyn`"
 STEPS = (1e-2, 2.5e-3, 1e-3, 2.5e-4, 1e-4, 5e-5)  # s
 PENALTY_STEPS = (2.5e-3, 1e-3, 5e-4)
-# Stiffness (N/m), damping (N s/m), friction coefficient, and the speed up to which friction is viscous (m/s): of those tried, the smallest error.
-PENALTY = {"contactStiffness": 5e5, "contactDamping": 50.0, "dryFriction": [1e3, 1e3], "dryFrictionProportionalZone": 1e-3}
+# Stiffness (N/m), damping (N s/m), friction coefficient, and the speed up to which friction is viscous (m/s):
+# of those tried, the smallest error.
+PENALTY = {
+    "contactStiffness": 5e5,
+    "contactDamping": 50.0,
+    "dryFriction": [1e3, 1e3],
+    "dryFrictionProportionalZone": 1e-3,
+}
 
 
 def _system(problem: Problem, penalty: bool):
@@ -32,7 +40,9 @@ def _system(problem: Problem, penalty: bool):
     system = container.AddSystem()
     scene, at_start = problem.scene, disc_body.start(float(problem.scene.radius), problem.minimal_start)
     m, a = float(scene.mass), float(scene.radius)
-    on_ground = system.AddMarker(items.MarkerBodyRigid(bodyNumber=system.AddObject(items.ObjectGround()), localPosition=[0, 0, 0]))
+    on_ground = system.AddMarker(
+        items.MarkerBodyRigid(bodyNumber=system.AddObject(items.ObjectGround()), localPosition=[0, 0, 0])
+    )
     body = system.CreateRigidBody(
         inertia=RigidBodyInertia(mass=m, inertiaTensor=m * a**2 * np.diag([0.25, 0.5, 0.25]), com=[0, 0, 0]),
         referencePosition=at_start.centre.tolist(),
@@ -45,7 +55,11 @@ def _system(problem: Problem, penalty: bool):
     rolling = {"markerNumbers": [on_ground, on_disc], "discRadius": a, "discAxis": [0, 1, 0]}
     if penalty:
         node = system.AddNode(items.NodeGenericData(initialCoordinates=[0, 0, 0], numberOfDataCoordinates=3))
-        system.AddObject(items.ObjectConnectorRollingDiscPenalty(**rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY))
+        system.AddObject(
+            items.ObjectConnectorRollingDiscPenalty(
+                **rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY
+            )
+        )
     else:
         system.AddObject(items.ObjectJointRollingDisc(**rolling))
     system.Assemble()
@@ -91,7 +105,12 @@ def _by_exudyn(solver: str, penalty: bool = False):
             )
             body = disc_body.Body(position, rotation.reshape(3, 3), velocity, omega)
             q, u = disc_body.state(float(problem.scene.radius), body, problem.truth.values)
-            return Solved(q=q, u=u, steps=float(round(problem.end / step)), failed="" if np.all(np.isfinite(q)) else "not finite")
+            return Solved(
+                q=q,
+                u=u,
+                steps=float(round(problem.end / step)),
+                failed="" if np.all(np.isfinite(q)) else "not finite",
+            )
 
         prepared = Prepared(run, read)
         prepared.run.__dict__["keeps"] = container  # the system dies with its container
@@ -109,5 +128,8 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         "joint, generalized-alpha": (STEPS, "GeneralizedAlpha", False),
         "penalty, generalized-alpha": (PENALTY_STEPS, "GeneralizedAlpha", True),
     }
-    found = [Curve(f"Exudyn, {name}", steps, _by_exudyn(*way), ("exudyn",), setting_unit="step (s)") for name, (steps, *way) in ways.items()]
+    found = [
+        Curve(f"Exudyn, {name}", steps, _by_exudyn(*way), ("exudyn",), setting_unit="step (s)")
+        for name, (steps, *way) in ways.items()
+    ]
     return found[1:2] if quick else found

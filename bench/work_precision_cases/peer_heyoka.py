@@ -1,6 +1,8 @@
-"""heyoka: Taylor series, compiled to machine code, on equations that the engine prints (`jj.lower(scene).python_source()`); on the disc, by hand too.
+"""heyoka: Taylor series, compiled to machine code, on equations that the engine prints
+(`jj.lower(scene).python_source()`); on the disc, by hand too.
 
-Also the second computation behind most references, in extended precision. Source: F. Biscani and D. Izzo, Mon. Not. R. Astron. Soc. 504 (2021) 2614.
+Also the second computation behind most references, in extended precision. Source: F. Biscani and D. Izzo,
+Mon. Not. R. Astron. Soc. 504 (2021) 2614.
 """
 
 import functools
@@ -16,12 +18,19 @@ from work_precision_cases.problem import Problem
 
 TOLERANCES = tuple(10.0**-k for k in range(4, 16, 2))
 FEWER = TOLERANCES[::2]  # every tolerance is compiled anew
-LARGE, HUGE = 100, 1000  # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes minutes
+LARGE, HUGE = (
+    100,
+    1000,
+    # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes
+    # minutes
+)
 
 
 @functools.cache
 def states(problem: Problem) -> tuple[np.ndarray, list[int]]:
-    """Start of the program's state (all speeds, where rows are kept by multipliers), and where in it the minimal state is."""
+    """Start of the program's state (all speeds, where rows are kept by multipliers), and where in it the
+    minimal state is.
+    """
     names = heyoka_lowered.names(problem.scene)
     start = heyoka_lowered.states(problem.scene, problem.state.q[None], problem.state.u[None])[0]
     return start, [names.index(name) for name in problem.minimal_names]
@@ -33,19 +42,27 @@ def system(problem: Problem) -> list:
 
 
 def extended(problem: Problem) -> dict[str, float]:
-    """Coordinates and speeds at the end, integrated in long double with a tolerance of 1e-18; the speeds that are not integrated follow from the rows."""
+    """Coordinates and speeds at the end, integrated in long double with a tolerance of 1e-18; the speeds that
+    are not integrated follow from the rows.
+    """
     start, minimal = states(problem)
-    q, u = problem.completed(jnp.asarray(heyoka_lowered.extended(system(problem), problem.end, start[None])[0, minimal]))
+    q, u = problem.completed(
+        jnp.asarray(heyoka_lowered.extended(system(problem), problem.end, start[None])[0, minimal])
+    )
     names = (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries)
     return dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True))
 
 
-def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool) -> Prepared:
+def _prepared(
+    problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool
+) -> Prepared:
     solvers: dict = {}
 
     def run(tolerance: float):
         if tolerance not in solvers:
-            solvers[tolerance] = heyoka.taylor_adaptive(equations, start.tolist(), tol=tolerance, fast_math=True, compact_mode=compact)
+            solvers[tolerance] = heyoka.taylor_adaptive(
+                equations, start.tolist(), tol=tolerance, fast_math=True, compact_mode=compact
+            )
         solver = solvers[tolerance]
         solver.time = 0.0
         solver.state[:] = start
@@ -57,7 +74,9 @@ def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: lis
 
 def on_engines_equations(problem: Problem) -> Prepared:
     """One integrator per tolerance."""
-    return _prepared(problem, system(problem), *states(problem), compact=jj.lower(problem.scene).operations >= HUGE)
+    return _prepared(
+        problem, system(problem), *states(problem), compact=jj.lower(problem.scene).operations >= HUGE
+    )
 
 
 def on_disc_by_hand(problem: Problem) -> Prepared:

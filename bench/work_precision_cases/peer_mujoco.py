@@ -1,7 +1,9 @@
-"""MuJoCo and MJX: the disc as a thin cylinder in contact with a plane, elliptic friction cone, friction coefficient 1.
+"""MuJoCo and MJX: the disc as a thin cylinder in contact with a plane, elliptic friction cone, friction
+coefficient 1.
 
-Contacts of MuJoCo are springs and regularised friction, so that a rolling disc sinks in and slips a little. Settings tried: time constants of the
-contact down to five steps, `impratio` 100, the noslip pass, both kinds of integrator. Source: E. Todorov, T. Erez and Y. Tassa, IROS (2012) 5026.
+Contacts of MuJoCo are springs and regularised friction, so that a rolling disc sinks in and slips a little.
+Settings tried: time constants of the contact down to five steps, `impratio` 100, the noslip pass, both kinds
+of integrator. Source: E. Todorov, T. Erez and Y. Tassa, IROS (2012) 5026.
 """
 
 import functools
@@ -31,12 +33,16 @@ STEPS = (1e-3, 3.125e-4, 1e-4, 5e-5, 2e-5)  # s
 def _model(problem: Problem, step: float, **settings):
     """The model, and its state at the start."""
     scene = problem.scene
-    made = elsewhere.rolling_disc(float(scene.mass), float(scene.radius), problem.minimal_start, step=step, **settings)
+    made = elsewhere.rolling_disc(
+        float(scene.mass), float(scene.radius), problem.minimal_start, step=step, **settings
+    )
     return mujoco.MjModel.from_xml_string(made.model), made.start
 
 
 def _solved(problem: Problem, position, velocity, steps: int) -> Solved:
-    q, u = disc_body.state(float(problem.scene.radius), elsewhere.body_of(position, velocity), problem.truth.values)
+    q, u = disc_body.state(
+        float(problem.scene.radius), elsewhere.body_of(position, velocity), problem.truth.values
+    )
     return Solved(q=q, u=u, steps=float(steps), failed="" if np.all(np.isfinite(q)) else "not finite")
 
 
@@ -97,7 +103,10 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         "MuJoCo, implicitfast, softer contact": {"constant": 20},
         "MuJoCo, RK4": {"integrator": "RK4"},
     }
-    steps, how = (STEPS[2], STEPS[-1]) if quick else STEPS, {"setting_unit": "step (s)", "note": "elliptic cone, thin cylinder in contact"}
+    steps, how = (
+        (STEPS[2], STEPS[-1]) if quick else STEPS,
+        {"setting_unit": "step (s)", "note": "elliptic cone, thin cylinder in contact"},
+    )
     found = [Curve(name, steps, _by_mujoco(**way), ("mujoco",), **how) for name, way in ways.items()]
     mjx_curve = Curve("MJX, Euler", STEPS[:3], _by_mjx, ("mujoco", "mujoco-mjx", "jax"), **how)
     return found[:1] if quick else [*found, mjx_curve]

@@ -1,7 +1,9 @@
-"""SymPy's `KanesMethod`, printed to C after common subexpressions, compiled by the system's compiler, integrated by SciPy.
+"""SymPy's `KanesMethod`, printed to C after common subexpressions, compiled by the system's compiler,
+integrated by SciPy.
 
-SciPy's integrators take a Python function and no `LowLevelCallable`, so each evaluation costs one call through ctypes. `scipy.integrate.ode` runs
-Hairer's DOP853 and ODEPACK's LSODA with their loops over steps compiled; `solve_ivp`, whose loop is Python, is measured too.
+SciPy's integrators take a Python function and no `LowLevelCallable`, so each evaluation costs one call
+through ctypes. `scipy.integrate.ode` runs Hairer's DOP853 and ODEPACK's LSODA with their loops over steps
+compiled; `solve_ivp`, whose loop is Python, is measured too.
 """
 
 import ctypes
@@ -25,25 +27,45 @@ MOST_STEPS = 1_000_000
 
 
 def c_source(equations: kane.KaneEquations) -> str:
-    """`void rates(double t, const double *y, double *dy)`: everything after common subexpressions, the symmetric system solved in closed form."""
+    """`void rates(double t, const double *y, double *dy)`: everything after common subexpressions, the
+    symmetric system solved in closed form.
+    """
     sp, n, m = kane.sp, len(equations.q), len(equations.u)
     y = sp.symbols(f"y:{n + m}")
     plain = dict(zip([*equations.q, *equations.u], y, strict=True))
-    entries = {(i, j): equations.mass_matrix[i, j] for i in range(m) for j in range(i + 1) if equations.mass_matrix[i, j] != 0}
+    entries = {
+        (i, j): equations.mass_matrix[i, j]
+        for i in range(m)
+        for j in range(i + 1)
+        if equations.mass_matrix[i, j] != 0
+    }
     places = {at: sp.Symbol(f"M{at[0]}{at[1]}") for at in entries}
     forces = sp.symbols(f"f:{m}")
     matrix = sp.Matrix(m, m, lambda i, j: places.get((max(i, j), min(i, j)), 0))
     targets = [*(f"dy[{i}]" for i in range(n)), *map(str, places.values()), *map(str, forces)]
-    shared, found = sp.cse([sp.sympify(e).subs(plain) for e in (*equations.qdot, *entries.values(), *equations.forcing)], sp.numbered_symbols("s"))
+    shared, found = sp.cse(
+        [sp.sympify(e).subs(plain) for e in (*equations.qdot, *entries.values(), *equations.forcing)],
+        sp.numbered_symbols("s"),
+    )
     solving, solved = sp.cse(list(matrix.LUsolve(sp.Matrix(forces))), sp.numbered_symbols("z"))
     code = sp.ccode
-    lines = [f"const double {name} = {value!r};" for name, value in ((str(s), v) for s, v in equations.parameters.items())]
+    lines = [
+        f"const double {name} = {value!r};"
+        for name, value in ((str(s), v) for s, v in equations.parameters.items())
+    ]
     lines += [f"const double y{i} = y[{i}];" for i in range(n + m)]
     lines += [f"const double {name} = {code(value)};" for name, value in shared]
-    lines += [f"{'' if target.startswith('dy') else 'const double '}{target} = {code(value)};" for target, value in zip(targets, found, strict=True)]
+    lines += [
+        f"{'' if target.startswith('dy') else 'const double '}{target} = {code(value)};"
+        for target, value in zip(targets, found, strict=True)
+    ]
     lines += [f"const double {name} = {code(value)};" for name, value in solving]
     lines += [f"dy[{n + i}] = {code(value)};" for i, value in enumerate(solved)]
-    return "#include <math.h>\nvoid rates(double t, const double *y, double *dy) {\n    " + "\n    ".join(lines) + "\n}\n"
+    return (
+        "#include <math.h>\nvoid rates(double t, const double *y, double *dy) {\n    "
+        + "\n    ".join(lines)
+        + "\n}\n"
+    )
 
 
 def compiled(source: str):
@@ -66,7 +88,9 @@ def _equations(problem: Problem) -> tuple:
 
 
 def callback(library, size: int):
-    """The rates as SciPy calls them; every integrator of SciPy copies what it is given, so that one output array serves."""
+    """The rates as SciPy calls them; every integrator of SciPy copies what it is given, so that one output
+    array serves.
+    """
     out = np.empty(size)
     function, to = library.rates, out.__array_interface__["data"][0]
 
@@ -85,7 +109,9 @@ def _by_ode(name: str):
 
         def run(tolerance: float):
             # the state that SciPy hands over is contiguous float64
-            solver = scipy.integrate.ode(rates).set_integrator(name, rtol=tolerance, atol=tolerance, nsteps=MOST_STEPS)
+            solver = scipy.integrate.ode(rates).set_integrator(
+                name, rtol=tolerance, atol=tolerance, nsteps=MOST_STEPS
+            )
             solver.set_initial_value(start, 0.0)
             return solver.integrate(problem.end), "" if solver.successful() else "SciPy says that it failed"
 
@@ -100,4 +126,6 @@ def curves(problem: Problem, quick: bool = False) -> list[Curve]:
         return []
     ways = {"DOP853": "dop853"} if quick else {"DOP853": "dop853", "LSODA": "lsoda"}
     used = ("sympy", "scipy", "numpy")
-    return [Curve(f"SymPy to C, SciPy ode {name}", TOLERANCES, _by_ode(way), used) for name, way in ways.items()]
+    return [
+        Curve(f"SymPy to C, SciPy ode {name}", TOLERANCES, _by_ode(way), used) for name, way in ways.items()
+    ]

@@ -14,7 +14,9 @@ from jourdain_jax.equations.minimal import minimal_kinematics
 
 @dataclass(frozen=True)
 class Reference:
-    """True values at the end, how they were obtained, and how far a second, independent computation is from them."""
+    """True values at the end, how they were obtained, and how far a second, independent computation is from
+    them.
+    """
 
     values: dict[str, float]
     how: str
@@ -70,12 +72,18 @@ class Problem:
         """A function of coordinates and privileged speeds at the end that returns coordinates and all speeds."""
         scene, n, end = self.scene, len(self.scene.coordinate_names.entries), jnp.asarray(self.end)
         rows = jj.structure_of(scene).kept_rows
-        return jax.jit(lambda y: (y[:n], minimal_kinematics(scene, self.independent, rows, end, y[:n], y[n:]).u))
+        return jax.jit(
+            lambda y: (y[:n], minimal_kinematics(scene, self.independent, rows, end, y[:n], y[n:]).u)
+        )
 
     def error(self, q, u) -> float:
-        """The largest absolute difference of a final state from the reference over the quantities compared, SI units."""
+        """The largest absolute difference of a final state from the reference over the quantities compared,
+        SI units.
+        """
         names = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries)
-        return largest_error(dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True)), self.truth.values, self.compared)
+        return largest_error(
+            dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True)), self.truth.values, self.compared
+        )
 
 
 def largest_error(found: dict, expected: dict[str, float], names: tuple[str, ...]) -> float:

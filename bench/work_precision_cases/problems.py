@@ -28,7 +28,9 @@ PROBLEMS = {
         Problem(
             "chaplygin-sleigh",
             "Chaplygin sleigh, 12 s",
-            lambda: jj.models.ChaplyginSleigh(mass=_SLEIGH["mass"], inertia=_SLEIGH["inertia"], offset=_SLEIGH["a"]),
+            lambda: jj.models.ChaplyginSleigh(
+                mass=_SLEIGH["mass"], inertia=_SLEIGH["inertia"], offset=_SLEIGH["a"]
+            ),
             {"x_rate": _SLEIGH["v0"], "y_rate": _SLEIGH["a"] * _SLEIGH["w0"], "heading_rate": _SLEIGH["w0"]},
             _SLEIGH["t_end"],
             references.sleigh,
@@ -37,7 +39,9 @@ PROBLEMS = {
         Problem(
             "rattleback",
             "Rattleback, 20 s",
-            lambda: jj.models.Rattleback(**_of(rattleback.RUN, "a", "b", "c", "h", "A", "B", "C", "D", "gravity")),
+            lambda: jj.models.Rattleback(
+                **_of(rattleback.RUN, "a", "b", "c", "h", "A", "B", "C", "D", "gravity")
+            ),
             _of(rattleback.RUN, *rattleback.NAMES),
             rattleback.RUN["t_end"],
             references.celt,
@@ -50,7 +54,19 @@ PROBLEMS = {
             dict(jj.models.WhippleBicycle.example),
             5.0,
             references.bicycle,
-            ("x", "y", "yaw", "lean", "pitch", "steer", "rear_spin", "front_spin", "lean_rate", "steer_rate", "rear_spin_rate"),
+            (
+                "x",
+                "y",
+                "yaw",
+                "lean",
+                "pitch",
+                "steer",
+                "rear_spin",
+                "front_spin",
+                "lean_rate",
+                "steer_rate",
+                "rear_spin_rate",
+            ),
         ),
     )
 }

@@ -29,7 +29,9 @@ class Record:
     setting: float  # a tolerance (absolute and relative) or a step in s, as `setting_unit` says
     setting_unit: str
     batch: int  # trajectories computed together
-    error: float | None  # the largest over the final quantities compared, absolute in SI units; None where the run failed
+    error: (
+        float | None
+    )  # the largest over the final quantities compared, absolute in SI units; None where the run failed
     seconds: float  # wall time per trajectory, warm
     steps: float | None = None  # per trajectory; None where they are not counted
     note: str = ""
@@ -43,4 +45,7 @@ def record(**values) -> dict:
     """A measurement as JSON holds it."""
     if values["kind"] not in KINDS:
         raise ValueError(f"`kind` is {values['kind']!r}, expected one of {KINDS}")
-    return {key: None if isinstance(value, float) and value != value else value for key, value in asdict(Record(**values)).items()}
+    return {
+        key: None if isinstance(value, float) and value != value else value
+        for key, value in asdict(Record(**values)).items()
+    }

@@ -1,8 +1,10 @@
-"""True values at the end of every problem, each with a second computation that shares neither equations nor integrator with the first.
+"""True values at the end of every problem, each with a second computation that shares neither equations nor
+integrator with the first.
 
-First: closed forms and extended-precision integrations of `tests/oracles`; for the bicycle, which has none, heyoka in extended precision on the
-engine's equations. Second: heyoka in extended precision on the engine's equations, or for the bicycle dense autodiff by diffrax; where heyoka is not
-installed, the engine at a tolerance of 1e-14. The uncertainty is their largest difference over the quantities compared.
+First: closed forms and extended-precision integrations of `tests/oracles`; for the bicycle, which has none,
+heyoka in extended precision on the engine's equations. Second: heyoka in extended precision on the engine's
+equations, or for the bicycle dense autodiff by diffrax; where heyoka is not installed, the engine at a
+tolerance of 1e-14. The uncertainty is their largest difference over the quantities compared.
 """
 
 import diffrax
@@ -20,10 +22,18 @@ TIGHT = 1e-14
 
 
 def by_engine(problem: Problem) -> dict[str, float]:
-    """The engine's own end, at a tolerance of 1e-14; not inside `jit`, where a motion that fails is not run again in another way."""
+    """The engine's own end, at a tolerance of 1e-14; not inside `jit`, where a motion that fails is not run
+    again in another way.
+    """
     options = {"ts": jnp.array([problem.end]), "rtol": TIGHT, "atol": TIGHT, "events": False}
     motion = jj.simulate(problem.scene, problem.state, solver=diffrax.Dopri8(), **options).raise_if_failed()
-    return dict(zip((*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries), (*motion.q_end, *motion.u_end), strict=True))
+    return dict(
+        zip(
+            (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries),
+            (*motion.q_end, *motion.u_end),
+            strict=True,
+        )
+    )
 
 
 def second(problem: Problem) -> tuple[dict[str, float], str]:
@@ -51,7 +61,12 @@ def disc(problem: Problem) -> Reference:
 
 def sleigh(problem: Problem) -> Reference:
     """Closed form; the path by quadrature."""
-    found = {name: values[-1] for name, values in chaplygin_sleigh.motion([0.0, problem.end], **_without(chaplygin_sleigh.RUN, "t_end")).items()}
+    found = {
+        name: values[-1]
+        for name, values in chaplygin_sleigh.motion(
+            [0.0, problem.end], **_without(chaplygin_sleigh.RUN, "t_end")
+        ).items()
+    }
     c, s, a = np.cos(found["th"]), np.sin(found["th"]), chaplygin_sleigh.RUN["a"]
     values = {"x": found["x"], "y": found["y"], "heading": found["th"], "heading_rate": found["w"]}
     values |= {"x_rate": found["v"] * c - a * found["w"] * s, "y_rate": found["v"] * s + a * found["w"] * c}
@@ -62,19 +77,38 @@ def celt(problem: Problem) -> Reference:
     """Kane and Levinson's equations, by the oracle."""
     found = rattleback.motion([0.0, problem.end], **_without(rattleback.RUN, "t_end"))
     values = {name: found[name][-1] for name in rattleback.NAMES}
-    return checked(problem, values, "Kane and Levinson's equations, extrapolation of order 18 in extended precision")
+    return checked(
+        problem, values, "Kane and Levinson's equations, extrapolation of order 18 in extended precision"
+    )
 
 
 def bicycle(problem: Problem) -> Reference:
-    """No closed form: heyoka on the engine's equations against dense autodiff of poses written by hand, or the engine against the latter."""
+    """No closed form: heyoka on the engine's equations against dense autodiff of poses written by hand, or
+    the engine against the latter.
+    """
     if peer_heyoka.heyoka is None:
         values, how = by_engine(problem), "the engine, Dopri8 at 1e-14"
     else:
         values, how = peer_heyoka.extended(problem), "heyoka, extended precision, the engine's equations"
     y = np.concatenate([problem.state.q, problem.state.u])
-    found = jax.jit(lambda y: dense.integrate(dense.bicycle_rates, dense.BICYCLE_PARAMETERS, y, problem.end, "Dopri8", 1e-13))(y[None])[0]
-    other = dict(zip((*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries), np.asarray(found), strict=True))
-    return Reference(values, how, largest_error(other, values, problem.compared), "dense autodiff of poses by hand, diffrax Dopri8 at 1e-13")
+    found = jax.jit(
+        lambda y: dense.integrate(
+            dense.bicycle_rates, dense.BICYCLE_PARAMETERS, y, problem.end, "Dopri8", 1e-13
+        )
+    )(y[None])[0]
+    other = dict(
+        zip(
+            (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries),
+            np.asarray(found),
+            strict=True,
+        )
+    )
+    return Reference(
+        values,
+        how,
+        largest_error(other, values, problem.compared),
+        "dense autodiff of poses by hand, diffrax Dopri8 at 1e-13",
+    )
 
 
 def _without(values: dict, *names: str) -> dict:

@@ -1,4 +1,6 @@
-"""Docstrings of the package as Sphinx reads them: an indented paragraph is code, single backticks quote code, and nothing else is markup."""
+"""Docstrings of the package as Sphinx reads them: an indented paragraph is code, single backticks quote code,
+and nothing else is markup.
+"""
 
 import re
 from typing import TYPE_CHECKING
@@ -33,7 +35,10 @@ def as_rest(lines: list[str]) -> list[str]:
 def _plain(line: str) -> str:
     """Without markup but for bold headings, items and quoted code."""
     parts = re.split(r"(`[^`]*`|\*\*[^*]+\*\*)", line)
-    return "".join(part if part.startswith(("`", "**")) else _SPECIAL.sub(lambda found: "\\" + found.group(0), part) for part in parts)
+    return "".join(
+        part if part.startswith(("`", "**")) else _SPECIAL.sub(lambda found: "\\" + found.group(0), part)
+        for part in parts
+    )
 
 
 def _process(app, what, name, value, options, lines):

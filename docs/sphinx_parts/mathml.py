@@ -13,7 +13,9 @@ def setup(app: Sphinx) -> dict:
         raise SkipNode
 
     def block(self, node):
-        formula = node.astext().replace("{aligned}", "{align*}")  # the one environment of the two that latex2mathml knows
+        formula = node.astext().replace(
+            "{aligned}", "{align*}"
+        )  # the one environment of the two that latex2mathml knows
         self.body.append(f'<div class="math">{convert(formula, display="block")}</div>')
         raise SkipNode
 

@@ -1,8 +1,10 @@
-"""Differentiable dynamics of holonomic and nonholonomic mechanical systems, by Jourdain's principle of virtual power.
+"""Differentiable dynamics of holonomic and nonholonomic mechanical systems, by Jourdain's principle of
+virtual power.
 
-Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is set to 0; asks for at least 16
-threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile small loops on the CPU into one function each, unless XLA_FLAGS
-holds `xla_backend_extra_options`. The last two take effect if JAX has not computed anything yet.
+Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is set to
+0; asks for at least 16 threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile small
+loops on the CPU into one function each, unless XLA_FLAGS holds `xla_backend_extra_options`. The last two take
+effect if JAX has not computed anything yet.
 
 Every name is imported on first use (`__init__.pyi` lists them).
 """
@@ -15,13 +17,15 @@ import lazy_loader as _lazy_loader
 if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
 
-# A batched LAPACK call of jaxlib 0.10 waits, in a thread of the pool, for work that is queued on the same pool: as many such calls at once as
-# there are threads wait for ever (seen with two cores and batches of some thousand). jaxlib 0.11 no longer splits batches.
+# A batched LAPACK call of jaxlib 0.10 waits, in a thread of the pool, for work that is queued on the same
+# pool: as many such calls at once as there are threads wait for ever (seen with two cores and batches of some
+# thousand). jaxlib 0.11 no longer splits batches.
 if not {"PJRT_NPROC", "NPROC"} & _os.environ.keys():
     _os.environ["PJRT_NPROC"] = str(max(16, _os.cpu_count() or 1))
 
-# By default XLA compiles a loop into one function if its body touches less than 1 kB; beyond, it starts every operation of the body on its own,
-# which takes ten times as long as the arithmetic of a step (a disc alone: 2.9 ms, with this 0.22 ms).
+# By default XLA compiles a loop into one function if its body touches less than 1 kB; beyond, it starts every
+# operation of the body on its own, which takes ten times as long as the arithmetic of a step (a disc alone:
+# 2.9 ms, with this 0.22 ms).
 if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
@@ -33,8 +37,10 @@ from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
 _public, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)
 _GONE = {
     "Built": "it is `Model`, which `build` returns",
-    "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take "
-        "half of its time",
+    "MuntheKaas": (
+        "the default solvers renormalise quaternions after each step, are as accurate and take "
+        "half of its time"
+    ),
 }
 _MOVED = ("identification", "studies", "equations", "analysis")
 
@@ -43,7 +49,9 @@ def __getattr__(name: str) -> object:
     """Import a public name; raise an AttributeError that says where a former one is now."""
     if name in __all__:
         return _public(name)
-    places = [f"it is `jj.{place}.{name}`" for place in _MOVED if name[:1] != "_" and name in _public(place).__all__]
+    places = [
+        f"it is `jj.{place}.{name}`" for place in _MOVED if name[:1] != "_" and name in _public(place).__all__
+    ]
     advice = _GONE.get(name, "".join(places))
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}" + f": {advice}" * bool(advice))
 

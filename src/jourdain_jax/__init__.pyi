@@ -46,7 +46,14 @@ from .motion.trajectories.storage import load_rollout, load_trajectory, save
 from .motion.trajectories.trajectory import Trajectory
 from .scene.bodies import Particle, RigidBody
 from .scene.constraints import knife_edge, pin, rod, weld
-from .scene.contact.contacts import Contact, Coulomb, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+from .scene.contact.contacts import (
+    Contact,
+    Coulomb,
+    ball_contact,
+    disc_contact,
+    ellipsoid_contact,
+    wheel_contact,
+)
 from .scene.contact.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
 from .scene.contact.held_rows import joint_friction
 from .scene.coordinates import coordinates, inputs, quaternion, speeds

@@ -1,8 +1,11 @@
-"""Ball rolling on a turning plane, flat or tilted (B8). Fowler; Weltner, Am. J. Phys. 47 (1979) 984; inertia kap m r^2.
+"""Ball rolling on a turning plane, flat or tilted (B8). Fowler; Weltner, Am. J. Phys. 47 (1979) 984; inertia
+kap m r^2.
 
-Axes of the plane: z its normal, x downhill, the plane turns at Om about z through the origin. R'' = n z x R' + G/(1 + kap),
-n = Om kap/(1 + kap), G = g sin(tilt) along +x. Body rates are components on the plane's (non-turning) axes; the contact
-point of the ball moves with the plane: wx = (Om X - Vy)/r, wy = (Vx + Om Y)/r, wz constant. For Om > 0 the drift is along +y.
+Axes of the plane: z its normal, x downhill, the plane turns at Om about z through the origin. R'' = n z x R'
++ G/(1 + kap),
+n = Om kap/(1 + kap), G = g sin(tilt) along +x. Body rates are components on the plane's (non-turning) axes;
+the contact point of the ball moves with the plane: wx = (Om X - Vy)/r, wy = (Vx + Om Y)/r, wz constant. For
+Om > 0 the drift is along +y.
 """
 
 import numpy as np
@@ -23,7 +26,9 @@ RUN = {
 RUN_FLAT = {**RUN, "tilt": 0.0}
 
 
-def motion(t, *, radius, turn_rate, tilt, gravity, inertia_ratio, x0, y0, vx0, vy0, wz=0.0, mass=None, t_end=None) -> dict[str, np.ndarray]:
+def motion(
+    t, *, radius, turn_rate, tilt, gravity, inertia_ratio, x0, y0, vx0, vy0, wz=0.0, mass=None, t_end=None
+) -> dict[str, np.ndarray]:
     """x, y, vx, vy of the centre and the angular velocity wx, wy, wz."""
     t = np.asarray(t, float)
     n = turn_rate * inertia_ratio / (1 + inertia_ratio)

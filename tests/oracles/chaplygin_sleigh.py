@@ -1,7 +1,8 @@
 """Chaplygin sleigh (B3). Chaplygin 1911; Bloch, 2003, sec. 1.7.
 
-(x, y) is the mass centre, a ahead of the blade; heading th; row -s xdot + c ydot - a thdot = 0. v is the forward speed of the
-blade, w = thdot. v' = a w^2, w' = -(a/k^2) v w, k^2 = inertia/mass + a^2; v = V tanh tau, w = +-(V/k) sech tau,
+(x, y) is the mass centre, a ahead of the blade; heading th; row -s xdot + c ydot - a thdot = 0. v is the
+forward speed of the blade, w = thdot. v' = a w^2, w' = -(a/k^2) v w, k^2 = inertia/mass + a^2; v = V tanh
+tau, w = +-(V/k) sech tau,
 tau = tau0 + a V t / k^2, th = th0 +- (k/a)(gd tau - gd tau0). The path is a quadrature.
 """
 

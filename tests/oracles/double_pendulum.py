@@ -1,6 +1,8 @@
-"""Planar double pendulum of two point masses: Lagrange's equations in angles, integrated in extended precision.
+"""Planar double pendulum of two point masses: Lagrange's equations in angles, integrated in extended
+precision.
 
-x to the right, y up, pivot at the origin; theta_k from straight down, counterclockwise: r1 = l1 (sin th1, -cos th1),
+x to the right, y up, pivot at the origin; theta_k from straight down, counterclockwise: r1 = l1 (sin th1,
+-cos th1),
 r2 = r1 + l2 (sin th2, -cos th2).
 """
 
@@ -23,7 +25,9 @@ RUN = {
 
 
 def motion(t, *, m1, m2, l1, l2, gravity, th1, th2, th1_rate, th2_rate, t_end=None) -> dict[str, np.ndarray]:
-    """th1, th2, th1_rate, th2_rate, x1, y1, x2, y2, vx1, vy1, vx2, vy2, tension1, tension2 (> 0: the rod pulls), energy."""
+    """th1, th2, th1_rate, th2_rate, x1, y1, x2, y2, vx1, vy1, vx2, vy2, tension1, tension2 (> 0: the rod
+    pulls), energy.
+    """
 
     def accelerations(p, q, u, v):
         # (m1 + m2) l1 p'' + m2 l2 cos(p - q) q'' = -m2 l2 sin(p - q) v^2 - (m1 + m2) g sin p

@@ -1,7 +1,8 @@
-"""Torque-free rigid body: Euler's equations by Jacobi elliptic functions. Landau & Lifshitz, Mechanics, section 37.
+"""Torque-free rigid body: Euler's equations by Jacobi elliptic functions. Landau & Lifshitz, Mechanics,
+section 37.
 
-w: body components, I_k w_k' = (I_l - I_m) w_l w_m cyclically; three different principal moments in any order; not on the
-separatrix (|L|^2 = 2 E I_middle) itself, except for the steady turn about the middle axis.
+w: body components, I_k w_k' = (I_l - I_m) w_l w_m cyclically; three different principal moments in any order;
+not on the separatrix (|L|^2 = 2 E I_middle) itself, except for the steady turn about the middle axis.
 """
 
 import numpy as np

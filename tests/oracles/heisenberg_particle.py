@@ -1,4 +1,5 @@
-"""Free particle with the Heisenberg row zdot = y xdot - x ydot (B5): straight lines, zero multiplier. Bloch, 2003, sec. 1.8.
+"""Free particle with the Heisenberg row zdot = y xdot - x ydot (B5): straight lines, zero multiplier. Bloch,
+2003, sec. 1.8.
 
 A variational (vakonomic) reading of the same row would give helices.
 """

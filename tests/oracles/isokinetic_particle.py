@@ -12,7 +12,9 @@ RUN = {"speed": 1.7, "gravity": 9.81, "theta0": 0.0, "t_end": 2.0}
 
 
 def motion(t, *, speed, gravity, theta0=0.0, x0=0.0, y0=0.0, t_end=None) -> dict[str, np.ndarray]:
-    """x, y, vx, vy, theta, and `force`: constraint force per mass along the velocity (negative brakes); |theta0| < 90 deg."""
+    """x, y, vx, vy, theta, and `force`: constraint force per mass along the velocity (negative brakes);
+    |theta0| < 90 deg.
+    """
     t = np.asarray(t, float)
     tau0 = -np.arctanh(np.sin(theta0))
     tau = tau0 + gravity * t / speed

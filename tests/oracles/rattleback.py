@@ -1,9 +1,11 @@
-"""Rattleback of Kane & Levinson, Int. J. Non-Linear Mech. 17 (1982) 175 (B15): ellipsoid rolling on a level plane.
+"""Rattleback of Kane & Levinson, Int. J. Non-Linear Mech. 17 (1982) 175 (B15): ellipsoid rolling on a level
+plane.
 
-Space axes n1, n2 level, n3 down. Attitude R = rot_3(gamma) rot_1(alpha) rot_2(beta) (body to space), body axis 3 down at zero
-angles; mu = R' n3 = (-cos a sin b, sin a, cos a cos b). Semi-axes a, b, c along the body axes; the mass centre lies h below the
-ellipsoid's centre (+h along body 3). A, B, C and D = I12 are the central inertia per unit mass; D is the entry of the inertia
-matrix (the off-diagonal element itself). w: body components of the angular velocity. Contact from the mass centre:
+Space axes n1, n2 level, n3 down. Attitude R = rot_3(gamma) rot_1(alpha) rot_2(beta) (body to space), body
+axis 3 down at zero angles; mu = R' n3 = (-cos a sin b, sin a, cos a cos b). Semi-axes a, b, c along the body
+axes; the mass centre lies h below the ellipsoid's centre (+h along body 3). A, B, C and D = I12 are the
+central inertia per unit mass; D is the entry of the inertia matrix (the off-diagonal element itself). w: body
+components of the angular velocity. Contact from the mass centre:
     rho = (a^2 m1, b^2 m2, c^2 m3)/sqrt(a^2 m1^2 + b^2 m2^2 + c^2 m3^2) - h e3.
 With mu' = mu x w, v = rho x w, F = v' + w x v - g mu (the contact force per mass):  I w' + w x I w = rho x F.
 """
@@ -31,9 +33,9 @@ RUN = {
     "t_end": 20.0,
 }
 NAMES = ("alpha", "beta", "gamma", "w1", "w2", "w3")
-# t -> the published values of NAMES; DIGITS the absolute error they may have (two to three units of the last digit shown).
-# alpha at t = 20 is printed 0.30853855, which is off by 3e-6 and breaks the energy integral by as much as that error
-# explains; the value here is this file's own, 0.3085355485.
+# t -> the published values of NAMES; DIGITS the absolute error they may have (two to three units of the last
+# digit shown). alpha at t = 20 is printed 0.30853855, which is off by 3e-6 and breaks the energy integral by
+# as much as that error explains; the value here is this file's own, 0.3085355485.
 TABLE = {
     1.0: (-0.006004378514, 0.023167406572, -4.266111465411, 5.04104230641, 1.76142316948, -3.11754353742),
     5.0: (-0.04693113, 0.01445297, -2.75016131345, -2.19784111, -1.74517600, 4.16424605),
@@ -46,7 +48,8 @@ DIGITS = {
     10.0: (2e-8, 2e-9, 2e-8, 3e-8, 2e-8, 2e-8),
     20.0: (2e-8, 2e-9, 2e-7, 2e-7, 2e-7, 2e-7),
 }
-# t -> the values of NAMES from `motion` to double precision; round-off of the start (1e-18 here) grows by SENSITIVITY.
+# t -> the values of NAMES from `motion` to double precision; round-off of the start (1e-18 here) grows by
+# SENSITIVITY.
 REFERENCE = {
     1.0: (
         -0.006004378513555924,
@@ -91,7 +94,13 @@ REFERENCE = {
 }
 FIRST_REVERSAL = 2.352731  # w3 = 0
 ENERGY = 0.123885313673553  # J/kg at the start
-SENSITIVITY = {1.0: 5.9e3, 2.0: 5.8e3, 5.0: 1.7e4, 10.0: 1.7e4, 20.0: 6.7e4}  # 2-norm of d state(T) / d state(0)
+SENSITIVITY = {
+    1.0: 5.9e3,
+    2.0: 5.8e3,
+    5.0: 1.7e4,
+    10.0: 1.7e4,
+    20.0: 6.7e4,
+}  # 2-norm of d state(T) / d state(0)
 
 
 def _cross(p, q):
@@ -141,14 +150,18 @@ def _split(parameters):
 
 
 def motion(t, **parameters) -> dict[str, np.ndarray]:
-    """alpha, beta, gamma, w1, w2, w3 and energy per mass, from the start in `parameters` (those of RUN) at t[0]."""
+    """alpha, beta, gamma, w1, w2, w3 and energy per mass, from the start in `parameters` (those of RUN) at
+    t[0].
+    """
     shape, start = _split({**RUN, **parameters})
     states = integrate(lambda _, y: rates(y, **shape), start, t)
     return {**dict(zip(NAMES, states.T, strict=True)), "energy": energy(states.T, **shape)}
 
 
 def energy(state, *, a, b, c, h, A, B, C, D, gravity) -> np.ndarray:
-    """Energy per mass of states (6, times): kinetic plus g times the height of the mass centre above the plane."""
+    """Energy per mass of states (6, times): kinetic plus g times the height of the mass centre above the
+    plane.
+    """
     w = np.asarray(state[3:], float)
     mu = _vertical(state[0], state[1])
     squares = np.array([a * a, b * b, c * c])

@@ -1,8 +1,8 @@
 """Numerical tools of the oracles: integration, quadrature and a linear solve in extended precision.
 
-`integrate` is Gragg's modified midpoint rule with Richardson extrapolation in even steps (Hairer, Norsett & Wanner, Solving
-Ordinary Differential Equations I, II.9), run in numpy's long double: about 1e-17 per step where that has 64 bits of mantissa
-(x86), about 1e-14 where it is plain double.
+`integrate` is Gragg's modified midpoint rule with Richardson extrapolation in even steps (Hairer, Norsett &
+Wanner, Solving Ordinary Differential Equations I, II.9), run in numpy's long double: about 1e-17 per step
+where that has 64 bits of mantissa (x86), about 1e-14 where it is plain double.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,8 @@ def _extrapolated_step(rhs: Callable, t, y, width):
 
 
 def integrate(rhs: Callable, start: Sequence, times: Sequence, first_step: float = 0.05) -> np.ndarray:
-    """States of y' = rhs(t, y) at `times` (the first is the time of `start`), shape (times, components), float64.
+    """States of y' = rhs(t, y) at `times` (the first is the time of `start`), shape (times, components),
+    float64.
 
     `rhs` must keep long double (numpy functions, no float() and no float64 arrays inside).
     """
@@ -85,7 +86,9 @@ def solve(matrix, right) -> np.ndarray:
 
 
 def integral(function: Callable, times: Sequence, panel: float = 0.25) -> np.ndarray:
-    """Integrals of `function` (of an array of times) from times[0] to each of `times`: Gauss-Legendre, 24 points a panel."""
+    """Integrals of `function` (of an array of times) from times[0] to each of `times`: Gauss-Legendre, 24
+    points a panel.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(24)
     total, sums = 0.0, [0.0]
     for left, right in pairwise(times):
@@ -97,10 +100,14 @@ def integral(function: Callable, times: Sequence, panel: float = 0.25) -> np.nda
     return np.array(sums)
 
 
-def constrained_motion(masses: Sequence, rows: Callable, force: Sequence, q0: Sequence, v0: Sequence, times: Sequence) -> np.ndarray:
-    """Motion with multipliers, m q'' = force + A' lambda, A q'' = -Adot v, for constant diagonal masses and forces and full row rank.
+def constrained_motion(
+    masses: Sequence, rows: Callable, force: Sequence, q0: Sequence, v0: Sequence, times: Sequence
+) -> np.ndarray:
+    """Motion with multipliers, m q'' = force + A' lambda, A q'' = -Adot v, for constant diagonal masses and
+    forces and full row rank.
 
-    **Arguments:** `rows(q)` gives A, analytic in q: Adot v is found by a complex step. **Returns:** (times, 2n): q then v.
+    **Arguments:** `rows(q)` gives A, analytic in q: Adot v is found by a complex step. **Returns:** (times,
+    2n): q then v.
     """
     m, impressed = np.asarray(masses, LONG), np.asarray(force, LONG) / np.asarray(masses, LONG)
     n, step = len(m), LONG(1e-30)

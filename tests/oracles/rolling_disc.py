@@ -1,11 +1,15 @@
-"""Thin disc rolling and tilting on a level plane (B6). Appell 1899; Korteweg 1899; Cushman & Duistermaat 2006.
+"""Thin disc rolling and tilting on a level plane (B6). Appell 1899; Korteweg 1899; Cushman & Duistermaat
+2006.
 
-theta is the angle between the disc's axis and the vertical, pi/2 upright. Frame: e1 = (cos psi, sin psi, 0) along the line of
-nodes, e3 = (sin theta sin psi, -sin theta cos psi, cos theta) the axis, e2 = e3 x e1 from the contact to the centre.
-w1 = thetadot, w2 = psidot sin theta, w3 = phidot + psidot cos theta; phi is the spin about e3. The contact point moves with
--a phidot e1, the centre with a (w1 e3 - w3 e1). A: moment about a diameter, C: about the axis (uniform: m a^2/4, m a^2/2).
+theta is the angle between the disc's axis and the vertical, pi/2 upright. Frame: e1 = (cos psi, sin psi, 0)
+along the line of nodes, e3 = (sin theta sin psi, -sin theta cos psi, cos theta) the axis, e2 = e3 x e1 from
+the contact to the centre.
+w1 = thetadot, w2 = psidot sin theta, w3 = phidot + psidot cos theta; phi is the spin about e3. The contact
+point moves with -a phidot e1, the centre with a (w1 e3 - w3 e1). A: moment about a diameter, C: about the
+axis (uniform: m a^2/4, m a^2/2).
 
-The yaw-lean-spin form rot_z(yaw) rot_x(lean) rot_y(spin), disc axis y, is the same with yaw = psi, lean = theta - pi/2,
+The yaw-lean-spin form rot_z(yaw) rot_x(lean) rot_y(spin), disc axis y, is the same with yaw = psi, lean =
+theta - pi/2,
 spin = -phi (the axle y is -e3); x, y is the contact point in both.
 """
 
@@ -35,8 +39,11 @@ def uniform_inertia(mass: float, radius: float) -> tuple[float, float]:
     return mass * radius**2 / 4, mass * radius**2 / 2
 
 
-def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=0.0, y0=0.0, inertia=None) -> dict[str, np.ndarray]:
-    """theta, psi, phi, w1, w2, w3, contact x, y, centre cx, cy, cz, and energy, integrated at about 1e-16 per step.
+def motion(
+    t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=0.0, y0=0.0, inertia=None
+) -> dict[str, np.ndarray]:
+    """theta, psi, phi, w1, w2, w3, contact x, y, centre cx, cy, cz, and energy, integrated at about 1e-16 per
+    step.
 
     `inertia` is (A, C), the uniform disc's by default. Leaves theta in (0, pi) alone: no flat disc.
     """
@@ -53,7 +60,8 @@ def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=
             a,
             yaw_rate,
             spin_rate,
-            (a_moment * b**2 * cot - (c_moment + ring) * b * c - mass * gravity * radius * cosine) / (a_moment + ring),
+            (a_moment * b**2 * cot - (c_moment + ring) * b * c - mass * gravity * radius * cosine)
+            / (a_moment + ring),
             a * (c_moment * c - a_moment * b * cot) / a_moment,
             ring * a * b / (c_moment + ring),
             -radius * spin_rate * np.cos(ps),
@@ -67,13 +75,29 @@ def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=
     result["cy"] = result["y"] + radius * np.cos(th) * np.cos(ps)
     result["cz"] = radius * np.sin(th)
     result["energy"] = (
-        (a_moment + ring) * result["w1"] ** 2 + a_moment * result["w2"] ** 2 + (c_moment + ring) * result["w3"] ** 2
+        (a_moment + ring) * result["w1"] ** 2
+        + a_moment * result["w2"] ** 2
+        + (c_moment + ring) * result["w3"] ** 2
     ) / 2 + mass * gravity * result["cz"]
     return result
 
 
 def motion_yaw_lean_spin(
-    t, *, mass, radius, gravity, yaw, lean, spin, yaw_rate, lean_rate, spin_rate, x0=0.0, y0=0.0, inertia=None, t_end=None
+    t,
+    *,
+    mass,
+    radius,
+    gravity,
+    yaw,
+    lean,
+    spin,
+    yaw_rate,
+    lean_rate,
+    spin_rate,
+    x0=0.0,
+    y0=0.0,
+    inertia=None,
+    t_end=None,
 ) -> dict[str, np.ndarray]:
     """The motion from and in yaw, lean, spin (the last are keys beside those of `motion`)."""
     theta = LONG(np.pi) / 2 + LONG(lean)  # pi/2 of double precision: cos(theta) = -sin(lean) to 6e-17
@@ -104,7 +128,8 @@ def _legendre(nu, x) -> tuple[float, float]:
 
 
 def legendre_constants(theta, w2, w3, *, mass, radius, inertia=None) -> tuple[np.ndarray, np.ndarray]:
-    """(c1, c2) of w3 = c1 P_nu(cos theta) + c2 P_nu(-cos theta), w2 = ((C + m a^2)/(m a^2)) dw3/dtheta: two integrals.
+    """(c1, c2) of w3 = c1 P_nu(cos theta) + c2 P_nu(-cos theta), w2 = ((C + m a^2)/(m a^2)) dw3/dtheta: two
+    integrals.
 
     nu (nu + 1) = -C m a^2 / (A (C + m a^2)). Arrays of one shape in, two arrays of that shape out.
     """
@@ -123,7 +148,9 @@ def legendre_constants(theta, w2, w3, *, mass, radius, inertia=None) -> tuple[np
 
 
 def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity, inertia=None) -> dict[str, float]:
-    """w2, w3, spin_rate (phidot) of steady rolling, and the signed radii of the circles of the centre and of the contact."""
+    """w2, w3, spin_rate (phidot) of steady rolling, and the signed radii of the circles of the centre and of
+    the contact.
+    """
     a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
     w2 = yaw_rate * np.sin(theta)
     load = mass * gravity * radius * np.cos(theta)
@@ -139,7 +166,9 @@ def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity, inert
 
 
 def upright_rolling_frequency_squared(spin: float, *, mass, radius, gravity, inertia=None) -> float:
-    """Square of the lean frequency when rolling straight at w3 = spin; stable where positive. Uniform: 12/5 spin^2 - 4g/5a."""
+    """Square of the lean frequency when rolling straight at w3 = spin; stable where positive. Uniform: 12/5
+    spin^2 - 4g/5a.
+    """
     a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
     ring = mass * radius**2
     return ((c_moment + ring) * c_moment * spin**2 / a_moment - mass * gravity * radius) / (a_moment + ring)

@@ -1,7 +1,7 @@
 """Rosenberg's nonholonomic particle (B5). Rosenberg, Analytical Dynamics, 1977; Bates & Sniatycki 1993.
 
-Free unit particle with the row zdot = y xdot. ydot = b and xdot sqrt(1 + y^2) = c are constant. b = 0 gives xdot constant.
-RUN's c is that constant, so xdot(0) = c / sqrt(1 + y0^2).
+Free unit particle with the row zdot = y xdot. ydot = b and xdot sqrt(1 + y^2) = c are constant. b = 0 gives
+xdot constant. RUN's c is that constant, so xdot(0) = c / sqrt(1 + y0^2).
 """
 
 import numpy as np

@@ -2,8 +2,9 @@
 
 (x, y) middle, th board heading, psi rotor angle relative to the board, wheels at phi (front) and -phi (back);
 rows -sin(th +- phi) xd + cos(th +- phi) yd +- l cos(phi) thd = 0;
-T = m v^2/2 + J thd^2/2 + Jr (thd + psid)^2/2 + Jw ((thd + phid)^2 + (thd - phid)^2)/2. Without torques phid and thd + psid are
-constant; u = c l cos(phi)/D, thd = c sin(phi)/D, D^2 = m l^2 cos^2 phi + (J + 2 Jw) sin^2 phi, c^2/2 = energy of (u, th).
+T = m v^2/2 + J thd^2/2 + Jr (thd + psid)^2/2 + Jw ((thd + phid)^2 + (thd - phid)^2)/2. Without torques phid
+and thd + psid are constant; u = c l cos(phi)/D, thd = c sin(phi)/D, D^2 = m l^2 cos^2 phi + (J + 2 Jw) sin^2
+phi, c^2/2 = energy of (u, th).
 """
 
 import numpy as np
@@ -25,7 +26,18 @@ RUN = {
 
 
 def velocities(
-    t, *, mass, half_length, board_inertia, wheel_inertia, phi0, phi_rate, u0, rotor_inertia=None, psi_rate=0.0, t_end=None
+    t,
+    *,
+    mass,
+    half_length,
+    board_inertia,
+    wheel_inertia,
+    phi0,
+    phi_rate,
+    u0,
+    rotor_inertia=None,
+    psi_rate=0.0,
+    t_end=None,
 ) -> dict[str, np.ndarray]:
     """phi, u (forward speed), th_rate, psi_rate in closed form; keeps long double times."""
     inertia = board_inertia + 2 * wheel_inertia
@@ -37,7 +49,12 @@ def velocities(
     phi = phi0 + phi_rate * np.asarray(t)
     turn = c * np.sin(phi) / size(phi)
     total = psi_rate + c * np.sin(phi0) / size(phi0)
-    return {"phi": phi, "u": c * half_length * np.cos(phi) / size(phi), "th_rate": turn, "psi_rate": total - turn}
+    return {
+        "phi": phi,
+        "u": c * half_length * np.cos(phi) / size(phi),
+        "th_rate": turn,
+        "psi_rate": total - turn,
+    }
 
 
 def motion(t, *, th0=0.0, psi0=0.0, x0=0.0, y0=0.0, **parameters) -> dict[str, np.ndarray]:

@@ -1,7 +1,9 @@
-"""Particles under given forces, some held by rigid rods (S12): Newton's equations with the rods' tensions solved for.
+"""Particles under given forces, some held by rigid rods (S12): Newton's equations with the rods' tensions
+solved for.
 
-m r'' = F(t, r, v) + sum of tensions; for a rod between points p and q, d = p - q: d.(p'' - q'') = -|d'|^2. No symmetry, no
-coordinates, integrated in extended precision, so rod lengths hold to about 1e-15. y is up where gravity acts.
+m r'' = F(t, r, v) + sum of tensions; for a rod between points p and q, d = p - q: d.(p'' - q'') = -|d'|^2. No
+symmetry, no coordinates, integrated in extended precision, so rod lengths hold to about 1e-15. y is up where
+gravity acts.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,11 +27,14 @@ RUN = {
 }
 
 
-def newton(t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence = (), anchors: Sequence = ()) -> dict[str, np.ndarray]:
-    """Positions `r` and velocities `v` (times, particles, dimensions) and rod `tensions` (times, rods + anchors, > 0 pulls).
+def newton(
+    t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence = (), anchors: Sequence = ()
+) -> dict[str, np.ndarray]:
+    """Positions `r` and velocities `v` (times, particles, dimensions) and rod `tensions` (times, rods +
+    anchors, > 0 pulls).
 
-    **Arguments:** `force(t, r, v)` -> (particles, dimensions), long double kept; `rods`, pairs of particle numbers; `anchors`,
-    pairs (particle number, fixed point). The start must fit the rods.
+    **Arguments:** `force(t, r, v)` -> (particles, dimensions), long double kept; `rods`, pairs of particle
+    numbers; `anchors`, pairs (particle number, fixed point). The start must fit the rods.
     """
     start, speed = np.asarray(r0, LONG), np.asarray(v0, LONG)
     shape = start.shape
@@ -81,8 +86,12 @@ def spring(p, q, stiffness, natural_length, relative_velocity=None, damping=0.0)
     return -pull * d / length
 
 
-def motion(t, *, masses, stiffness, natural_length, damping, gravity, anchor, rods, r0, v0, t_end=None) -> dict[str, np.ndarray]:
-    """The example of RUN: particle 0 on a spring to the anchor, the rods between the particles; with `energy`."""
+def motion(
+    t, *, masses, stiffness, natural_length, damping, gravity, anchor, rods, r0, v0, t_end=None
+) -> dict[str, np.ndarray]:
+    """The example of RUN: particle 0 on a spring to the anchor, the rods between the particles; with
+    `energy`.
+    """
     down = np.zeros(len(anchor), LONG)
     down[1] = -gravity
     fixed = np.asarray(anchor, LONG)
@@ -96,4 +105,7 @@ def motion(t, *, masses, stiffness, natural_length, damping, gravity, anchor, ro
     r, v, m = result["r"], result["v"], np.asarray(masses)
     stretch = np.linalg.norm(r[:, 0] - np.asarray(anchor), axis=-1) - natural_length
     kinetic = np.einsum("p,tpd,tpd->t", m, v, v) / 2
-    return {**result, "energy": kinetic + gravity * np.einsum("p,tp->t", m, r[..., 1]) + stiffness * stretch**2 / 2}
+    return {
+        **result,
+        "energy": kinetic + gravity * np.einsum("p,tp->t", m, r[..., 1]) + stiffness * stretch**2 / 2,
+    }

@@ -1,6 +1,8 @@
-"""Suslov's problem (B12). Suslov 1902; Kozlov 1988. Rigid body about a fixed point, body-fixed row w3 = 0, no torque.
+"""Suslov's problem (B12). Suslov 1902; Kozlov 1988. Rigid body about a fixed point, body-fixed row w3 = 0, no
+torque.
 
-I13 is the entry of the inertia matrix (minus the integral of x z), I12 = I23 = 0. With 2E = I11 w1^2 + I22 w2^2:
+I13 is the entry of the inertia matrix (minus the integral of x z), I12 = I23 = 0. With 2E = I11 w1^2 + I22
+w2^2:
 w1 = +-sqrt(2E/I11) sech(tau), w2 = sqrt(2E/I22) tanh(tau), tau = tau0 + k t, k = (I13/I11) sqrt(2E/I22).
 """
 
@@ -29,7 +31,9 @@ def motion(t, *, i11, i22, i13, w1, w2, i33=None, t_end=None) -> dict[str, np.nd
 
 
 def attitude(t, **parameters) -> np.ndarray:
-    """Quaternion (w, x, y, z), body to space, shape (times, 4), from the identity at t[0]; integrated in extended precision."""
+    """Quaternion (w, x, y, z), body to space, shape (times, 4), from the identity at t[0]; integrated in
+    extended precision.
+    """
 
     def rhs(time, quaternion):
         state = motion(time, **parameters)

@@ -1,7 +1,8 @@
-"""Trailers on on-axle hitches (B18). Kinematics: each axle rolls along its own heading. Laumond 1993; Sordalen 1993.
+"""Trailers on on-axle hitches (B18). Kinematics: each axle rolls along its own heading. Laumond 1993;
+Sordalen 1993.
 
-gamma = heading of the pulling vehicle minus heading of the trailer, L the trailer's length, v the pulling axle's speed, w its
-yaw rate: gamma' = w - (v/L) sin gamma. v < 0 (backing) is unstable at rate |v|/L.
+gamma = heading of the pulling vehicle minus heading of the trailer, L the trailer's length, v the pulling
+axle's speed, w its yaw rate: gamma' = w - (v/L) sin gamma. v < 0 (backing) is unstable at rate |v|/L.
 """
 
 import numpy as np
@@ -12,7 +13,9 @@ RUN = {"length": 0.7, "v": 1.2, "w": 0.4, "gamma0": 1.0, "t_end": 5.0}
 
 
 def hitch_angle(t, *, length, v, w, gamma0, t_end=None) -> np.ndarray:
-    """gamma for constant v and w, modulo 2 pi: h = tan(gamma/2) solves a Riccati equation; w = 0: h = h0 exp(-v t/L)."""
+    """gamma for constant v and w, modulo 2 pi: h = tan(gamma/2) solves a Riccati equation; w = 0: h = h0
+    exp(-v t/L).
+    """
     t = np.asarray(t, float)
     rate = np.sqrt(complex((v / length) ** 2 - w**2)) / 2
     even = np.cosh(rate * t).real
@@ -36,7 +39,8 @@ def steady_radii(radius: float, lengths) -> np.ndarray:
 def chain(t, *, lengths, speed, yaw_rate, headings0, x0=0.0, y0=0.0) -> dict[str, np.ndarray]:
     """Kinematics of a leader and n trailers, given the leader's speed(t) and yaw_rate(t).
 
-    **Returns:** x, y of the leader's axle, `headings` (times, n + 1), leader first, and `speeds`, the axles' speeds.
+    **Returns:** x, y of the leader's axle, `headings` (times, n + 1), leader first, and `speeds`, the axles'
+    speeds.
     """
 
     def rates(time, headings):

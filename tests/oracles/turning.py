@@ -1,4 +1,5 @@
-"""A push along a heading that turns uniformly: heading h = h0 + w t, forward speed u = u0 + k * integral of cos h.
+"""A push along a heading that turns uniformly: heading h = h0 + w t, forward speed u = u0 + k * integral of
+cos h.
 
 The common core of the axle (S11, B1) and of the skate (B2). With x = w t,
     S = int cos h = t cos(h0 + x/2) sinc(x/2),   C = int sin h = t sin(h0 + x/2) sinc(x/2),
@@ -35,7 +36,12 @@ def push_while_turning(t, u0: float, k: float, heading0: float, rate: float) -> 
     sine, versine = t * _sinc(x), t * (x / 2) * _sinc(x / 2) ** 2  # sin(x)/w, (1 - cos x)/w
     mixed = t**2 * (_excess(2 * x) - _excess(x))  # int (versine cos x)
     # int S sin h, with S = cos0 sine - sin0 versine and sin h = sin0 cos x + cos0 sin x
-    moment = cos0 * sin0 * sine**2 / 2 + cos0**2 * t**2 * _excess(2 * x) - sin0**2 * mixed - sin0 * cos0 * versine**2 / 2
+    moment = (
+        cos0 * sin0 * sine**2 / 2
+        + cos0**2 * t**2 * _excess(2 * x)
+        - sin0**2 * mixed
+        - sin0 * cos0 * versine**2 / 2
+    )
     return {
         "heading": heading0 + x,
         "u": u0 + k * along,

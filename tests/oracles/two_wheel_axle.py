@@ -1,10 +1,11 @@
-"""Two wheels on a rigid axle on an incline. Wang & Pao (2003), eq. (57)-(67); the variant with disc wheels and a heavy axle.
+"""Two wheels on a rigid axle on an incline. Wang & Pao (2003), eq. (57)-(67); the variant with disc wheels
+and a heavy axle.
 
 Axes: x down the slope, y across it, z along its normal. phi is the heading: the wheels' forward direction is
-(cos phi, sin phi, 0), the axle direction j'' = (-sin phi, cos phi, 0); wheel 2 lies on the +j'' side, r2 - r1 = l j''.
-psi_j > 0 rolls forward: xdot_j = a psidot_j cos phi, ydot_j = a psidot_j sin phi; a psidot_2 = a psidot_1 - l phidot.
-Equations (64) give phi'' = 0 and psi1'' = M g sin(alpha) cos(phi) / (a (M + m')); no initial value is special, phi rate
-zero included.
+(cos phi, sin phi, 0), the axle direction j'' = (-sin phi, cos phi, 0); wheel 2 lies on the +j'' side, r2 - r1
+= l j''. psi_j > 0 rolls forward: xdot_j = a psidot_j cos phi, ydot_j = a psidot_j sin phi; a psidot_2 = a
+psidot_1 - l phidot. Equations (64) give phi'' = 0 and psi1'' = M g sin(alpha) cos(phi) / (a (M + m')); no
+initial value is special, phi rate zero included.
 """
 
 import numpy as np
@@ -39,7 +40,24 @@ RUN_HEAVY_AXLE = {
 }
 
 
-def motion(t, *, radius, length, mass, rim_mass, slope, gravity, phi0, phi_rate, psi1_rate, x1=0.0, y1=0.0, psi1=0.0, psi2=0.0, **_) -> dict[str, np.ndarray]:
+def motion(
+    t,
+    *,
+    radius,
+    length,
+    mass,
+    rim_mass,
+    slope,
+    gravity,
+    phi0,
+    phi_rate,
+    psi1_rate,
+    x1=0.0,
+    y1=0.0,
+    psi1=0.0,
+    psi2=0.0,
+    **_,
+) -> dict[str, np.ndarray]:
     """x1, y1, z1, psi1, x2, y2, z2, psi2, phi and the rates psi1_rate, psi2_rate, phi_rate (S11)."""
     k = mass * gravity * np.sin(slope) / (mass + rim_mass)  # a psi1'' = k cos(phi)
     path = push_while_turning(t, radius * psi1_rate, k, phi0, phi_rate)
@@ -61,8 +79,12 @@ def motion(t, *, radius, length, mass, rim_mass, slope, gravity, phi0, phi_rate,
     }
 
 
-def motion_heavy_axle(t, *, radius, half_track, wheel_mass, axle_mass, slope, gravity, u0, th0, th_rate, t_end=None) -> dict[str, np.ndarray]:
-    """x, y (middle of the axle), th, p1, p2 and u, with rows c xd + s yd -+ b thd = R p1d, R p2d (B1). Starts at zero."""
+def motion_heavy_axle(
+    t, *, radius, half_track, wheel_mass, axle_mass, slope, gravity, u0, th0, th_rate, t_end=None
+) -> dict[str, np.ndarray]:
+    """x, y (middle of the axle), th, p1, p2 and u, with rows c xd + s yd -+ b thd = R p1d, R p2d (B1). Starts
+    at zero.
+    """
     k = gravity * np.sin(slope) * (2 * wheel_mass + axle_mass) / (3 * wheel_mass + axle_mass)
     path = push_while_turning(t, u0, k, th0, th_rate)
     turned = half_track * th_rate * np.asarray(t, float)

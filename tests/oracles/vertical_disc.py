@@ -1,7 +1,8 @@
 """Vertical disc rolling on a level plane (B4). Bloch, Nonholonomic Mechanics and Control, 2003, sec. 1.4.
 
-phi heading, th rolling angle; rows xdot = R cos(phi) thdot, ydot = R sin(phi) thdot. Both rates are constant. The
-multipliers are those of the rows xdot - R cos(phi) thdot = 0 and ydot - R sin(phi) thdot = 0: the forces (l1, l2) on (x, y).
+phi heading, th rolling angle; rows xdot = R cos(phi) thdot, ydot = R sin(phi) thdot. Both rates are constant.
+The multipliers are those of the rows xdot - R cos(phi) thdot = 0 and ydot - R sin(phi) thdot = 0: the forces
+(l1, l2) on (x, y).
 """
 
 import numpy as np
@@ -11,7 +12,9 @@ from .turning import push_while_turning
 RUN = {"mass": 1.0, "radius": 1.0, "phi0": 0.0, "phi_rate": 2.0, "th_rate": 1.0, "t_end": 1.0}
 
 
-def motion(t, *, radius, phi0, phi_rate, th_rate, th0=0.0, x0=0.0, y0=0.0, mass=1.0, t_end=None) -> dict[str, np.ndarray]:
+def motion(
+    t, *, radius, phi0, phi_rate, th_rate, th0=0.0, x0=0.0, y0=0.0, mass=1.0, t_end=None
+) -> dict[str, np.ndarray]:
     """x, y, phi, th and the multipliers l1, l2; regular at phi_rate = 0."""
     path = push_while_turning(t, radius * th_rate, 0.0, phi0, phi_rate)
     size = mass * phi_rate * radius * th_rate

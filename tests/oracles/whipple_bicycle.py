@@ -1,9 +1,11 @@
-"""Linear Whipple bicycle, upright and straight (B16). Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007) 1955.
+"""Linear Whipple bicycle, upright and straight (B16). Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A
+463 (2007) 1955.
 
-M q'' + v C1 q' + (g K0 + v^2 K2) q = f, q = (roll, steer). Axes of the paper: x forward, y right, z down, origin at the rear
-contact; roll > 0 to the right, steer > 0 to the right. R, B, H, F: rear wheel, rear body, front handlebar, front wheel. x, z of
-the wheels' centres are (0, -r_R) and (w, -r_F). Inertias are central, in these axes; I_zz of a wheel equals its I_xx.
-`matrices` is the appendix of the paper, from 25 parameters; the constants below are its values to 21 digits.
+M q'' + v C1 q' + (g K0 + v^2 K2) q = f, q = (roll, steer). Axes of the paper: x forward, y right, z down,
+origin at the rear contact; roll > 0 to the right, steer > 0 to the right. R, B, H, F: rear wheel, rear body,
+front handlebar, front wheel. x, z of the wheels' centres are (0, -r_R) and (w, -r_F). Inertias are central,
+in these axes; I_zz of a wheel equals its I_xx. `matrices` is the appendix of the paper, from 25 parameters;
+the constants below are its values to 21 digits.
 """
 
 import mpmath
@@ -24,7 +26,8 @@ K0_TEXT = (("-80.95", "-2.599516852498716407343"), ("-2.599516852498716407343", 
 K2_TEXT = (("0", "76.59734589573222151899"), ("0", "2.654315237946040252254"))
 M, C1, K0, K2 = (np.array(rows, float) for rows in (M_TEXT, C1_TEXT, K0_TEXT, K2_TEXT))
 
-# speed: castering, capsize (both real), weave real part, weave imaginary part; at v = 0 the weave pair is two real roots.
+# speed: castering, capsize (both real), weave real part, weave imaginary part; at v = 0 the weave pair is two
+# real roots.
 _MODES = {
     1: (-7.11008014637440773, -3.13423125066578423, 3.52696170990069417, 0.807740275199310045),
     2: (-8.67387984831737163, -3.07158645641514251, 2.68234517512745345, 1.68066296590675776),
@@ -39,7 +42,9 @@ _MODES = {
 }
 # speed -> the four eigenvalues: castering, capsize, weave pair
 EIGENVALUES: dict[int, np.ndarray] = {
-    0: np.array([-5.53094371765393464, -3.13164324790655567, 3.13164324790655567, 5.53094371765393464], complex),
+    0: np.array(
+        [-5.53094371765393464, -3.13164324790655567, 3.13164324790655567, 5.53094371765393464], complex
+    ),
     **{v: np.array([ca, cs, complex(re, im), complex(re, -im)]) for v, (ca, cs, re, im) in _MODES.items()},
 }
 WEAVE_SPEED = 4.2923825363411039587
@@ -57,7 +62,8 @@ def exact_parameters() -> dict:
 def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
     """M, C1, K0, K2 as nested lists of the entries, from the 25 parameters (appendix A of the paper).
 
-    Entries are whatever the parameters are: floats, arrays (one bicycle per element) or, with mpmath's cos and sin, mpf.
+    Entries are whatever the parameters are: floats, arrays (one bicycle per element) or, with mpmath's cos
+    and sin, mpf.
     """
     w, c, lam, r_r, r_f = p["w"], p["c"], p["lam"], p["rR"], p["rF"]
     m_r, m_b, m_h, m_f = p["mR"], p["mB"], p["mH"], p["mF"]
@@ -67,7 +73,16 @@ def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
     m_t = m_r + m_b + m_h + m_f
     x_t = (x_b * m_b + x_h * m_h + w * m_f) / m_t
     z_t = (-r_r * m_r + z_b * m_b + z_h * m_h - r_f * m_f) / m_t
-    t_xx = p["IRxx"] + p["IBxx"] + p["IHxx"] + p["IFxx"] + m_r * r_r**2 + m_b * z_b**2 + m_h * z_h**2 + m_f * r_f**2
+    t_xx = (
+        p["IRxx"]
+        + p["IBxx"]
+        + p["IHxx"]
+        + p["IFxx"]
+        + m_r * r_r**2
+        + m_b * z_b**2
+        + m_h * z_h**2
+        + m_f * r_f**2
+    )
     t_xz = p["IBxz"] + p["IHxz"] - m_b * x_b * z_b - m_h * x_h * z_h + m_f * w * r_f
     t_zz = p["IRxx"] + p["IBzz"] + p["IHzz"] + p["IFxx"] + m_b * x_b**2 + m_h * x_h**2 + m_f * w**2
     # the front assembly (A)
@@ -100,7 +115,9 @@ def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
     }
 
 
-AT_5 = {  # of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40 digits
+# of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40
+# digits
+AT_5 = {
     "w": (0.5784301836667 + 11.04402541662j, 1.873378311812, -0.4776030485691, -4.393049781489),
     "c": (12.18560145265 - 4.418538571895j, -9.374190592203, 11.47995745126, 28.88866886342),
     "lam": (2.459557200396 - 13.16293523872j, -3.350671972655, 4.17667019102, 4.308855800463),
@@ -117,7 +134,9 @@ def state_matrix(v: float, m=M, c1=C1, k0=K0, k2=K2, gravity: float = 9.81) -> n
 
 
 def exact_eigenvalues(v, parts: dict, gravity) -> list:
-    """The four roots of det(M s^2 + v C1 s + g K0 + v^2 K2) in mpmath's current precision, for `parts` from `matrices`."""
+    """The four roots of det(M s^2 + v C1 s + g K0 + v^2 K2) in mpmath's current precision, for `parts` from
+    `matrices`.
+    """
     return mpmath.polyroots(exact_polynomial(v, parts, gravity), maxsteps=200, extraprec=200)
 
 

@@ -1,19 +1,26 @@
-"""A ball on a plate that tilts about two axes through the middle of its top: the classic of control laboratories.
+"""A ball on a plate that tilts about two axes through the middle of its top: the classic of control
+laboratories.
 
-About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute angle of rolling s: left
-alone, a ball runs off. Motors therefore tilt the plate against the place and the velocity of the ball.
-Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12 (2002) 217 describes the apparatus.
+About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's
+absolute angle of rolling s: left alone, a ball runs off. Motors therefore tilt the plate against the place
+and the velocity of the ball. Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12
+(2002) 217 describes the apparatus.
 """
 
 import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "The plate tilts so that the ball follows a point on a circle, with a lag. With all four gains zero it runs off."
+LOOK = (
+    "The plate tilts so that the ball follows a point on a circle, with a lag. With all four gains zero it"
+    " runs off."
+)
 
 
 class BallOnPlate(jj.Scene):
-    """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: the place where the ball is wanted (m)."""
+    """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: the
+    place where the ball is wanted (m).
+    """
 
     ball_mass: float = jj.parameter(0.3, unit="kg", positive=True)
     radius: float = jj.parameter(0.03, unit="m", positive=True)
@@ -27,17 +34,26 @@ class BallOnPlate(jj.Scene):
     coordinates = jj.coordinates("x y roll pitch", jj.quaternion("attitude"))
     inputs = jj.inputs("wanted_x wanted_y")
     domain = {"x": (-0.2, 0.2), "y": (-0.2, 0.2), "roll": (-0.4, 0.4), "pitch": (-0.4, 0.4)}
-    conventions = "z up; x, y along the plate; positive pitch lowers the side of x, positive roll raises the side of y."
+    conventions = (
+        "z up; x, y along the plate; positive pitch lowers the side of x, positive roll raises the side of y."
+    )
     example = {"x": 0.12}
     example_span = 4.0
 
     def bodies(self, t, q):
         plate = jj.rot_x(q.roll) @ jj.rot_y(q.pitch)
         on_plate = plate @ jnp.stack([q.x, q.y, self.radius + 0.0 * q.x])
-        corners = jnp.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]])
+        corners = jnp.array(
+            [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]
+        )
         return {
             "plate": jj.RigidBody(1.0, self.plate_inertia, jnp.zeros(3), plate, 0.25 * corners),
-            "ball": jj.RigidBody.ball(self.ball_mass, self.radius, position=on_plate, orientation=jj.quaternion_to_matrix(q.attitude)),
+            "ball": jj.RigidBody.ball(
+                self.ball_mass,
+                self.radius,
+                position=on_plate,
+                orientation=jj.quaternion_to_matrix(q.attitude),
+            ),
         }
 
     def loads(self, motion):
@@ -46,7 +62,9 @@ class BallOnPlate(jj.Scene):
         roll = self.rate_gain * u.y_rate - self.place_gain * (wanted.wanted_y - q.y)
         about_x = self.stiffness * (roll - q.roll) - self.damping * u.roll_rate
         about_y = self.stiffness * (pitch - q.pitch) - self.damping * u.pitch_rate
-        return jj.gravity(motion, self.gravity), jj.generalized_force(motion, roll_rate=about_x, pitch_rate=about_y)
+        return jj.gravity(motion, self.gravity), jj.generalized_force(
+            motion, roll_rate=about_x, pitch_rate=about_y
+        )
 
     def velocity_constraints(self, motion):
         ball, plate = motion["ball"], motion["plate"]

@@ -1,16 +1,23 @@
-"""A kick scooter with its rider standing still: a Whipple bicycle with small wheels and a low deck, pushed from behind.
+"""A kick scooter with its rider standing still: a Whipple bicycle with small wheels and a low deck, pushed
+from behind.
 
-Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s its rider must steer: left alone it falls.
-Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers are those of an adult's scooter, estimated.
+Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s its rider must steer: left
+alone it falls. Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers
+are those of an adult's scooter, estimated.
 """
 
 import jourdain_jax as jj
 
-LOOK = "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall, too little and too late."
+LOOK = (
+    "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall,"
+    " too little and too late."
+)
 
 
 class KickScooter(jj.models.WhippleBicycle):
-    """The Whipple bicycle with a scooter's numbers. Inputs: those of the bicycle, and `push`: the foot's force on the ground, forward on the deck (N)."""
+    """The Whipple bicycle with a scooter's numbers. Inputs: those of the bicycle, and `push`: the foot's
+    force on the ground, forward on the deck (N).
+    """
 
     w: float = jj.parameter(0.86, unit="m", positive=True, about="wheelbase")
     c: float = jj.parameter(0.03, unit="m", about="trail")
@@ -43,15 +50,22 @@ class KickScooter(jj.models.WhippleBicycle):
     example_span = 1.6
 
     def visuals(self, pose):
-        return {"rear frame": jj.Visual.line(*RIDER, radius=0.03), "front frame": jj.Visual.line(*FORK, radius=0.02)}
+        return {
+            "rear frame": jj.Visual.line(*RIDER, radius=0.03),
+            "front frame": jj.Visual.line(*FORK, radius=0.02),
+        }
 
     def loads(self, motion):
         deck = motion["rear frame"]
-        foot = deck.point((-self.xB, 0.0, self.zB + self.rR))  # behind the rider, at the height of the rear axle
+        foot = deck.point(
+            (-self.xB, 0.0, self.zB + self.rR)
+        )  # behind the rider, at the height of the rear axle
         return *super().loads(motion), jj.point_force(foot, motion.inputs.push * deck.orientation[:, 0])
 
     def effective_mass(self):
-        """What a push has to move when the scooter runs straight: all masses and the turning of the wheels (kg)."""
+        """What a push has to move when the scooter runs straight: all masses and the turning of the wheels
+        (kg).
+        """
         return self.mR + self.mB + self.mH + self.mF + self.IRyy / self.rR**2 + self.IFyy / self.rF**2
 
 

@@ -1,18 +1,25 @@
 """A tricycle (a fork-lift, a tug): the front wheel is driven and steered, two rear wheels roll freely.
 
-Three wheels carry a determined share each. In a turn with the steer angle d the rear wheels turn at (R -+ track/2)/r with
-R = wheelbase / tan(d), the front wheel at sqrt(R^2 + wheelbase^2)/r. Source: R. Siegwart and I. Nourbakhsh, Autonomous Mobile Robots (2004), 3.2.
+Three wheels carry a determined share each. In a turn with the steer angle d the rear wheels turn at (R -+
+track/2)/r with
+R = wheelbase / tan(d), the front wheel at sqrt(R^2 + wheelbase^2)/r. Source: R. Siegwart and I. Nourbakhsh,
+Autonomous Mobile Robots (2004), 3.2.
 """
 
 import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "The rear wheels turn at different rates, which is what a differential is for; the outer one carries more than the inner one."
+LOOK = (
+    "The rear wheels turn at different rates, which is what a differential is for; the outer one carries more"
+    " than the inner one."
+)
 
 
 class Tricycle(jj.Scene):
-    """x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs: `drive` about the front axle and `steer_torque` (N m)."""
+    """x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs: `drive` about the
+    front axle and `steer_torque` (N m).
+    """
 
     frame_mass: float = jj.parameter(60.0, unit="kg", positive=True)
     ahead: float = jj.parameter(0.4, unit="m", about="of the frame's mass centre before the rear axle")
@@ -27,7 +34,9 @@ class Tricycle(jj.Scene):
     inputs = jj.inputs("drive steer_torque")
     privileged = ("steer_rate", "front_rate")
     domain = {"heading": (-3.2, 3.2), "steer": (-1.0, 1.0)}
-    conventions = "z up; heading from x towards y; steer positive to the left; positive wheel angles roll forward."
+    conventions = (
+        "z up; heading from x towards y; steer positive to the left; positive wheel angles roll forward."
+    )
     example = {"steer": 0.5, "front_rate": 6.0}
     example_span = 6.0
 
@@ -35,11 +44,19 @@ class Tricycle(jj.Scene):
         frame, o = jj.rot_z(q.heading), 0.0 * q.x
         axle, fork = jnp.stack([q.x, q.y, o + self.radius]), frame @ jj.rot_z(q.steer)
         centre = axle + self.ahead * frame[:, 0] + jnp.stack([o, o, o + self.height - self.radius])
-        made = {"frame": jj.RigidBody.box(self.frame_mass, (0.9, 0.5, 0.4), position=centre, orientation=frame)}
-        places = {"left": 0.5 * self.track * frame[:, 1], "right": -0.5 * self.track * frame[:, 1], "front": self.wheelbase * frame[:, 0]}
+        made = {
+            "frame": jj.RigidBody.box(self.frame_mass, (0.9, 0.5, 0.4), position=centre, orientation=frame)
+        }
+        places = {
+            "left": 0.5 * self.track * frame[:, 1],
+            "right": -0.5 * self.track * frame[:, 1],
+            "front": self.wheelbase * frame[:, 0],
+        }
         for name, place in places.items():
             turned = (fork if name == "front" else frame) @ jj.rot_y(q[name])
-            made[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=axle + place, orientation=turned)
+            made[name] = jj.RigidBody.thin_disc(
+                self.wheel_mass, self.radius, axis="y", position=axle + place, orientation=turned
+            )
         return made
 
     def loads(self, motion):
@@ -47,7 +64,12 @@ class Tricycle(jj.Scene):
         return (
             jj.gravity(motion, self.gravity),
             jj.torque(motion, "front", motion.inputs.drive * front, reaction="frame"),
-            jj.torque(motion, "front", motion.inputs.steer_torque * motion["frame"].orientation[:, 2], reaction="frame"),
+            jj.torque(
+                motion,
+                "front",
+                motion.inputs.steer_torque * motion["frame"].orientation[:, 2],
+                reaction="frame",
+            ),
         )
 
     def contacts(self, pose):

@@ -49,7 +49,9 @@ class EnergyBalance:
     changed_by: tuple[str, ...]
 
     def __str__(self) -> str:
-        return "T + V is conserved" if self.conserved else f"T + V is changed by {' and '.join(self.changed_by)}"
+        return (
+            "T + V is conserved" if self.conserved else f"T + V is changed by {' and '.join(self.changed_by)}"
+        )
 
 
 def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
@@ -70,7 +72,9 @@ def energy_balance(scene: Scene) -> EnergyBalance:
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))
     powers, size = _powers(scene, t, q, u, inputs)
     limit = (1e-9 if q.dtype == jnp.float64 else 1e-4) * float(jnp.max(size))
-    changed_by = tuple(text for name, text in _ORIGINS.items() if float(largest(getattr(powers, name))) > limit)
+    changed_by = tuple(
+        text for name, text in _ORIGINS.items() if float(largest(getattr(powers, name))) > limit
+    )
     changed_by += ("potentials that depend on inputs",) if structure_of(scene).potentials_of_inputs else ()
     return EnergyBalance(not changed_by, changed_by)
 

@@ -49,10 +49,16 @@ class RowsOverStates:
         slopes = jacobian(g, flat, u)
         self.shape = len(flat), len(u)
         self.places = [(i, u.index(n)) for i, row in enumerate(slopes) for n in row]
-        self.values = [*flat, *g.substituted(at.qdot.tolist(), dict.fromkeys(u, g.zero)), *(node for row in slopes for node in row.values())]
+        self.values = [
+            *flat,
+            *g.substituted(at.qdot.tolist(), dict.fromkeys(u, g.zero)),
+            *(node for row in slopes for node in row.values()),
+        ]
         variables = [self.traced.t, *self.traced.q.tolist()]
         changes = jacobian(g, self.values, variables)
-        self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
+        self.changes = [
+            (i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()
+        ]
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
         """Return values at the points for the speeds u, and their derivative as a function of directions. The
@@ -60,7 +66,10 @@ class RowsOverStates:
 
         `x`, `u` and the directions have a leading axis of points.
         """
-        probes = Probes(self.traced.graph, named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs)))))
+        probes = Probes(
+            self.traced.graph,
+            named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs)))),
+        )
         found = probes([*self.values, *(node for _, _, node in self.changes)])
         value, change = found[: len(self.values)], found[len(self.values) :]
         place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))
@@ -113,7 +122,10 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
     curved = largest(A - other, 2) > 1.5e-8 * (1 + largest(A, 2))
     changes = [along(np.tile(e, (len(x), 1))) for e in np.eye(x.shape[1])]
     da, dF = (np.stack(parts, axis=-1) for parts in zip(*changes, strict=True))
-    worst = {name: max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True)) for s, name in enumerate(names)}
+    worst = {
+        name: max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True))
+        for s, name in enumerate(names)
+    }
     return {name: float("inf") if curved[:, s].any() else worst[name] for s, name in enumerate(names)}
 
 
@@ -212,7 +224,9 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
     return np.concatenate(values), np.concatenate(sizes)
 
 
-def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _brackets_of(
+    fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the result of `_brackets`, from the generators at these points and their derivatives `along`
     directions.
     """
@@ -247,16 +261,20 @@ class _Fields:
     """
 
     def __init__(self, scene: Scene, with_time: bool, u):
-        self.scene, self.with_time, self.u, self.rows = scene, with_time, np.asarray(u, float), RowsOverStates(scene)
+        self.scene, self.with_time, self.u, self.rows = (
+            scene,
+            with_time,
+            np.asarray(u, float),
+            RowsOverStates(scene),
+        )
         # indices in (1, u)
         self.free = [0, *(1 + i for i in structure_of(scene).independent)]
         self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return values at many points, and a function of one direction per point that returns derivatives.
-        """
+        """Return values at many points, and a function of one direction per point that returns derivatives."""
         first = 1 - self.with_time
-        padded = lambda a: np.pad(a, ((0, 0), (first, 0)))  # noqa: E731
+        padded = lambda a: np.pad(a, ((0, 0), (first, 0)))
         (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
         length = np.linalg.norm(a[..., 1:], axis=2, keepdims=True)
         scale = 1 / np.where(length > 0, length, 1.0)
@@ -275,4 +293,8 @@ class _Fields:
     def _solved(self, a: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return `-a_z^-1 right`, with a_z for the dependent speeds."""
         a_z = a[:, :, self.dependent]
-        return -np.linalg.solve(a_z, right) if a_z.shape[1] == a_z.shape[2] else -np.linalg.pinv(a_z, rcond=1e-12) @ right
+        return (
+            -np.linalg.solve(a_z, right)
+            if a_z.shape[1] == a_z.shape[2]
+            else -np.linalg.pinv(a_z, rcond=1e-12) @ right
+        )

@@ -9,7 +9,6 @@ others), times M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peter
 Multibody System Dynamics 33 (2015) 143.
 """
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +29,19 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
     smallest_pivot,
 )
-from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, array_module, compiled_quickly, holds, is_traced, largest, static
+from jourdain_jax.calculus.reals import (
+    Count,
+    Indices,
+    Numbers,
+    Scalar,
+    all_finite,
+    array_module,
+    compiled_quickly,
+    holds,
+    is_traced,
+    largest,
+    static,
+)
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.state_projection import State
@@ -50,7 +61,9 @@ class Modes(eqx.Module):
     eigenvalues: Complex[Array, "modes"]  # s, in 1/s
     shapes: Complex[Array, "parts modes"]  # (M s^2 + C s + K) shape = 0
     left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
-    condition: Float[Array, "modes"]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
+    condition: Float[
+        Array, "modes"
+    ]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
     scene: Scene
     named: Labels | None = static()
 
@@ -83,11 +96,21 @@ class Linearization(Printed, eqx.Module):
 
     def _text(self) -> str:
         if self.A.ndim != 2:
-            return f"Linearizations of shape {self.A.shape[:-2]}; named coordinates: {', '.join(self.coordinates) or 'none'}"
-        lines, names = [f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
-            f"pivot {float(self.pivot):.2g}"], self.coordinates
+            return (
+                f"Linearizations of shape {self.A.shape[:-2]}; named coordinates:"
+                f" {', '.join(self.coordinates) or 'none'}"
+            )
+        lines, names = (
+            [
+                f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
+                f"pivot {float(self.pivot):.2g}"
+            ],
+            self.coordinates,
+        )
         if names:
-            lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)]
+            lines += [
+                line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)
+            ]
             lines += matrix("F", self.F, names, self.inputs) if self.inputs else []
             lines.append(f"  coupling to other coordinates {float(self.coupling):.1e}")
         else:
@@ -131,7 +154,9 @@ class Linearization(Printed, eqx.Module):
         """
         found = self.modes(names)
         check_name(mode, dict.fromkeys(found.names), f"no mode `{mode}`")
-        eigenvalues = [complex(s) for s, name in zip(found.eigenvalues, found.names, strict=True) if name == mode]
+        eigenvalues = [
+            complex(s) for s, name in zip(found.eigenvalues, found.names, strict=True) if name == mode
+        ]
         return sensitivities(self.about, mode, max(eigenvalues, key=lambda s: s.imag), held)
 
     def state_eigenvalues(self) -> Complex[Array, "states"]:
@@ -208,7 +233,11 @@ def linearize(
         return found
     if privileged is None and scene.privileged is None:
         chosen = privileged_at(scene, state, f, y)
-        found = found if chosen == y else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
+        found = (
+            found
+            if chosen == y
+            else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
+        )
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` are not determined by its "
@@ -229,7 +258,9 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
         warn(text, SensitivityWarning)
 
 
-def _about(instant, scene: Scene, state: State, f, y: Indices, dependent: Labels | None, coordinates: Labels | None) -> Linearization:
+def _about(
+    instant, scene: Scene, state: State, f, y: Indices, dependent: Labels | None, coordinates: Labels | None
+) -> Linearization:
     v, D, mass = instant(scene, state.t, state.q, state.u, f)
     at, names = places_of(scene), perturbed_names(scene)
     q, known = state.q, not is_traced((D, state))
@@ -243,7 +274,9 @@ def _about(instant, scene: Scene, state: State, f, y: Indices, dependent: Labels
         coordinates = tuple(name for name in independent if _own_rate(scene, name) in y)
     matrices = _matrices(scene, q, v, D, mass, independent, y, coordinates)
     states, inputs = (*independent, *speeds), scene.inputs.entries
-    return Linearization(**matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f))
+    return Linearization(
+        **matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f)
+    )
 
 
 def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coordinates: Labels) -> dict:
@@ -256,8 +289,14 @@ def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coor
     # derivatives along every perturbation (ds, du, df), and perturbations as functions of the independent
     # ones
     along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
-    T = eliminated(along[np.concatenate([at.geometric, at.phi])], np.concatenate([kept, count + chosen, count + m + np.arange(len(at.f))]))
-    pivots = smallest_pivot(along[at.geometric], others(kept, count)), smallest_pivot(along[at.phi], count + others(chosen, m))
+    T = eliminated(
+        along[np.concatenate([at.geometric, at.phi])],
+        np.concatenate([kept, count + chosen, count + m + np.arange(len(at.f))]),
+    )
+    pivots = (
+        smallest_pivot(along[at.geometric], others(kept, count)),
+        smallest_pivot(along[at.phi], count + others(chosen, m)),
+    )
 
     # rows of A and B: rates of the independent ds in axes that rotate with the unperturbed motion, and of the
     # privileged speeds; a rotation ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq =
@@ -266,10 +305,22 @@ def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coor
     rates = xp.concatenate([rates, along[constant] @ T])
     n = len(kept) + len(y)
     A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
-    found = dict(zip(("M", "C", "K", "F", "coupling"), _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates), strict=True))
+    found = dict(
+        zip(
+            ("M", "C", "K", "F", "coupling"),
+            _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates),
+            strict=True,
+        )
+    )
     acceleration = largest(v[constant])
     residual = xp.maximum(acceleration, largest(change))
-    found |= {"A": A, "B": B, "acceleration": acceleration, "residual": residual, "pivot": xp.minimum(*pivots)}
+    found |= {
+        "A": A,
+        "B": B,
+        "acceleration": acceleration,
+        "residual": residual,
+        "pivot": xp.minimum(*pivots),
+    }
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 
@@ -287,7 +338,11 @@ def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates:
     M = back[count:, count:].T @ mass @ back[count:, count:]
     K, C, F = -M @ rates[:, :count], -M @ rates[:, count:], M @ forced
     beside = others(p, count)
-    neglected = [_relative(M[:k, k:], M[:k, :k]), _relative(C[:k, k:], C[:k, :k]), _relative(K[:k, beside], K[:k, p])]
+    neglected = [
+        _relative(M[:k, k:], M[:k, :k]),
+        _relative(C[:k, k:], C[:k, :k]),
+        _relative(K[:k, beside], K[:k, p]),
+    ]
     return M[:k, :k], C[:k, :k], K[:k, p], F[:k], xp.max(xp.stack(neglected))
 
 

@@ -60,7 +60,11 @@ class Places(NamedTuple):
 
 def places_of(scene: Scene) -> Places:
     """Return the positions for a scene."""
-    n, m, geometric = len(scene.coordinate_names.entries), len(scene.speed_names.entries), len(names_of_position_rows(scene))
+    n, m, geometric = (
+        len(scene.coordinate_names.entries),
+        len(scene.speed_names.entries),
+        len(names_of_position_rows(scene)),
+    )
     of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
     return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
 
@@ -120,12 +124,22 @@ class ByProgram:
         given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
         t, q, u = given[first], given[first + 1 :][:n], given[first + 1 + n :][:m]
         of_rates = [program.qdot, program.ydot, program.z if asked else (), program.guards]
-        qdot, ydot, z, self.guards = _copied(graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given)
+        qdot, ydot, z, self.guards = _copied(
+            graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given
+        )
         M, self.has_masses = rows.M or {}, rows.M is not None
-        g, phi, of_masses = _copied(graph, [rows.g, rows.phi, M.values()], rows.graph, (rows.parameters, rows.t, rows.q, rows.u, rows.inputs), given)
+        g, phi, of_masses = _copied(
+            graph,
+            [rows.g, rows.phi, M.values()],
+            rows.graph,
+            (rows.parameters, rows.t, rows.q, rows.u, rows.inputs),
+            given,
+        )
         udot = dict(zip(program.independent, ydot, strict=True))
         if asked:
-            motion = {t: graph.one} | dict(zip(q, qdot, strict=True)) | {u[k]: node for k, node in udot.items()}
+            motion = (
+                {t: graph.one} | dict(zip(q, qdot, strict=True)) | {u[k]: node for k, node in udot.items()}
+            )
             dependent = dict(zip(program.dependent, z, strict=True))
             udot |= dict(zip(asked, derivatives(graph, [dependent[k] for k in asked], motion), strict=True))
         self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
@@ -170,7 +184,12 @@ def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
         equations, rows = equations_and_rows(scene, t, q, u, f)
         problem = scaled(equations, rows.judged_by(usual_rows(scene)))
         udot = problem.c * Privileged(constant).solve(problem)[0]
-        return jnp.concatenate([coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]), equations.M
+        return (
+            jnp.concatenate(
+                [coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]
+            ),
+            equations.M,
+        )
 
     x = jnp.concatenate([t[None], q, u, f])
     v, slope, M = jax.linearize(instant, x, has_aux=True)
@@ -185,21 +204,27 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
         return ByMatrices(constant)
     try:
         program = lower(scene)
-        found = by_program(as_scene(scene), program, tuple(k for k in constant if k not in program.independent))
+        found = by_program(
+            as_scene(scene), program, tuple(k for k in constant if k not in program.independent)
+        )
     except NotLowered:
         return ByMatrices(constant)
     return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Return names of the coordinates that do not affect accelerations; for a quaternion, names of its parts.
-    """
-    return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
+    """Return names of the coordinates that do not affect accelerations; for a quaternion, names of its parts."""
+    return entries_of(
+        scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
+    )
 
 
 def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
     """Return names of coordinates; for a quaternion or an angular velocity, names of its parts."""
-    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    groups = {
+        group: scene.coordinate_names.entries[first : first + length]
+        for group, first, length in scene.coordinate_names.groups
+    }
     return {entry for name in names for entry in groups.get(name, (name,))}
 
 
@@ -213,24 +238,32 @@ def on_rows(scene: Scene) -> np.ndarray:
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
 
-def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:
+def _copied(
+    graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]
+) -> list[list[int]]:
     """Return copies of lists of nodes of another graph, in which its parameters (by leaf), t, q, u and inputs
     are replaced.
     """
     parameters, *rest = variables
     places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]
-    new = graph.copied([n for part in parts for n in part], of, {n: x for n, x in zip(places, given, strict=True) if n >= 0})
+    new = graph.copied(
+        [n for part in parts for n in part], of, {n: x for n, x in zip(places, given, strict=True) if n >= 0}
+    )
     return [[new[n] for n in part] for part in parts]
 
 
-def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+def _evaluated(
+    graph: Graph, nodes: Sequence[int], variables: Sequence[int]
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy, one
     operation at a time.
     """
     if jax.config.jax_enable_x64 and is_made(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
         return lambda given: np.asarray(kernel(given))
-    return lambda given: Probes(graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True)))(nodes)[:, 0]
+    return lambda given: Probes(
+        graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True))
+    )(nodes)[:, 0]
 
 
 def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
@@ -239,7 +272,9 @@ def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int])
     """
     if is_made(graph, nodes):
         return values_of_nodes(graph, nodes, variables)
-    return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])
+    return lambda x: jnp.stack(
+        [jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))]
+    )
 
 
 def is_made(graph: Graph, nodes: Sequence[int]) -> bool:

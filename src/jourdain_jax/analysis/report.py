@@ -7,7 +7,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
+from jourdain_jax.analysis.integrability import (
+    frobenius_violations,
+    growth_vector,
+    integrable_below,
+    reachable,
+)
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.integrate.inputs import as_inputs
@@ -23,7 +28,16 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.structure.structure import structure_of
 
-AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", "affine", "worst_pivot", "typical_pivot", "rank_losses")
+AS_IN_STRUCTURE = (
+    "degrees_of_freedom",
+    "rank",
+    "redundant_rows",
+    "rheonomic",
+    "affine",
+    "worst_pivot",
+    "typical_pivot",
+    "rank_losses",
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,7 +75,9 @@ class Report(Printed):
     privileged_velocities: Labels
     privileged_by_user: bool
     lowering: str  # number of operations of the scalar program and how it is integrated, or why there is none
-    worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
+    worst_pivot: (
+        float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
+    )
     typical_pivot: float
     rank_losses: Labels  # probed configurations at which the constraints lose rank
     # at the given start, or at the scene's example if its rank differs; otherwise None
@@ -72,9 +88,13 @@ class Report(Printed):
 
     def as_dict(self) -> dict:
         """Return the fields by name, as plain data; None replaces values that are not finite."""
-        facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        facts = {
+            key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()
+        }
         facts["domain"] = {name: list(bounds) for name, bounds in self.domain.items()}
-        facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
+        facts["frobenius_violations"] = {
+            row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()
+        }
         return facts
 
     def _text(self) -> str:
@@ -83,18 +103,28 @@ class Report(Printed):
             "speeds": _listed(self.speeds),
             "rows": f"{len(self.rows)}, of rank {self.rank}" if self.rows else "none",
             "degrees of freedom": str(self.degrees_of_freedom),
-            "redundant rows": _listed(self.redundant_rows) if self.redundant_rows else self._no_redundant_rows(),
+            "redundant rows": (
+                _listed(self.redundant_rows) if self.redundant_rows else self._no_redundant_rows()
+            ),
             "holonomic row by row": _listed(self.integrable_rows),
             "nonholonomic row by row": _listed(self.nonholonomic_rows),
             "growth vector": self._growth(),
-            "depends on time": f"yes (rheonomic): {', '.join(self.depends_on_time)}" if self.rheonomic else "no (scleronomic)",
+            "depends on time": (
+                f"yes (rheonomic): {', '.join(self.depends_on_time)}"
+                if self.rheonomic
+                else "no (scleronomic)"
+            ),
             "cyclic coordinates": _listed(self.cyclic_coordinates),
             "ignorable coordinates": _listed(self.ignorable_coordinates),
             "privileged velocities": _listed(self.privileged_velocities),
             "chosen by": "the scene" if self.privileged_by_user else "the engine",
             "lowered to": self.lowering,
             "their conditioning": self._conditioning(),
-            "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
+            "rank is lost at": (
+                "none of the probed configurations"
+                if not self.rank_losses
+                else "; ".join(self.rank_losses[:4])
+            ),
             **({} if self.rank_at_start is None else {"at the start": self._at_start()}),
             "events": _listed(self.events),
             "probed in": self._probed(),
@@ -108,7 +138,10 @@ class Report(Printed):
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):
-            return f"{len(self.rows) - self.rank} at each configuration, but none at all of them: which rows follow from the others changes along the motion"
+            return (
+                f"{len(self.rows) - self.rank} at each configuration, but none at all of them: which rows"
+                " follow from the others changes along the motion"
+            )
         return "none"
 
     def _at_start(self) -> str:
@@ -131,24 +164,35 @@ class Report(Printed):
             return f"{sizes}, still growing at brackets of {self.bracket_depth} fields"
         count = self.holonomic_rows_together
         together = f"rows that are holonomic taken together: {count or 'none'}; " if self.rows else ""
-        return f"{sizes}, closed; {together}the motion stays on a manifold of dimension {self.growth_vector[-1]}"
+        return (
+            f"{sizes}, closed; {together}the motion stays on a manifold of dimension {self.growth_vector[-1]}"
+        )
 
     def _probed(self) -> str:
         stated = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in self.domain.items())
-        rest = "" if set(self.domain) >= {*self.coordinates, *self.speeds} else f"coordinates {_span(COORDINATE_DOMAIN)}, speeds {_span(SPEED_DOMAIN)}"
+        rest = (
+            ""
+            if set(self.domain) >= {*self.coordinates, *self.speeds}
+            else f"coordinates {_span(COORDINATE_DOMAIN)}, speeds {_span(SPEED_DOMAIN)}"
+        )
         return f"{stated}; otherwise {rest}" if stated and rest else stated or rest
 
     def _conditioning(self) -> str:
         if self.degrees_of_freedom == 0:
             return "nothing to choose, no freedom left"
-        worst = f"smallest pivot {self.worst_pivot:.2g}" if self.worst_pivot > 1e-9 else "singular at some probed configuration"
+        worst = (
+            f"smallest pivot {self.worst_pivot:.2g}"
+            if self.worst_pivot > 1e-9
+            else "singular at some probed configuration"
+        )
         return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
 
 
 @shown_from_users_lines
 @of_known_numbers
-def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | "
-    "None" = None) -> Report:
+def report(
+    scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | None" = None
+) -> Report:
     """Report freedoms, constraints, rank, redundancy, integrability, growth vector, cyclic and ignorable
     coordinates of a scene.
 
@@ -210,6 +254,8 @@ def _lowering(built: Model) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
-    reason = native_motion.reason_against(modelled(built.scene).field(), built.scene, as_inputs(built.scene, None), bool(built.events))
+    reason = native_motion.reason_against(
+        modelled(built.scene).field(), built.scene, as_inputs(built.scene, None), bool(built.events)
+    )
     where = f"not to machine code: {reason}" if reason else f"to machine code{ffi.devices()}"
     return f"a scalar program of {found.operations} operations{calls}; {where}"

@@ -24,7 +24,13 @@ from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, ran
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies, partial_velocities, pose_at
+from jourdain_jax.equations.kinematics import (
+    coordinate_rates,
+    motion_at,
+    of_bodies,
+    partial_velocities,
+    pose_at,
+)
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
@@ -91,7 +97,10 @@ def along(f: Callable, arguments, point, direction, u) -> tuple:
     and 2h, and the increment h, which depends on the speeds `u`.
     """
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
-    ends = [_value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    ends = [
+        _value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction))
+        for k in (-2, -1, 1, 2)
+    ]
     return *_pushed(f, arguments, point, direction), ends, h
 
 
@@ -154,10 +163,15 @@ class Verification(Printed, eqx.Module):
         lines = [f"Verification of {self.scene}: {'passed' if self.passed else 'FAILED'}"]
         for check in self.checks:
             verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
-            lines.append(f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}" + (f"; {check.note}" if check.note else ""))
+            lines.append(
+                f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}"
+                + (f"; {check.note}" if check.note else "")
+            )
         if not self.certifies:
-            lines.append("  single precision: gross errors show, but passing certifies nothing; verify in "
-                "double precision (JAX_ENABLE_X64=1)")
+            lines.append(
+                "  single precision: gross errors show, but passing certifies nothing; verify in "
+                "double precision (JAX_ENABLE_X64=1)"
+            )
         if self.not_applicable:
             lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
         return "\n".join([*lines, self.mistakes]).rstrip()
@@ -178,9 +192,13 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     It needs concrete numbers, so it does not run under jit or vmap.
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
-        raise ValueError(f"`direction` is {described(direction)}, expected a `{type(scene).__name__}` whose "
-            "fields hold the change of each parameter")
-    A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene))
+        raise ValueError(
+            f"`direction` is {described(direction)}, expected a `{type(scene).__name__}` whose "
+            "fields hold the change of each parameter"
+        )
+    A, dA, size = _row_change(
+        scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene)
+    )
     if A.size == 0:
         return True
     P = np.asarray(pseudo_inverse(jnp.asarray(A)))
@@ -200,7 +218,9 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
     return value, change, jnp.max(jnp.abs(value), initial=1.0)
 
 
-def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int) -> list[Check]:
+def gradient_checks(
+    scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int
+) -> list[Check]:
     """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
     the coordinates, arbitrary in the speeds, and relative to the values in the parameters.
 
@@ -212,24 +232,47 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
         return []
     generator = np.random.default_rng(seed)
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-    relative = jax.tree.map(lambda x: jnp.asarray(generator.normal(size=x.shape) * np.where(x == 0, 1.0, x), x.dtype), moving)
+    relative = jax.tree.map(
+        lambda x: jnp.asarray(generator.normal(size=x.shape) * np.where(x == 0, 1.0, x), x.dtype), moving
+    )
     weights = jnp.asarray(generator.normal(size=2 * u.shape[0]), u.dtype)
     du = jnp.asarray(generator.normal(size=u.shape), u.dtype)
     dq = coordinate_rates(scene, t, q, Z @ du) - coordinate_rates(scene, t, q, jnp.zeros_like(u))
-    left_out = "parameters omitted: changing them makes redundant constraints independent, so accelerations have no derivative there"
+    left_out = (
+        "parameters omitted: changing them makes redundant constraints independent, so accelerations have no"
+        " derivative there"
+    )
     cases = (relative, ""), (jax.tree.map(jnp.zeros_like, relative), left_out)
-    case = next((case for case in cases if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)), None)
+    case = next(
+        (
+            case
+            for case in cases
+            if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)
+        ),
+        None,
+    )
     if case is None:
         note = "omitted: the constraints lose rank at this state, so accelerations have no derivative there"
         return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
     change, note = case
-    arguments, point, direction = (names, weights, t, inputs, fixed, usual_rows(scene)), (moving, q, u), (change, dq, du)
+    arguments, point, direction = (
+        (names, weights, t, inputs, fixed, usual_rows(scene)),
+        (moving, q, u),
+        (change, dq, du),
+    )
     value, forward, ends, h = along(_outcome, arguments, point, direction, u)
     size = np.abs(value) + np.abs(forward) + 1e-3 * np.sum(np.abs(weights))
     found = []
-    for name, other in (("jvp against vjp", _reverse(arguments, point, direction)), ("differences", central_difference(ends, h))):
+    for name, other in (
+        ("jvp against vjp", _reverse(arguments, point, direction)),
+        ("differences", central_difference(ends, h)),
+    ):
         errors = np.abs(forward - other) / size
-        found.append(check(name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note))
+        found.append(
+            check(
+                name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note
+            )
+        )
     return found
 
 
@@ -246,7 +289,11 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
 
 def by_reduction(way, scene, t, q, u, equations, rows):
     """Apply one reduction to shared equations and constraints."""
-    return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
+    return (
+        way.accelerations(scene, t, q, u, equations, rows)
+        if isinstance(way, GibbsAppell)
+        else reduce(way, equations, rows)
+    )
 
 
 @eval_numpy
@@ -259,7 +306,9 @@ def _dot(a, b):
     return sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
+def statement_checks(
+    scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int
+) -> list[Check]:
     """Return the checks of inertia, potentials and derivatives; `Z` spans the admissible speeds."""
     inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
@@ -279,23 +328,37 @@ def _inertia(motion: Motion) -> dict[str, Scalar]:
     values = {}
     for name, moving in motion.bodies.items():
         body = moving.body
-        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(jnp.abs(body.mass), tiny_of(body.mass))
+        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(
+            jnp.abs(body.mass), tiny_of(body.mass)
+        )
         if not isinstance(body, RigidBody):
             continue
         size = largest(body.inertia) + tiny_of(body.inertia)
         moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
         values[f"body `{name}`: its inertia is not symmetric"] = largest(body.inertia - body.inertia.T) / size
-        values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
+        values[f"body `{name}`: a principal moment of inertia is negative"] = (
+            jnp.maximum(-moments[0], 0.0) / size
+        )
         excess = jnp.where(moments[0] >= 0, jnp.maximum(moments[2] - moments[0] - moments[1], 0.0), 0.0)
-        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other "
-            "two"] = excess / size
-        values[f"body `{name}`: its orientation is no rotation matrix"] = largest(body.orientation.T @ body.orientation - jnp.eye(3))
+        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = (
+            excess / size
+        )
+        values[f"body `{name}`: its orientation is no rotation matrix"] = largest(
+            body.orientation.T @ body.orientation - jnp.eye(3)
+        )
     return values
 
 
 def _gravity(scene: Scene, motion: Motion) -> dict[str, Scalar]:
-    directions = {_name(i, load): load.direction for i, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)}
-    return {f"{name}: its direction is no unit vector": jnp.abs(jnp.linalg.norm(e) - 1) for name, e in directions.items()}
+    directions = {
+        _name(i, load): load.direction
+        for i, load in enumerate(loads_of(scene, motion))
+        if isinstance(load, Gravity)
+    }
+    return {
+        f"{name}: its direction is no unit vector": jnp.abs(jnp.linalg.norm(e) - 1)
+        for name, e in directions.items()
+    }
 
 
 def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
@@ -315,9 +378,15 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
     for i, slope in zip(stated, dV, strict=True):
         total = resultants(scene, motion, loads=(loads[i],))
         # Q = beta' F + gamma' L + Q_direct
-        Q = jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque) + total.direct
+        Q = (
+            jnp.einsum("bik,bi->k", partial.linear, total.force)
+            + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque)
+            + total.direct
+        )
         size = largest(Q) + largest(slope) + tiny_of(q)
-        values[f"{_name(i, loads[i])}: its potential does not give its force"] = largest(Z.T @ (Q + slope)) / size
+        values[f"{_name(i, loads[i])}: its potential does not give its force"] = (
+            largest(Z.T @ (Q + slope)) / size
+        )
     return values
 
 
@@ -335,8 +404,10 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
         body = placed.body
         pieces |= {f"body `{name}`: its mass": body.mass, f"body `{name}`: its position": body.position}
         if isinstance(body, RigidBody):
-            pieces |= {f"body `{name}`: its inertia": body.inertia, f"body `{name}`: its "
-                "orientation": body.orientation}
+            pieces |= {
+                f"body `{name}`: its inertia": body.inertia,
+                f"body `{name}`: its orientation": body.orientation,
+            }
     for i, load in enumerate(loads_of(scene, motion)):
         for kind, part in (("force", load.forces), ("torque", load.torques), ("force", load.generalized)):
             pieces |= {f"{_name(i, load)}: its {kind} on `{name}`": value for name, value in part.items()}
@@ -346,7 +417,9 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
     if potential is not None:
         pieces["the scene's `potential`"] = jnp.asarray(potential)
     pieces |= {f"constraint `{name}`": value for name, value in velocity_rows(scene, motion).items()}
-    return pieces | {f"position of constraint `{name}`": value for name, value in position_rows(scene, pose).items()}
+    return pieces | {
+        f"position of constraint `{name}`": value for name, value in position_rows(scene, pose).items()
+    }
 
 
 def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
@@ -354,13 +427,22 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     # SI units; below this size, differences are dominated by round-off
     floor = 1e-2 if q.dtype == jnp.float32 else 1e-4
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-    draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)  # noqa: E731
-    direction = (jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving), jnp.ones_like(t), draw(q), draw(u))
+    draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)
+    direction = (
+        jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving),
+        jnp.ones_like(t),
+        draw(q),
+        draw(u),
+    )
     point = (moving, t, q, u)
     value, change, around, h = along(_at, (fixed, inputs), point, direction, u)
     values = {}
     for name in value:
-        f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in around]
+        f, slope, ends = (
+            np.asarray(value[name]),
+            np.asarray(change[name]),
+            [np.asarray(x[name]) for x in around],
+        )
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order if f is smooth, the jump of the
         # slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)

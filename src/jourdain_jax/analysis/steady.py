@@ -3,9 +3,9 @@ them change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
-Families of steady motions use the same equations (`motion_derivatives.py`). They are solved by Levenberg-Marquardt from
-the guess (`calculus/roots.py`). Steadiness of the result is judged by dy/dt and d2y/dt2 along the motion,
-without the list of ignorable coordinates.
+Families of steady motions use the same equations (`motion_derivatives.py`). They are solved by
+Levenberg-Marquardt from the guess (`calculus/roots.py`). Steadiness of the result is judged by dy/dt and
+d2y/dt2 along the motion, without the list of ignorable coordinates.
 """
 
 from collections.abc import Mapping
@@ -18,19 +18,46 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.families.equations import sizes
-from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
+from jourdain_jax.analysis.motion_derivatives import (
+    ByMatrices,
+    ByProgram,
+    entries_of,
+    instant_of,
+    on_rows,
+    places_of,
+    unseen,
+)
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, check_kind, compiled_quickly, eps_of, largest, static
+from jourdain_jax.calculus.reals import (
+    Flag,
+    Indices,
+    Number,
+    Numbers,
+    Scalar,
+    check_kind,
+    compiled_quickly,
+    eps_of,
+    largest,
+    static,
+)
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_time, shown_from_users_lines
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    as_input_vector,
+    as_rolling,
+    as_time,
+    shown_from_users_lines,
+)
 from jourdain_jax.scene.names import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"},
-    "no motion is integrated; `max_steps` bounds the search, and a backend is an option of `jj.build`")
+_REFUSED = dict.fromkeys(
+    {*SPAN, *OPTION_NAMES} - {"max_steps"},
+    "no motion is integrated; `max_steps` bounds the search, and a backend is an option of `jj.build`",
+)
 
 
 class SteadyMotion(Printed, eqx.Module):
@@ -89,7 +116,9 @@ def steady(
 
     **Raises** ValueError for an unknown name, and TypeError for another option by name.
     """
-    most_steps = as_options(Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED).max_steps
+    most_steps = as_options(
+        Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED
+    ).max_steps
     built, scene = scene, as_rolling(scene, "steady")
     t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
@@ -113,8 +142,7 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
     if isinstance(guess, State):
         return guess.t, guess.q, guess.u
     check_kind(
-        guess, Mapping, "`guess`",
-        "a State or a dictionary of named values; those not named start from zero"
+        guess, Mapping, "`guess`", "a State or a dictionary of named values; those not named start from zero"
     )
     q, u, _ = scene.named(**guess)
     return as_time(t0), q, u
@@ -150,7 +178,9 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)
     eps = float(eps_of(guess))
     round_off = eps**0.5
-    z = smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps)
+    z = smooth_root(
+        lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps
+    )
     of_rows, first, _ = left = jnp.stack(problem(z)[2])
     residual = largest(left)
     state = state_of(problem.scene, problem.t, z[:n], z[n:], largest(z[:n] - q), largest(z[n:] - u), of_rows)

@@ -35,7 +35,11 @@ def perturbed_names(scene: Scene) -> Labels:
     return tuple(names)
 
 
-def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]]:
+def perturbations(
+    scene: Scene,
+) -> tuple[
+    Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]
+]:
     """Return S and B of `dq = E ds` with `E = S + B q`. For plain coordinates E is the identity; for a
     quaternion `E ds` is half its product with the small rotation ds.
 
@@ -51,13 +55,21 @@ def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbe
 
 
 # q (0, ds)/2 = H q ds, by components w, x, y, z of the product and by axes of the rotation
-_HALF_A_TURN = np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]] * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None] / 2
+_HALF_A_TURN = (
+    np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]]
+    * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None]
+    / 2
+)
 
 
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
     """Return the inverse, or the pseudo-inverse of a rectangular matrix; NaN if there is none."""
     try:
-        return array_module(x).linalg.inv(x) if len(x) == x.shape[1] else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
+        return (
+            array_module(x).linalg.inv(x)
+            if len(x) == x.shape[1]
+            else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
+        )
     except np.linalg.LinAlgError:
         return np.full(x.T.shape, np.nan)
 
@@ -67,15 +79,21 @@ def others(some, count: int) -> Int[np.ndarray, "rest"]:
     return np.setdiff1d(np.arange(count), np.asarray(some, int))
 
 
-def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]) -> Float[Entries, "all independent"]:
+def eliminated(
+    rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]
+) -> Float[Entries, "all independent"]:
     """Return the matrix from independent to all perturbations, such that `rows @ perturbation = 0`."""
     dependent = others(independent, rows.shape[1])
     rows = _of_unit_length(rows, dependent)
     followed = -inverse(rows[:, dependent]) @ rows[:, independent]
-    return array_module(rows).concatenate([np.eye(len(independent)), followed])[np.argsort(np.concatenate([independent, dependent]))]
+    return array_module(rows).concatenate([np.eye(len(independent)), followed])[
+        np.argsort(np.concatenate([independent, dependent]))
+    ]
 
 
-def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
+def smallest_pivot(
+    rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
+) -> Float[Entries, ""]:
     """Return the smallest singular value of the dependent columns, with rows of unit length. Its derivative
     is zero.
     """
@@ -86,7 +104,9 @@ def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, 
     return xp.asarray(xp.min(sizes, initial=1.0) if len(block) >= len(dependent) else 0.0)
 
 
-def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, "rows all"]:
+def _of_unit_length(
+    rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
+) -> Float[Entries, "rows all"]:
     """Return rows divided by the lengths of their dependent parts."""
     xp, block = array_module(rows), rows[:, dependent]
     length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
@@ -118,7 +138,11 @@ def _scaled_rows(scene: Scene, t, q, u, f):
 
 
 def dependent_coordinates(
-    scene: Scene, state: State, named: Labels, dependent: Labels | None, G: Float[np.ndarray, "rows coordinates"] | None = None
+    scene: Scene,
+    state: State,
+    named: Labels,
+    dependent: Labels | None,
+    G: Float[np.ndarray, "rows coordinates"] | None = None,
 ) -> Int[np.ndarray, "dependent"]:
     """Return indices of the dependent perturbations `ds`, which the geometric constraints determine: the
     named ones, else well conditioned ones.
@@ -126,20 +150,26 @@ def dependent_coordinates(
     `G`: dg/dq at the state, if known; otherwise states of the scene's domain are used.
     """
     names = perturbed_names(scene)
-    check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to "
-        "perturb")
+    check_names(
+        (*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to perturb"
+    )
     if len(set(named)) != len(named):
         raise ValueError(f"`coordinates` contains a name twice ({', '.join(named)}); give each once")
     both = set(named) & set(dependent or ())
     if both:
-        raise ValueError(f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it "
-            "from one of them")
+        raise ValueError(
+            f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it from one of them"
+        )
     if dependent is not None:
         return np.array([names.index(name) for name in dependent], int)
     if not names_of_position_rows(scene):
         return np.zeros(0, int)
     known, count = structure_of(scene), len(names_of_position_rows(scene))
-    G, q = (known.closure_slopes[:, :count], known.coordinates) if G is None else (G[None], np.asarray(state.q)[None])
+    G, q = (
+        (known.closure_slopes[:, :count], known.coordinates)
+        if G is None
+        else (G[None], np.asarray(state.q)[None])
+    )
     S, B = perturbations(scene)
     G = G @ np.stack([S + B @ x for x in q[: len(G)]])
     G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), tiny_of(G))

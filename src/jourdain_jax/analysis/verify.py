@@ -21,7 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.statements import Verification, by_reduction, check, gradient_checks, statement_checks
+from jourdain_jax.analysis.statements import (
+    Verification,
+    by_reduction,
+    check,
+    gradient_checks,
+    statement_checks,
+)
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
@@ -29,7 +35,15 @@ from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, of_bodies, partial_velocities, shapes_along_motion, velocities
+from jourdain_jax.equations.kinematics import (
+    coordinate_rates,
+    inertias,
+    motion_at,
+    of_bodies,
+    partial_velocities,
+    shapes_along_motion,
+    velocities,
+)
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.scene_parts import names_of_rows
@@ -39,7 +53,13 @@ from jourdain_jax.motion.check import check as look_for_mistakes
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    as_input_vector,
+    as_scene,
+    of_known_numbers,
+    shown_from_users_lines,
+)
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import loads_of, potential_of
 from jourdain_jax.structure.sampling import sample_states
@@ -49,7 +69,11 @@ from jourdain_jax.structure.structure import plain_row_lengths, structure_of, us
 @shown_from_users_lines
 @of_known_numbers
 def verify(
-    scene: Scene | BuiltFor, state: "State | Mapping[str, Any] | None" = None, inputs: "Numbers | Mapping[str, Any] | None" = None, *, seed: int = 0
+    scene: Scene | BuiltFor,
+    state: "State | Mapping[str, Any] | None" = None,
+    inputs: "Numbers | Mapping[str, Any] | None" = None,
+    *,
+    seed: int = 0,
 ) -> Verification:
     """Check the equations and statements of a scene at a consistent state; a failed check names its culprit.
 
@@ -84,7 +108,10 @@ def verify(
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
-    checks += [check(name, values, found["M"].dtype) for name, values in _comparisons(scene, found, applicable).items()]
+    checks += [
+        check(name, values, found["M"].dtype)
+        for name, values in _comparisons(scene, found, applicable).items()
+    ]
     checks += gradient_checks(scene, t, q, u, inputs, Z, tuple(applicable), seed)
     left_out = tuple(name for name in found["applicable"] if name not in applicable)
     return Verification(type(scene).__name__, tuple(checks), left_out, str(look_for_mistakes(scene)))
@@ -94,19 +121,30 @@ def verify(
 def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     rows = rows.judged_by(usual)
-    ways = {name: diagnosed(by_reduction(way, scene, t, q, u, equations, rows), equations, rows) for name, way in reductions(scene).items()}
+    ways = {
+        name: diagnosed(by_reduction(way, scene, t, q, u, equations, rows), equations, rows)
+        for name, way in reductions(scene).items()
+    }
     c = speed_scale(equations.M)
     reference = ways["svd"]
     newton = newton_residual(scene, t, q, u, reference.udot, inputs)
     partial = partial_velocities(scene, t, q, u)
     turned = of_bodies(motion_at(scene, t, q, u, inputs), "orientation")
     hidden_torque = jnp.einsum("bji,bj->bi", turned, newton.angular)
-    by_body = jnp.einsum("bik,bi->bk", partial.linear, newton.linear) + jnp.einsum("bik,bi->bk", partial.angular, hidden_torque)
+    by_body = jnp.einsum("bik,bi->bk", partial.linear, newton.linear) + jnp.einsum(
+        "bik,bi->bk", partial.angular, hidden_torque
+    )
     reactions = row_reactions(scene, t, q, u, reference, inputs)
     torque = jnp.einsum("bji,sbj->sbi", turned, reactions.torque)
-    by_row = jnp.einsum("bik,sbi->sk", partial.linear, reactions.force) + jnp.einsum("bik,sbi->sk", partial.angular, torque) + reactions.direct
-    energy = lambda t, q, u: sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))  # noqa: E731
-    energy_rate = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot))
+    by_row = (
+        jnp.einsum("bik,sbi->sk", partial.linear, reactions.force)
+        + jnp.einsum("bik,sbi->sk", partial.angular, torque)
+        + reactions.direct
+    )
+    energy = lambda t, q, u: sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))
+    energy_rate = jax.jvp(
+        energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot)
+    )
     forms = {"Gibbs function": gibbs_equations(scene, t, q, u, inputs)}
     # a varying mass joins at the body's own velocity (m a = F); d/dt dT/dqdot would count its momentum as
     # lost
@@ -128,7 +166,10 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
         "reference": reference.constraint_force * c,
         "energy_rate": energy_rate[1],
         "power": power(scene, motion_at(scene, t, q, u, inputs), reference).total,
-        "power_scale": jnp.abs(energy_rate[0]) + jnp.linalg.norm(u / c) * jnp.linalg.norm(c * (jnp.abs(equations.Q) + jnp.abs(equations.h))),
+        "power_scale": (
+            jnp.abs(energy_rate[0])
+            + jnp.linalg.norm(u / c) * jnp.linalg.norm(c * (jnp.abs(equations.Q) + jnp.abs(equations.h)))
+        ),
     }
 
 
@@ -139,7 +180,9 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
     force, torque = weights.mass * v * w, largest(weights.inertia, (1, 2)) * w**2
-    return jnp.einsum("bik,b->k", jnp.abs(partial.linear), force) + jnp.einsum("bik,b->k", jnp.abs(partial.angular), torque)
+    return jnp.einsum("bik,b->k", jnp.abs(partial.linear), force) + jnp.einsum(
+        "bik,b->k", jnp.abs(partial.angular), torque
+    )
 
 
 def _size(found: dict, *others) -> float:
@@ -160,10 +203,20 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
     energy = np.abs(found["energy_rate"] - found["power"]) / (tiny_of(found["M"]) + found["power_scale"])
     return {
         "reductions": _reductions(found, applicable),
-        "forms": {f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
-        "virtual power": {suspect: largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
-        "Newton": {suspect: largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
-        "energy": {"a load whose potential does not give its force, or a constraint with uncounted power": energy},
+        "forms": {
+            f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h])
+            for name, (M, h) in found["forms"].items()
+        },
+        "virtual power": {
+            suspect: largest(found["Z"].T @ force) / size for suspect, force in virtual.items()
+        },
+        "Newton": {
+            suspect: largest(forces.sum(0) - found["reference"]) / of_newton
+            for suspect, forces in newton.items()
+        },
+        "energy": {
+            "a load whose potential does not give its force, or a constraint with uncounted power": energy
+        },
     }
 
 
@@ -175,7 +228,10 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
         # against the median of all, so that one wrong reduction does not make the others look wrong
         middle = np.median(np.stack([found[quantity][name] for name in applicable]), axis=0)
         size = _size(found, middle)
-        differences = {name: np.max([known, largest(found[quantity][name] - middle) / size]) for name, known in differences.items()}
+        differences = {
+            name: np.max([known, largest(found[quantity][name] - middle) / size])
+            for name, known in differences.items()
+        }
     return {f"reduction `{name}`": value for name, value in differences.items()}
 
 

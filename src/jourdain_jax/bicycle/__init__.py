@@ -2,8 +2,20 @@
 
 from jourdain_jax.bicycle.job import Refused, Study, run, study, table, write_results
 from jourdain_jax.bicycle.measurements import benchmark_from_measurements
-from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, measured_bicycle, read_bicycle, shipped_bicycles, shipped_measurements
-from jourdain_jax.bicycle.stability import StabilitySpeeds, eigenvalues, linear_matrices, stability_speeds, upright_running
+from jourdain_jax.bicycle.parameter_files import (
+    MeasuredBicycle,
+    measured_bicycle,
+    read_bicycle,
+    shipped_bicycles,
+    shipped_measurements,
+)
+from jourdain_jax.bicycle.stability import (
+    StabilitySpeeds,
+    eigenvalues,
+    linear_matrices,
+    stability_speeds,
+    upright_running,
+)
 from jourdain_jax.bicycle.uncertainty import Interval, ParameterSamples, interval, sample_parameters
 
 __all__ = [

@@ -117,7 +117,9 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
         path=str(path),
         bicycle=bicycle,
         speeds={name: _interval(getattr(found, name), physical) for name in SPEEDS},
-        stable_fraction=float(np.mean(np.asarray(found.stable_range_exists)[1:][physical])) if physical.any() else 0.0,
+        stable_fraction=(
+            float(np.mean(np.asarray(found.stable_range_exists)[1:][physical])) if physical.any() else 0.0
+        ),
         grid=grid,
         eigenvalues=np.asarray(_modes(matrices, jnp.asarray(grid))),
         physical=physical,
@@ -126,13 +128,20 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds if there is none.
-    """
+    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds if there is none."""
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
     if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on
-        return {"below the stable range": 0.75 * weave, "inside it, near its start": 1.2 * weave, "inside it, faster (it has no end)": 2.0 * weave}
-    return {"below the stable range": 0.75 * weave, "inside the stable range": (weave + capsize) / 2, "above the stable range": 1.3 * capsize}
+        return {
+            "below the stable range": 0.75 * weave,
+            "inside it, near its start": 1.2 * weave,
+            "inside it, faster (it has no end)": 2.0 * weave,
+        }
+    return {
+        "below the stable range": 0.75 * weave,
+        "inside the stable range": (weave + capsize) / 2,
+        "above the stable range": 1.3 * capsize,
+    }
 
 
 def ride(values: dict[str, float], by_label: dict[str, float]) -> Rides:
@@ -159,8 +168,7 @@ _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=g
 
 
 def _interval(values, physical) -> dict | None:
-    """Return value, low, high and fraction of one speed; None if neither the bicycle nor any sample has it.
-    """
+    """Return value, low, high and fraction of one speed; None if neither the bicycle nor any sample has it."""
     if np.isnan(values).all():
         return None
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))
@@ -177,7 +185,9 @@ def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndar
     return np.sort(np.concatenate([np.linspace(0.0, top, 81), np.clip(close, 0.0, top)]))
 
 
-def run(paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None) -> list[Study | Refused]:
+def run(
+    paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None
+) -> list[Study | Refused]:
     """Return the studies of all files, in order, with shared compiled programs."""
     studies = []
     for path in paths:
@@ -217,7 +227,10 @@ def _cell(speed: dict | None) -> str:
 
 
 def _notes(one: Study) -> list[str]:
-    notes = [f"ride at {r['speed']:.2f} m/s, {r['label']}: {r['message']} at t = {r['t_end']:.2f} s" for r in one.as_dict()["rides"]]
+    notes = [
+        f"ride at {r['speed']:.2f} m/s, {r['label']}: {r['message']} at t = {r['t_end']:.2f} s"
+        for r in one.as_dict()["rides"]
+    ]
     if refused := int(np.sum(~one.physical)):
         notes.append(f"{refused} samples are impossible bicycles and do not count")
     if one.bicycle.covariance is not None:

@@ -89,7 +89,9 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
         distance = [abs(float(found[names[i]])) for i in here]
         sigma = np.sqrt(np.sum(misses[here] ** 2, axis=1))
         # where sigmas are zero, so is the scale
-        ratio = np.divide(distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0)
+        ratio = np.divide(
+            distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0
+        )
         worst = int(np.argmax(ratio))
         if ratio[worst] > 3:  # standard deviations by which lines may miss a mass centre without a warning
             warnings.append(
@@ -101,11 +103,15 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
 
 
 @compiled_quickly
-def _with_slopes(means: Values, hangings: tuple[tuple[str, Indices], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
+def _with_slopes(
+    means: Values, hangings: tuple[tuple[str, Indices], ...], by_table: bool
+) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
     """Return parameters, distances of plumb lines, and the derivatives of both with respect to each reading,
     in the order of the means.
     """
-    found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
+    found, slope = jax.linearize(
+        lambda y: _parameters(y, dict(hangings), by_table), means
+    )  # compiles in half the time of `jacfwd`
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 
@@ -160,7 +166,9 @@ def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
     """
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
-    return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])
+    return jnp.stack(
+        [along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)]
+    )
 
 
 def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2"], PerHanging]:
@@ -176,7 +184,9 @@ def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2
     return r, across @ r - beside
 
 
-def _least_squares(rows: Float[Array, "rows columns"], values: Float[Array, "rows"]) -> Float[Array, "columns"]:
+def _least_squares(
+    rows: Float[Array, "rows columns"], values: Float[Array, "rows"]
+) -> Float[Array, "columns"]:
     return jnp.linalg.solve(rows.T @ rows, rows.T @ values)
 
 
@@ -184,7 +194,10 @@ def _moments_about_y(y: Values, lengths: Values) -> Values:
     """Return Iyy of the parts, kg m^2, from the periods of their swings and the distances `lengths` of their
     mass centres from the axle.
     """
-    return {f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l) for p, l in lengths.items()}
+    return {
+        f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l)
+        for p, l in lengths.items()
+    }
 
 
 def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, Float[Array, "_"]]) -> Values:
@@ -195,11 +208,13 @@ def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, 
     tilt, 0, cos tilt).
     """
     bar = y["mP"] * (3 * (y["dP"] / 2) ** 2 + y["lP"] ** 2) / 12
-    along = lambda timed: bar * (timed / y["TtP1"]) ** 2  # noqa: E731, n . I n
+    along = lambda timed: bar * (timed / y["TtP1"]) ** 2
     found = {f"I{wheel}xx": along(y[f"Tt{wheel}1"]) for wheel in "RF"}
     for part, numbers in hangings.items():
         s, c = jnp.sin(tilts[part]), jnp.cos(tilts[part])
-        moments = _least_squares(jnp.stack([s**2, c**2, -2 * s * c], axis=1), along(_column("Tt", part, numbers, y)))
+        moments = _least_squares(
+            jnp.stack([s**2, c**2, -2 * s * c], axis=1), along(_column("Tt", part, numbers, y))
+        )
         found |= {f"I{part}{axes}": moment for axes, moment in zip(("xx", "zz", "xz"), moments, strict=True)}
     return found
 

@@ -67,7 +67,11 @@ class MeasuredBicycle:
         if self.covariance is None:
             return dict(self.prior)
         known = np.array([sigma > 0 for sigma in self.sigmas.values()])
-        return dict(joint_normal({name: self.values[name] for name in self.prior}, self.covariance[np.ix_(known, known)]))
+        return dict(
+            joint_normal(
+                {name: self.values[name] for name in self.prior}, self.covariance[np.ix_(known, known)]
+            )
+        )
 
 
 def measured_bicycle(name: str) -> MeasuredBicycle:
@@ -97,7 +101,9 @@ def shipped_measurements() -> dict[str, Path]:
 
 def _shipped(ending: str) -> dict[str, Path]:
     folder = Path(str(resources.files("jourdain_jax") / "bicycle" / "data"))
-    return {path.stem.removesuffix(ending) or path.stem: path for path in sorted(folder.glob(f"*{ending}.txt"))}
+    return {
+        path.stem.removesuffix(ending) or path.stem: path for path in sorted(folder.glob(f"*{ending}.txt"))
+    }
 
 
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
@@ -131,7 +137,9 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     known = {name: values[name] for name in PARAMETER_NAMES}
     broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
     if broken:
-        got = ", ".join(f"{name} = {known[name]:g}" for name in PARAMETER_NAMES if any(f"`{name}`" in s for s in broken))
+        got = ", ".join(
+            f"{name} = {known[name]:g}" for name in PARAMETER_NAMES if any(f"`{name}`" in s for s in broken)
+        )
         raise ValueError(
             f"{path}: degenerate bicycle: {'; '.join(broken)}; got {got}. The nonlinear model rolls on real "
             "wheels: give their true radii, masses and moments of inertia (SI units, radians), or omit this "
@@ -168,7 +176,9 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
     """Yield numbers and content of the lines of a YAML file, in the format of a text file, from the section
     `values`, or from the whole file if it has none.
     """
-    lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [
+        (number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)
+    ]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)
     inside = not has_section
     for number, line in lines:
@@ -184,13 +194,17 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
                     f"benchmark's: {' '.join(PARAMETER_NAMES)}"
                 )
         elif inside and not value:
-            raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: "
-                "value`, for example `rF: 0.35`")
+            raise ValueError(
+                f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: "
+                "value`, for example `rF: 0.35`"
+            )
         elif inside:
             yield number, f"{name} = {value}"
 
 
-def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str) -> Iterator[tuple[str, str, str]]:
+def entries(
+    path: Path, lines: Iterable[tuple[int, str]], form: str, again: str
+) -> Iterator[tuple[str, str, str]]:
     """Yield the location, the name and the text after `=` of each line. Raises ValueError for another `form`
     or a repeated name.
     """
@@ -212,11 +226,16 @@ def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, floa
     """
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or omit this bicycle."
-    value, *rest = (files.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
+    value, *rest = (
+        files.number(part, f"{where}: {kind} of `{name}`", advice=advice)
+        for part, kind in zip(parts, (what, "sigma"), strict=False)
+    )
     sigma = rest[0] if rest else None
     if sigma is not None and sigma < 0:
-        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give "
-            "its magnitude, or omit `+/-` if it is unknown.")
+        raise ValueError(
+            f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give "
+            "its magnitude, or omit `+/-` if it is unknown."
+        )
     return value, sigma
 
 
@@ -229,13 +248,15 @@ def _check_known(name: str, where: str) -> None:
 def _ignored_but_telling(values: dict[str, float]) -> Labels:
     """Return warnings for ignored values that contradict the symmetry of the model."""
     found = [
-        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its "
-        "plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0
+        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane"
+        for name in _OUT_OF_PLANE
+        if values.get(name, 0.0) != 0.0
     ]
     for name, twin in _REPEATED.items():
         if values.get(name, values[twin]) != values[twin]:
-            found.append(f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used "
-                "instead")
+            found.append(
+                f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used instead"
+            )
     return tuple(found)
 
 

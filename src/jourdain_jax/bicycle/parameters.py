@@ -17,7 +17,9 @@ from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import Labels, Sentences
 
 # name -> unit, meaning and sign, in the order of the paper's table and of arrays of parameters
-PARAMETERS: dict[str, Mapping] = {field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")}
+PARAMETERS: dict[str, Mapping] = {
+    field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")
+}
 PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
@@ -55,12 +57,16 @@ def doubts(values: Mapping[str, float]) -> Sentences:
     for body in "BH":
         xx, yy, zz, xz = (values[f"I{body}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
         middle, half_spread = (xx + zz) / 2, math.hypot((xx - zz) / 2, xz)
-        smallest, largest = middle - half_spread, middle + half_spread  # principal moments in the plane of symmetry
+        smallest, largest = (
+            middle - half_spread,
+            middle + half_spread,
+        )  # principal moments in the plane of symmetry
         if smallest <= 0 or yy <= 0:
             found.append(f"the inertia matrix of body {body} is not positive definite")
         if yy > smallest + largest or largest > smallest + yy:
             found.append(f"a principal moment of inertia of body {body} exceeds the sum of the other two")
         if values[f"z{body}"] > 0:
-            found.append(f"`z{body}` > 0: the centre of mass of body {body} lies below the ground (z points "
-                "down)")
+            found.append(
+                f"`z{body}` > 0: the centre of mass of body {body} lies below the ground (z points down)"
+            )
     return tuple(found)

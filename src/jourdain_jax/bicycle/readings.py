@@ -28,10 +28,32 @@ from jourdain_jax.calculus.files import name_of
 from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.scene.names import Labels
 
-_FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
+_FORM = (
+    "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
+)
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
 _WHOLE_FORK, _SPLIT_FORK = ("mH", "TcH1"), ("mG", "mS", "h6", "h7", "d5", "d6", "l", "TcG1", "TcS1")
-_ALWAYS = ("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "TcF1", "TtR1", "TtF1", "mP", "lP", "dP", "TtP1", "TcB1")
+_ALWAYS = (
+    "g",
+    "dR",
+    "nR",
+    "dF",
+    "nF",
+    "mR",
+    "mF",
+    "mB",
+    "lR",
+    "lF",
+    "TcR1",
+    "TcF1",
+    "TtR1",
+    "TtF1",
+    "mP",
+    "lP",
+    "dP",
+    "TtP1",
+    "TcB1",
+)
 
 
 @dataclass(frozen=True)
@@ -67,9 +89,12 @@ def read_readings(path: str | Path) -> Readings:
     path = Path(name_of(path))
     means: dict[str, float] = {}
     sigmas: dict[str, float | None] = {}
-    for where, name, right in entries(path, text_lines(read_lines(path)), _FORM, "Write several readings in "
-        "one line, with commas between."):
-        means[name], sigmas[name] = _mean([with_sigma(one, name, where, "reading") for one in right.split(",")])
+    for where, name, right in entries(
+        path, text_lines(read_lines(path)), _FORM, "Write several readings in one line, with commas between."
+    ):
+        means[name], sigmas[name] = _mean(
+            [with_sigma(one, name, where, "reading") for one in right.split(",")]
+        )
     split = "mS" in means or "mG" in means
     needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
@@ -81,13 +106,25 @@ def read_readings(path: str | Path) -> Readings:
             f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and "
             f"add a line {_FORM} for each."
         )
-    used = {*needed, *(f"{what}{part}{k}" for part, found in hangings.items() for k in found for what in ("alpha", "a", "Tt"))}
+    used = {
+        *needed,
+        *(
+            f"{what}{part}{k}"
+            for part, found in hangings.items()
+            for k in found
+            for what in ("alpha", "a", "Tt")
+        ),
+    }
     return Readings(
         path=str(path),
         means={name: means[name] for name in sorted(used)},
         sigmas={name: sigmas[name] or 0.0 for name in sorted(used)},
         hangings=hangings,
-        without_sigma=tuple(name for name, sigma in sigmas.items() if sigma is None and name in used and not name.startswith("n")),
+        without_sigma=tuple(
+            name
+            for name, sigma in sigmas.items()
+            if sigma is None and name in used and not name.startswith("n")
+        ),
         unused=tuple(name for name in means if name not in used),
     )
 
@@ -101,4 +138,6 @@ def _hangings(means: dict[str, float], part: str) -> Indices:
 def _mean(readings: list[tuple[float, float | None]]) -> tuple[float, float | None]:
     """Return the mean of the readings in a line, and its standard deviation (None if no reading has one)."""
     squares = [sigma**2 for _, sigma in readings if sigma is not None]
-    return math.fsum(value for value, _ in readings) / len(readings), math.sqrt(math.fsum(squares)) / len(readings) if squares else None
+    return math.fsum(value for value, _ in readings) / len(readings), (
+        math.sqrt(math.fsum(squares)) / len(readings) if squares else None
+    )

@@ -154,7 +154,9 @@ def stability_speeds(
 def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
     _, b3, _, b1, b0 = _coefficients(matrices)
     opposite, coincident = _in_speed(matrices)
-    (zeros, is_zero), (opposites, is_opposite), (coincidents, is_coincident) = (_roots(polynomial, top**2) for polynomial in (b0, opposite, coincident))
+    (zeros, is_zero), (opposites, is_opposite), (coincidents, is_coincident) = (
+        _roots(polynomial, top**2) for polynomial in (b0, opposite, coincident)
+    )
 
     upward = is_zero & (_slope(b0, zeros) * jnp.polyval(b1, zeros) < 0)
     capsize = jnp.min(zeros, where=upward, initial=jnp.inf)
@@ -232,7 +234,9 @@ def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
 
     opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
     D0 = combined((1, b2, b2), (-3, x, b3, b1), (12, b4, b0))
-    D1 = combined((2, b2, b2, b2), (-9, x, b3, b2, b1), (27, x, b3, b3, b0), (27, x, b4, b1, b1), (-72, b4, b2, b0))
+    D1 = combined(
+        (2, b2, b2, b2), (-9, x, b3, b2, b1), (27, x, b3, b3, b0), (27, x, b4, b1, b1), (-72, b4, b2, b0)
+    )
     return opposite, combined((4, D0, D0, D0), (-1, D1, D1))
 
 
@@ -271,7 +275,9 @@ def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
     return (s > 0) & (jnp.polyval(slopes, s) * jnp.polyval(jnp.polyder(first), s) > 0)
 
 
-def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
+def _widest_stable_range(
+    matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar
+) -> tuple[Scalar, Scalar]:
     """Return the widest interval between neighbouring crossing speeds in which all eigenvalues decay, without
     derivative; NaN if there is none.
     """
@@ -279,7 +285,9 @@ def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossi
     ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))
     middles = (0.5 * (ends[:-1] + ends[1:])) ** 2
     # Lienard & Chipart: a0, a1, a3, a4 and the third Hurwitz determinant positive.
-    positive = jnp.stack([jnp.polyval(jnp.atleast_1d(p), middles) for p in (*_coefficients(matrices), opposite)])
+    positive = jnp.stack(
+        [jnp.polyval(jnp.atleast_1d(p), middles) for p in (*_coefficients(matrices), opposite)]
+    )
     stable = jnp.all(jnp.delete(positive, 2, axis=0) > 0, axis=0)
     widths = jnp.where(stable, ends[1:] - ends[:-1], 0.0)
     widest = jnp.argmax(widths)

@@ -27,8 +27,7 @@ class ParameterSamples(eqx.Module):
     refused: dict[str, Array]  # violated condition, as a sentence -> number of samples
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
-        """Return one array of samples per parameter, for `jax.vmap` over a function of a dict of parameters.
-        """
+        """Return one array of samples per parameter, for `jax.vmap` over a function of a dict of parameters."""
         return dict(zip(PARAMETER_NAMES, self.values.T, strict=True))
 
 
@@ -41,7 +40,9 @@ class Interval(eqx.Module):
     fraction: Scalar  # share of the counted samples that have the quantity
 
 
-def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
+def sample_parameters(
+    bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int
+) -> ParameterSamples:
     """Return `count` bicycles drawn from a normal distribution with the measured values and their covariance.
     Without a covariance, parameters are independent, with their sigmas.
 
@@ -53,8 +54,9 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
     not positive.
     """
     if count < 1:
-        raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about "
-            "0.1 sigma.")
+        raise ValueError(
+            f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about 0.1 sigma."
+        )
     value = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     standard = jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)
     values = value + standard @ jnp.asarray(_root(bicycle), value.dtype).T

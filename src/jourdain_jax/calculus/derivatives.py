@@ -35,11 +35,11 @@ from jourdain_jax.calculus.reals import with_usual_promotion
 
 SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which only "
-        "machine code supports; with XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
+    "machine code supports; with XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
 )
 THIRD_ORDER_MESSAGE = (
     "`simulate` was differentiated three times, not in forward mode alone; pass backend='xla' and use "
-        "forward mode, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
+    "forward mode, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
 )
 
 
@@ -52,12 +52,13 @@ class DifferentiationModeError(TypeError):
 
 
 class OtherDeviceError(RuntimeError):
-    """Raised if machine code would become part of a program for another process or for an unsupported device.
-    """
+    """Raised if machine code would become part of a program for another process or for an unsupported device."""
 
     def __init__(self, program: str) -> None:
-        super().__init__(f"machine code of this process cannot be part of a program {program}; pass "
-            '`backend="xla"` to `jj.simulate` or `jj.build`')
+        super().__init__(
+            f"machine code of this process cannot be part of a program {program}; pass "
+            '`backend="xla"` to `jj.simulate` or `jj.build`'
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,11 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
     """Return the forward derivative of a map with respect to some of its first `count` arguments."""
 
     def pushed(at, arrays):
-        return jax.jvp(lambda *new: own.apply(put(at[:count], which, new), at[count:]), tuple(at[i] for i in which), tuple(arrays))[1]
+        return jax.jvp(
+            lambda *new: own.apply(put(at[:count], which, new), at[count:]),
+            tuple(at[i] for i in which),
+            tuple(arrays),
+        )[1]
 
     return LinearMap(pushed, own.shapes)
 
@@ -109,7 +114,9 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
 
     def along(which: list[int]) -> LinearMap | None:
         further = own.along(which)
-        return further and _spread(_in_lanes(further, [*axes, *[0] * count], len(which), size), [axes[i] for i in which], size)
+        return further and _spread(
+            _in_lanes(further, [*axes, *[0] * count], len(which), size), [axes[i] for i in which], size
+        )
 
     return LinearMap(
         lambda at, arrays: jax.vmap(own.apply, in_axes=(axes, 0), axis_size=size)(list(at), list(arrays)),
@@ -126,14 +133,27 @@ def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
     transposed = own.transposed
 
     def gathered(arrays: Sequence) -> list:
-        return [jnp.sum(x, 0) if axis is None else jnp.moveaxis(x, 0, axis) for x, axis in zip(arrays, axes, strict=True)]
+        return [
+            jnp.sum(x, 0) if axis is None else jnp.moveaxis(x, 0, axis)
+            for x, axis in zip(arrays, axes, strict=True)
+        ]
 
     def back() -> LinearMap:
         assert transposed is not None
         inner = transposed()
-        return LinearMap(lambda at, g: gathered(inner.apply(at, g)), jax.eval_shape(gathered, inner.shapes), lambda: forth, inner.along)
+        return LinearMap(
+            lambda at, g: gathered(inner.apply(at, g)),
+            jax.eval_shape(gathered, inner.shapes),
+            lambda: forth,
+            inner.along,
+        )
 
-    forth = LinearMap(lambda at, arrays: own.apply(at, with_lanes_first(arrays, axes, size)), own.shapes, transposed and back, own.along)
+    forth = LinearMap(
+        lambda at, arrays: own.apply(at, with_lanes_first(arrays, axes, size)),
+        own.shapes,
+        transposed and back,
+        own.along,
+    )
     return forth
 
 
@@ -150,14 +170,18 @@ def _pushed(values, tangents, *, linear: LinearMap, count: int):
     if any(type(t) is not ad.Zero for t in tangents[count:]):
         along.append(linear(values[:count], [ad.instantiate_zeros(t) for t in tangents[count:]]))
     if which:
-        along.append((linear.along(which) or by_jax(linear, count, which))(values, [tangents[i] for i in which]))
+        along.append(
+            (linear.along(which) or by_jax(linear, count, which))(values, [tangents[i] for i in which])
+        )
     return found, [reduce(operator.add, parts) for parts in zip(*along, strict=True)]
 
 
 def _pulled(cotangents, *values, linear: LinearMap, count: int):
     if linear.transposed is None:
         no_further()
-    return [None] * count + linear.transposed()(values[:count], [ad.instantiate_zeros(ct) for ct in cotangents])
+    return [None] * count + linear.transposed()(
+        values[:count], [ad.instantiate_zeros(ct) for ct in cotangents]
+    )
 
 
 @with_usual_promotion
@@ -168,7 +192,11 @@ def _evaluated(*values, linear: LinearMap, count: int) -> list:
 linear_map_p = Primitive("jourdain_linear_map")
 linear_map_p.multiple_results = True
 linear_map_p.def_impl(_evaluated)
-linear_map_p.def_abstract_eval(lambda *avals, linear, count: [avals[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False) for x in linear.shapes])
+linear_map_p.def_abstract_eval(
+    lambda *avals, linear, count: [
+        avals[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False) for x in linear.shapes
+    ]
+)
 ad.primitive_jvps[linear_map_p] = _pushed
 ad.primitive_transposes[linear_map_p] = _pulled
 batching.primitive_batchers[linear_map_p] = _batched
@@ -198,13 +226,23 @@ class BothWays(NamedTuple):
         def pushed(at, along):
             return self.rates(moving)(list(at[: len(self.leaves)]), *along)
 
-        return LinearMap(pushed, [self.found[i] for i in self.places], lambda: self._pulls(moving), lambda others: self._turns(moving, others))
+        return LinearMap(
+            pushed,
+            [self.found[i] for i in self.places],
+            lambda: self._pulls(moving),
+            lambda others: self._turns(moving, others),
+        )
 
     def _pulls(self, moving: list[int]) -> LinearMap:
         def pulled(at, g):
             return self.pulled(moving)(at[: len(self.leaves)], at[len(self.leaves) :], g)
 
-        return LinearMap(pulled, [self.leaves[i] for i in moving], lambda: self.pushes(moving), lambda others: self._bends(moving, others))
+        return LinearMap(
+            pulled,
+            [self.leaves[i] for i in moving],
+            lambda: self.pushes(moving),
+            lambda others: self._bends(moving, others),
+        )
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
         """Return the derivative of Jacobian-vector products with respect to other leaves. It also depends on
@@ -216,7 +254,10 @@ class BothWays(NamedTuple):
             return self._bends(others, moving).apply([*at[:count], *g], at[count:])
 
         own = by_jax(self.pushes(moving), count, others)
-        return replace(own, transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further))
+        return replace(
+            own,
+            transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further),
+        )
 
     def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
         """Return the derivative of vector-Jacobian products with respect to other leaves. It also depends on
@@ -233,9 +274,15 @@ class BothWays(NamedTuple):
                 return self.pulled(moving)(put(leaves, others, new), put(found, self.places, numbers), g)
 
             rates = self.rates(others)(leaves, *along)
-            return jax.jvp(pulled, ([leaves[i] for i in others], [found[i] for i in self.places]), (list(along), list(rates)))[1]
+            return jax.jvp(
+                pulled,
+                ([leaves[i] for i in others], [found[i] for i in self.places]),
+                (list(along), list(rates)),
+            )[1]
 
-        return LinearMap(bent, [self.leaves[i] for i in moving], lambda: self._bends(others, moving), no_further)
+        return LinearMap(
+            bent, [self.leaves[i] for i in moving], lambda: self._bends(others, moving), no_further
+        )
 
 
 class Rules(NamedTuple):
@@ -306,7 +353,13 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
-        return lanes_first(jax.jvp(lambda *new: differentiable(*of.whole(put(leaves, moving, new))), [leaves[i] for i in moving], along)[1])
+        return lanes_first(
+            jax.jvp(
+                lambda *new: differentiable(*of.whole(put(leaves, moving, new))),
+                [leaves[i] for i in moving],
+                along,
+            )[1]
+        )
 
     return _with_rates(run, rates)
 
@@ -315,7 +368,9 @@ def pushed_by_jax(run: Callable) -> Callable:
     """Return the `push` rule of a function that JAX differentiates forward."""
 
     def push(arguments: tuple, tangents: tuple):
-        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+        moving, fixed = eqx.partition(
+            arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None)
+        )
         return jax.jvp(lambda moving: run(*eqx.combine(moving, fixed)), (moving,), (tangents,))
 
     return push
@@ -331,7 +386,9 @@ def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -
     def pull(perturbed: tuple, arguments: tuple, found, g):
         moving, fixed = eqx.partition(arguments, perturbed)
         back = jax.vjp(lambda moving: reverse(*eqx.combine(moving, fixed)), moving)[1]
-        return back(jax.tree.map(lambda x, g: np.zeros(x.shape, jax.dtypes.float0) if g is None else g, found, g))[0]
+        return back(
+            jax.tree.map(lambda x, g: np.zeros(x.shape, jax.dtypes.float0) if g is None else g, found, g)
+        )[0]
 
     return with_rules(forward, Rules(pushed_by_jax(forward), pull, lambda *_: reason_against_second))
 
@@ -345,7 +402,11 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
         def pushed(moving: list[int], leaves, *along):
             tangents = jax.tree.unflatten(of.treedef, put([None] * len(leaves), moving, along))
-            return [x for x in jax.tree.leaves(rules.push(of.whole(leaves), tangents)[1]) if x.dtype != jax.dtypes.float0]
+            return [
+                x
+                for x in jax.tree.leaves(rules.push(of.whole(leaves), tangents)[1])
+                if x.dtype != jax.dtypes.float0
+            ]
 
         def perturbed(moving: list[int]):
             varies = jax.tree.unflatten(of.treedef, [i in moving for i in range(len(leaves))])
@@ -366,8 +427,10 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 
         ends, structure = jax.tree.flatten(jax.lax.stop_gradient(found))
         places = [i for i, x in enumerate(ends) if _is_number(x)]
-        reason = lambda moving: rules.reason_against_second(*perturbed(moving))  # noqa: E731
-        way = BothWays(lambda moving: partial(pushed, moving), pulled, reason, shapes(leaves), shapes(ends), places)
+        reason = lambda moving: rules.reason_against_second(*perturbed(moving))
+        way = BothWays(
+            lambda moving: partial(pushed, moving), pulled, reason, shapes(leaves), shapes(ends), places
+        )
         return _without_gaps(found, way.pushes(moving)([*leaves, *ends], along))
 
     return _with_rates(run, rates)
@@ -376,7 +439,9 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 def _without_gaps(found, rates: list):
     """Return the tangents of the whole result from the tangents of its numbers."""
     left = iter(rates)
-    return jax.tree.map(lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found)
+    return jax.tree.map(
+        lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found
+    )
 
 
 def _is_number(x) -> bool:

@@ -19,7 +19,9 @@ def figure(draw: Callable[[Any], None], width: float, height: float, caption: st
     """
     try:
         # a pixel of a page is 1/96 inch
-        drawn = needed("matplotlib.figure", "a figure", "plot").Figure((width / 96, height / 96), dpi=96, layout="constrained")
+        drawn = needed("matplotlib.figure", "a figure", "plot").Figure(
+            (width / 96, height / 96), dpi=96, layout="constrained"
+        )
     except ImportError as missing:
         return f"<p>{html.escape(str(missing))}</p>"
     draw(drawn)
@@ -31,4 +33,7 @@ def figure(draw: Callable[[Any], None], width: float, height: float, caption: st
     drawn.savefig(png, format="png")
     below = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
     data = base64.b64encode(png.getvalue()).decode()
-    return f'<figure><img alt="{html.escape(caption)}" width="{width:.0f}" height="{height:.0f}" src="data:image/png;base64,{data}"/>{below}</figure>'
+    return (
+        f'<figure><img alt="{html.escape(caption)}" width="{width:.0f}" height="{height:.0f}"'
+        f' src="data:image/png;base64,{data}"/>{below}</figure>'
+    )

@@ -22,7 +22,9 @@ from jourdain_jax.calculus.reals import described
 
 FilePath = str | os.PathLike
 DEEPEST = 250  # maximum nesting depth: bodies of a chain, as elements of MJCF
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE
+)
 
 
 def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
@@ -46,8 +48,10 @@ def opened(path: FilePath, what: str) -> Iterator[BinaryIO]:
             yield file
     except OSError as error:
         said = error.strerror or type(error).__name__
-        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); pass the path of "
-            f"{what}{_near(Path(path), error)}") from None
+        raise ValueError(
+            f"{shortened(path, 300)}: cannot be read ({said}); pass the path of "
+            f"{what}{_near(Path(path), error)}"
+        ) from None
 
 
 def name_of(path) -> str:
@@ -70,8 +74,9 @@ def read_text(path: FilePath, limit: int, what: str = "a text file") -> str:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is "
-            f"{content[error.start]:#04x}), expected {what}") from None
+        raise ValueError(
+            f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}), expected {what}"
+        ) from None
     if "\0" in text:
         raise ValueError(f"{path}: a binary file (it contains zero bytes), expected {what}")
     return text
@@ -87,8 +92,10 @@ def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> fl
     value = float(plain) if _NUMBER.fullmatch(plain) else None
     if value is None or (finite and not math.isfinite(value)):
         hint = ", with `.` as the decimal point" if "," in plain else ""
-        raise ValueError(f"{what} is `{shortened(plain)}`, expected a "
-            f"{'finite ' if value is not None else ''}number{hint}{advice}")
+        raise ValueError(
+            f"{what} is `{shortened(plain)}`, expected a "
+            f"{'finite ' if value is not None else ''}number{hint}{advice}"
+        )
     return value
 
 
@@ -109,8 +116,7 @@ def parsed(parse: Callable, content, source: str, what: str):
     except RecursionError:
         raise _too_deep(source) from None
     except Exception as error:
-        raise ValueError(f"{source}: not {what} "
-            f"({shortened(error, 200) or type(error).__name__})") from None
+        raise ValueError(f"{source}: not {what} ({shortened(error, 200) or type(error).__name__})") from None
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
@@ -146,8 +152,7 @@ _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes a line feed a
 
 
 def check_place(path: FilePath) -> None:
-    """Raise ValueError if no file can be written at `path`: its folder is missing, or it is a folder itself.
-    """
+    """Raise ValueError if no file can be written at `path`: its folder is missing, or it is a folder itself."""
     place = name_of(path)
     folder = os.path.dirname(place) or "."
     try:
@@ -161,7 +166,9 @@ def check_place(path: FilePath) -> None:
         raise ValueError(f"cannot write `{shortened(place, 300)}`: {error.strerror}") from None
 
 
-def write_whole(path: FilePath, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:
+def write_whole(
+    path: FilePath, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666
+) -> None:
     """Write `content` to `path` atomically. `wait`: return only when it is on the disk; `mode`: permissions
     as in `open`.
     """

@@ -13,12 +13,19 @@ _CALLS = dict.fromkeys(("jit", "pjit", "remat", "remat2", "checkpoint"), "jaxpr"
 _CALLS |= dict.fromkeys(("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
 
 
-def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, number: Callable = lambda x, aval: np.asarray(x, aval.dtype)) -> list:
+def evaluated(
+    closed: ClosedJaxpr,
+    arguments: Sequence,
+    results: Callable,
+    number: Callable = lambda x, aval: np.asarray(x, aval.dtype),
+) -> list:
     """Evaluate a jaxpr. `results(equation, inputs)` evaluates one equation, `number(x, aval)` converts a
     constant.
     """
     jaxpr = closed.jaxpr
-    values = {v: number(x, v.aval) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
+    values = {v: number(x, v.aval) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(
+        zip(jaxpr.invars, arguments, strict=True)
+    )
 
     def read(atom):
         return number(atom.val, atom.aval) if isinstance(atom, Literal) else values[atom]
@@ -34,7 +41,9 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
-    return ClosedJaxpr(dce_jaxpr(of_wanted, [True] * len(of_wanted.outvars), instantiate=True)[0], closed.consts)
+    return ClosedJaxpr(
+        dce_jaxpr(of_wanted, [True] * len(of_wanted.outvars), instantiate=True)[0], closed.consts
+    )
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
@@ -53,7 +62,8 @@ def parts_of_scan(equation) -> tuple[int, int]:
     """
     body = equation.params["jaxpr"].jaxpr
     whole, carried = (
-        sum(x.aval.ndim == y.aval.ndim for x, y in zip(*pair, strict=True)) for pair in ((equation.invars, body.invars), (equation.outvars, body.outvars))
+        sum(x.aval.ndim == y.aval.ndim for x, y in zip(*pair, strict=True))
+        for pair in ((equation.invars, body.invars), (equation.outvars, body.outvars))
     )
     return whole - carried, carried
 
@@ -65,7 +75,11 @@ def is_jaxpr(x) -> bool:
 
 def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
     """Return the jaxprs among the parameters of a primitive."""
-    return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(params.values()), is_leaf=is_jaxpr) if is_jaxpr(x)]
+    return [
+        getattr(x, "jaxpr", x)
+        for x in jax.tree.leaves(list(params.values()), is_leaf=is_jaxpr)
+        if is_jaxpr(x)
+    ]
 
 
 def loops(jaxpr: Jaxpr) -> Iterator[str]:

@@ -10,7 +10,9 @@ from jaxtyping import Float
 
 
 def jumps(
-    values: Callable[[np.ndarray], np.ndarray], a: Float[np.ndarray, "intervals variables"], b: Float[np.ndarray, "intervals variables"]
+    values: Callable[[np.ndarray], np.ndarray],
+    a: Float[np.ndarray, "intervals variables"],
+    b: Float[np.ndarray, "intervals variables"],
 ) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
     """Yield, for every interval from `a` to `b` with a jump, the entry that jumps most and the points just
     before and after.

@@ -3,7 +3,8 @@
     diffrax = module_on_first_use("diffrax")      stands for the module, under `if TYPE_CHECKING: import diffrax`
 
 A class that derives from one of such a module is defined in a module that is itself imported on first use.
-`isinstance(x, diffrax.AbstractSolver)` imports diffrax, so compare `x` first with None and with our own kinds.
+`isinstance(x, diffrax.AbstractSolver)` imports diffrax, so compare `x` first with None and with our own
+kinds.
 """
 
 from importlib import import_module
@@ -38,8 +39,10 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
     except ImportError as error:
         package = module.partition(".")[0]
         install = f"'jourdain-jax[{extra}]'" if extra else package
-        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it "
-            f"with: pip install {install}") from error
+        raise ImportError(
+            f"{purpose} needs the package `{package}`, which is not installed; install it "
+            f"with: pip install {install}"
+        ) from error
 
 
 def version_of(package: str) -> str:

@@ -41,7 +41,10 @@ def identity(name: str) -> Primitive:
     primitive.def_impl(lambda *values, **_: list(values))
     primitive.def_abstract_eval(lambda *avals, **_: list(avals))
     mlir.register_lowering(primitive, lambda ctx, *values, **_: list(values))
-    batching.primitive_batchers[primitive] = lambda values, axes, **params: (primitive.bind(*values, **params), axes)
+    batching.primitive_batchers[primitive] = lambda values, axes, **params: (
+        primitive.bind(*values, **params),
+        axes,
+    )
     return primitive
 
 
@@ -66,7 +69,10 @@ def lanes_of(values, axes) -> int:
 def with_lanes_first(values, axes, count: int | None = None) -> list:
     """Return the arrays with the batch axis first; an array without one is repeated."""
     count = lanes_of(values, axes) if count is None else count
-    return [jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
+    return [
+        jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(values, axes, strict=True)
+    ]
 
 
 def _with_lanes_first(values, axes):
@@ -107,7 +113,9 @@ batching.primitive_batchers[_entries_p] = _with_lanes_last
 ad.deflinear2(_entries_p, lambda cotangents, v: [jnp.stack([ad.instantiate_zeros(x) for x in cotangents])])
 
 
-_shown_p, _forwards_p, _tangents_p = (identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents"))
+_shown_p, _forwards_p, _tangents_p = (
+    identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents")
+)
 
 
 def _transposed(cotangents, *values, look: Callable):
@@ -133,7 +141,12 @@ def _seen(*tangents, look: Callable):
 def _seen_in_batch(tangents, dims, *, look: Callable):
     """Process several directions at once, from `jacfwd`."""
     if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
-        look([np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0) for x, dim in zip(tangents, dims, strict=True)])
+        look(
+            [
+                np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0)
+                for x, dim in zip(tangents, dims, strict=True)
+            ]
+        )
     return list(tangents), dims
 
 
@@ -141,7 +154,10 @@ _tangents_p.def_impl(_seen)
 batching.primitive_batchers[_tangents_p] = _seen_in_batch
 ad.primitive_jvps[_forwards_p] = _pushed
 ad.deflinear2(_tangents_p, lambda cotangents, *values, look: [ad.instantiate_zeros(ct) for ct in cotangents])
-ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p.bind(*primals, look=look), list(tangents))
+ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (
+    _tangents_p.bind(*primals, look=look),
+    list(tangents),
+)
 
 
 def tap_tangents(values: tuple, look: Callable) -> tuple:
@@ -166,7 +182,9 @@ def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
 
 
 @jax.custom_jvp
-def left(asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]) -> list[Array]:
+def left(
+    asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]
+) -> list[Array]:
     """Return `each` of some arrays. `failed` marks failed samples along their first axes; `asked` is the zero
     from `entered`.
     """
@@ -185,7 +203,11 @@ def nan_where(failed: Flag, x: Scalar) -> Scalar:
 @partial(entered.defjvp, symbolic_zeros=True)
 def _entering(primals, tangents):
     each, asked = entered(*primals)
-    moved = {k: _counted_p.bind(jnp.asarray(x), lanes=0) for k, x in enumerate(tangents) if not isinstance(x, SymbolicZero)}
+    moved = {
+        k: _counted_p.bind(jnp.asarray(x), lanes=0)
+        for k, x in enumerate(tangents)
+        if not isinstance(x, SymbolicZero)
+    }
     count = sum((count.astype(asked.dtype) for _, count in moved.values()), jnp.zeros((), asked.dtype))
     return (each, asked), ([moved[k][0] if k in moved else x for k, x in enumerate(tangents)], count)
 
@@ -196,7 +218,9 @@ def _leaving(primals, tangents):
     none, count = jnp.zeros_like(asked), count.astype(asked.dtype)
 
     def lost(failed, x, rate):
-        failed = jnp.broadcast_to(jnp.reshape(failed, (*failed.shape, *[1] * (x.ndim - failed.ndim))), x.shape)
+        failed = jnp.broadcast_to(
+            jnp.reshape(failed, (*failed.shape, *[1] * (x.ndim - failed.ndim))), x.shape
+        )
         return _lost_p.bind(failed, none, asked, count, jnp.asarray(rate), lanes=0)[0]
 
     return left(*primals), list(map(lost, failed, each, rates))
@@ -268,7 +292,9 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
         return [avals[-1].update(shape=x.shape, weak_type=False) for x in found]
 
     p.multiple_results = True
-    p.def_impl(jax.jit(lambda *values, lanes: list(function(jnp, *values, lanes=lanes)), static_argnames="lanes"))
+    p.def_impl(
+        jax.jit(lambda *values, lanes: list(function(jnp, *values, lanes=lanes)), static_argnames="lanes")
+    )
     p.def_abstract_eval(shapes)
     mlir.register_lowering(p, mlir.lower_fun(partial(function, jnp), multiple_results=True))
 
@@ -295,4 +321,9 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
 
 _counted_p, _masked_p = _map(_counted, _counted_back, 0), _map(_masked, _masked_back, 1)
 _lost_p, _lost_and_counted_p = _map(_lost, _lost_back, 2), _map(_lost_and_counted, _lost_and_counted_back, 1)
-MAPS = (_counted_p, _counted), (_masked_p, _masked), (_lost_p, _lost), (_lost_and_counted_p, _lost_and_counted)
+MAPS = (
+    (_counted_p, _counted),
+    (_masked_p, _masked),
+    (_lost_p, _lost),
+    (_lost_and_counted_p, _lost_and_counted),
+)

@@ -26,7 +26,9 @@ from jourdain_jax.calculus.reals import Count, rank_cutoff, with_usual_promotion
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
-def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
+def pseudo_inverse(
+    A: Float[Array, "rows columns"], cutoff: float | None = None
+) -> Float[Array, "columns rows"]:
     """Return the Moore-Penrose inverse of `A`, dropping singular values below `cutoff` times the largest. It
     is differentiable to any order in both modes where the rank is constant.
     """
@@ -71,7 +73,9 @@ def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns col
     return _null_space(A, _svd_basis, None)
 
 
-def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns columns"]:
+def null_space_qr(
+    A: Float[Array, "rows columns"], cutoff: float | None = None
+) -> Float[Array, "columns columns"]:
     """Return a null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space
     are zero.
 

@@ -96,15 +96,27 @@ def _of_jax(x) -> Array:
     if has_unit(x):
         raise TypeError(f"real numbers are expected, but this is {described(x)}")
     try:
-        x = np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x
+        x = (
+            np.asarray(x, real_type())
+            if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble
+            else x
+        )
         # without a dtype, JAX compiles a program for each shape of a NumPy array
-        return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if isinstance(x, np.ndarray) and x.dtype.kind == "f" else None)
+        return jnp.asarray(
+            x,
+            (
+                jax.dtypes.canonicalize_dtype(x.dtype)
+                if isinstance(x, np.ndarray) and x.dtype.kind == "f"
+                else None
+            ),
+        )
     except OverflowError:
         raise ValueError("an integer is too large for a floating-point number; use a smaller one") from None
 
 
-def checked_real(value, what: str, shape: Shape | None = None, *, advice: str = "check how it was "
-    "built") -> Array:
+def checked_real(
+    value, what: str, shape: Shape | None = None, *, advice: str = "check how it was built"
+) -> Array:
     """Return `value` as a floating-point array.
 
     **Arguments**
@@ -135,8 +147,9 @@ def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str 
     return found
 
 
-def checked_known(value, what: str, shape: Shape | None = None, *, advice: str = "check how it was "
-    "built") -> np.ndarray:
+def checked_known(
+    value, what: str, shape: Shape | None = None, *, advice: str = "check how it was built"
+) -> np.ndarray:
     """Return a concrete `value` as a NumPy array of the default float, also inside `jit`. Arguments and
     errors as for `checked_real`.
     """
@@ -163,7 +176,12 @@ def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advic
 
 def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
     """Return an integer from `low` to `high`, or raise ValueError with the `expected` range."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low or (high is not None and value > high):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | np.integer)
+        or value < low
+        or (high is not None and value > high)
+    ):
         raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
     return int(value)
 
@@ -179,7 +197,9 @@ def has_unit(x) -> bool:
     """
     if isinstance(x, list | tuple):
         return any(has_unit(part) for part in x if type(part) is not float)
-    return _may_have_unit(type(x)) and any(hasattr(type(x), name) or name in getattr(x, "__dict__", ()) for name in _UNITS)
+    return _may_have_unit(type(x)) and any(
+        hasattr(type(x), name) or name in getattr(x, "__dict__", ()) for name in _UNITS
+    )
 
 
 def as_array(x, dtype):
@@ -189,11 +209,20 @@ def as_array(x, dtype):
 
 def in_default_precision(tree):
     """Return the tree with floating-point arrays converted to the default type."""
-    return jax.tree.map(lambda x: x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+    return jax.tree.map(
+        lambda x: (
+            x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x
+        ),
+        tree,
+    )
 
 
 def _check(array, what: str, shape: Shape | None, advice: str) -> None:
-    if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
+    if (
+        array.dtype.kind not in "iuf"
+        and not jnp.issubdtype(array.dtype, jnp.integer)
+        and not jnp.issubdtype(array.dtype, jnp.floating)
+    ):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")
     if shape is not None and array.shape != shape:
         expected = "one number" if shape == () else str(shape)
@@ -228,7 +257,11 @@ def described(value) -> str:
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         numbers = getattr(value.dtype, "kind", "O") not in "OUSMm"
         masked = ", of which some are masked" if np.ma.is_masked(value) else ""
-        return f"an array of shape {tuple(value.shape)}{masked}" if numbers else f"an array of {value.dtype}, shape {tuple(value.shape)}"
+        return (
+            f"an array of shape {tuple(value.shape)}{masked}"
+            if numbers
+            else f"an array of {value.dtype}, shape {tuple(value.shape)}"
+        )
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
 
@@ -292,12 +325,20 @@ _UNITS = "units", "unit", "magnitude"  # attributes of quantities with units in 
 _PLAIN = bool, int, float, complex, np.ndarray
 _NEVER = np.generic | jax.Array | jax.core.Tracer | type
 _may_have_unit: Callable[[type], bool] = lru_cache(maxsize=1024)(
-    lambda kind: kind not in _PLAIN and not issubclass(kind, _NEVER) and (hasattr(kind, "__float__") or hasattr(kind, "__array__"))
+    lambda kind: (
+        kind not in _PLAIN
+        and not issubclass(kind, _NEVER)
+        and (hasattr(kind, "__float__") or hasattr(kind, "__array__"))
+    )
 )
 
 # Cached by type, at a tenth of the time of an isinstance check against the classes of JAX.
-is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.core.Tracer))
-is_array_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.Array | jax.core.Tracer | np.ndarray | np.generic))
+is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(
+    lambda kind: issubclass(kind, jax.core.Tracer)
+)
+is_array_type: Callable[[type], bool] = lru_cache(maxsize=1024)(
+    lambda kind: issubclass(kind, jax.Array | jax.core.Tracer | np.ndarray | np.generic)
+)
 
 
 F = TypeVar("F", bound=Callable)
@@ -317,7 +358,9 @@ def with_usual_promotion(function: F) -> F:
 # For functions whose cost is mostly compilation. Before jaxlib 0.11.1, XLA's new emitters can be disabled: a
 # first motion of a disc from cached object code then takes 1.55 s instead of 1.75. Later versions have only
 # these emitters.
-_EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
+_EMITTERS: dict[str, Any] = (
+    {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
+)
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 
 

@@ -33,7 +33,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, all_finite, eps_of, largest, tiny_of, with_usual_promotion
+from jourdain_jax.calculus.reals import (
+    Count,
+    Flag,
+    Scalar,
+    all_finite,
+    eps_of,
+    largest,
+    tiny_of,
+    with_usual_promotion,
+)
 
 Unknowns = Float[Array, "unknowns"]
 
@@ -74,7 +83,13 @@ def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
         x, size, _, _ = jax.lax.while_loop(running, iterate, start)
         return x, (size <= eps**0.6).astype(x0.dtype)
 
-    x, converged = jax.lax.custom_root(residual, jax.lax.stop_gradient(guess), solve, lambda f, y: jnp.linalg.solve(_matrix(f, y), y), has_aux=True)
+    x, converged = jax.lax.custom_root(
+        residual,
+        jax.lax.stop_gradient(guess),
+        solve,
+        lambda f, y: jnp.linalg.solve(_matrix(f, y), y),
+        has_aux=True,
+    )
     return Root(x, converged > 0)
 
 
@@ -108,7 +123,9 @@ class Search(eqx.Module):
         return jnp.where(jnp.isfinite(left), left, jnp.inf)
 
 
-def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
+def damped_search(
+    rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80
+) -> Search:
     """Search near `guess`, within `low` to `high`, for x with no residual above `tolerance`; otherwise return
     the smallest residual found. J has derivatives with respect to x in units of `size`.
 
@@ -124,34 +141,51 @@ def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: fl
         f, J = look(search.trial)
         # never accept a Jacobian that is not finite
         better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))
-        best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
+        best, f, J = (
+            jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J))
+        )
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
         # limit a step to a quarter of the size of the unknowns
         step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(largest(step), tiny_of(f)))
         # at a damping of 1e7 no step reduces the residuals
-        going = (largest(f) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
+        going = (
+            (largest(f) > tolerance)
+            & (damping < 1e7)
+            & (search.steps < most_steps)
+            & jnp.all(jnp.isfinite(f))
+        )
         return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)
     unknown = jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype)
-    start = Search(guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    start = Search(
+        guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True)
+    )
     return jax.lax.while_loop(lambda search: search.going, once, start)
 
 
-def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80) -> Unknowns:
+def smooth_root(
+    look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80
+) -> Unknowns:
     """Return the root near a guess, differentiable to any order. After a search without derivatives come
     three steps `x <- x - J+ R(x)` with constant J, each of which makes one more order of derivatives correct.
 
     `look`: x -> R and J, without derivatives; `rows`: x -> R; `x`: values of the fixed unknowns (size zero)
     with their derivatives; `cutoff`: of J+. Other arguments as for `damped_search`.
     """
-    found = jax.lax.stop_gradient(damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps))
+    found = jax.lax.stop_gradient(
+        damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps)
+    )
     inverse = size[:, None] * pseudo_inverse(found.J, cutoff)
-    return jax.lax.scan(lambda x, _: (x - inverse @ rows(x), None), jnp.where(size > 0, found.best, x), length=3)[0]
+    return jax.lax.scan(
+        lambda x, _: (x - inverse @ rows(x), None), jnp.where(size > 0, found.best, x), length=3
+    )[0]
 
 
-def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Count]:
+def first_root(
+    rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds
+) -> tuple[Nearest, Count]:
     """Return the root from the first of the `guesses` that succeeds, and the index of that guess; without a
     root, the nearest approach.
 
@@ -167,7 +201,9 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
 
     def next_block(carried):
         k, best, number = carried
-        found = jax.vmap(lambda guess: damped_search(rows, guess, size, tolerance, *bounds))(guesses[jnp.asarray(places)[k]])
+        found = jax.vmap(lambda guess: damped_search(rows, guess, size, tolerance, *bounds))(
+            guesses[jnp.asarray(places)[k]]
+        )
         left = jax.vmap(lambda search: search.left)(found)
         which = jnp.where(jnp.any(left <= good), jnp.argmax(left <= good), jnp.argmin(left)).astype(jnp.int32)
         better = (k == 0) | (left[which] < best.left)
@@ -175,14 +211,20 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
         return k + 1, *jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, (best, number))
 
     nothing = Nearest(guesses[0], jnp.full((), jnp.inf, guesses.dtype)), jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), next_block, (jnp.zeros((), jnp.int32), *nothing))[1:]
+    return jax.lax.while_loop(
+        lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good),
+        next_block,
+        (jnp.zeros((), jnp.int32), *nothing),
+    )[1:]
 
 
 QUIET = 2  # number of steps without change after which the iteration has settled
 ROUND_OFF = 1e3  # a change exceeds this many eps, relative to 1 + |x|
 
 
-def fixed_point(step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None) -> Float[Array, "entries"]:
+def fixed_point(
+    step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None
+) -> Float[Array, "entries"]:
     """Return x after at most `most` steps of `x <- step(a, x)`; a NaN counts as settled.
 
     `prepare`: turns a into the argument of the steps, a pair whose second part is not differentiated.
@@ -201,7 +243,9 @@ def _iterated(of: tuple, *, step: Callable, most: int, prepare: Callable | None)
 @with_usual_promotion
 def _iterated_jvp(primals, tangents, *, step, most, prepare):
     (of,), (along,) = primals, tangents
-    (moving, _), (fixed, _) = moves, _ = eqx.partition(of, jax.tree.map(lambda d: d is not None, along, is_leaf=lambda d: d is None))
+    (moving, _), (fixed, _) = moves, _ = eqx.partition(
+        of, jax.tree.map(lambda d: d is not None, along, is_leaf=lambda d: d is None)
+    )
     flat, restored = ravel_pytree(moves)
     units, first = jax.vmap(restored)(jnp.eye(flat.size, dtype=flat.dtype))
     D = jnp.zeros((flat.size, *of[1].shape), of[1].dtype) if first is None else first
@@ -209,13 +253,18 @@ def _iterated_jvp(primals, tangents, *, step, most, prepare):
     if prepare is None:
         at, dat, taken = moving, units, lambda at: eqx.combine(at, fixed)
     else:
-        of_units = along_each(lambda da: jax.jvp(lambda a: prepare(eqx.combine(a, fixed)), (moving,), (da,), has_aux=True), out_axes=(None, 0, None))
+        of_units = along_each(
+            lambda da: jax.jvp(lambda a: prepare(eqx.combine(a, fixed)), (moving,), (da,), has_aux=True),
+            out_axes=(None, 0, None),
+        )
         at, dat, rest = of_units(units)
-        taken = lambda at: (at, rest)  # noqa: E731
+        taken = lambda at: (at, rest)
 
     def both(carry):
         x, D = carry
-        return along_each(lambda da, dx: jax.jvp(lambda a, x: step(taken(a), x), (at, x), (da, dx)), out_axes=(None, 0))(dat, D)
+        return along_each(
+            lambda da, dx: jax.jvp(lambda a, x: step(taken(a), x), (at, x), (da, dx)), out_axes=(None, 0)
+        )(dat, D)
 
     x, D = _loop(both, (of[1], D), most)
     return x, ravel_pytree(along)[0] @ D
@@ -243,7 +292,13 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def nearest_root(
-    look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: np.ndarray | float = np.inf, within: tuple = (-np.inf, np.inf)
+    look: Look,
+    solve: Callable,
+    x: np.ndarray,
+    *,
+    most: int = 25,
+    longest: np.ndarray | float = np.inf,
+    within: tuple = (-np.inf, np.inf),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
     1 + |x|, infinite for NaN.

@@ -33,8 +33,9 @@ def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _angle(angle: Number) -> Scalar:
-    return checked_real(angle, "angle of a rotation", (),
-        advice="pass one angle in rad; use `jax.vmap` for many")
+    return checked_real(
+        angle, "angle of a rotation", (), advice="pass one angle in rad; use `jax.vmap` for many"
+    )
 
 
 def _turned(angle: Number, rows: Callable) -> Matrix3:
@@ -47,7 +48,8 @@ def _turned(angle: Number, rows: Callable) -> Matrix3:
 def rot_x(angle: Number) -> Matrix3:
     """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the x axis.
 
-    With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the inertial frame.
+    With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the
+    inertial frame.
     """
     return _turned(angle, lambda c, s, o, i: [[i, o, o], [o, c, -s], [o, s, c]])
 
@@ -55,7 +57,8 @@ def rot_x(angle: Number) -> Matrix3:
 def rot_y(angle: Number) -> Matrix3:
     """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the y axis.
 
-    With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k, `R[:, k]`, is body axis k in the inertial frame.
+    With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k,
+    `R[:, k]`, is body axis k in the inertial frame.
     """
     return _turned(angle, lambda c, s, o, i: [[c, o, s], [o, i, o], [-s, o, c]])
 
@@ -88,8 +91,10 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
     """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="pass (w, x, y, z)")
     if not holds(np.any, quaternion):
-        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; pass (w, x, y, z) of nonzero "
-            "length, such as (1, 0, 0, 0) for no rotation")
+        raise ValueError(
+            "quaternion is (0, 0, 0, 0), which is not an attitude; pass (w, x, y, z) of nonzero "
+            "length, such as (1, 0, 0, 0) for no rotation"
+        )
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v), independent of the norm, so a drifting norm never scales an
     # inertia.

@@ -64,7 +64,9 @@ def root(x):
     """
     a, ea = halves(x)
     value = np.sqrt(a)
-    return with_bound(value, np.where((ea > 0) & (np.abs(a) <= LOST * ea), np.inf, np.where(ea > 0, ea / value, 0.0)))
+    return with_bound(
+        value, np.where((ea > 0) & (np.abs(a) <= LOST * ea), np.inf, np.where(ea > 0, ea / value, 0.0))
+    )
 
 
 def wave(function: Callable) -> Callable:

@@ -116,13 +116,34 @@ def _whole_quotients(sympy, a, b):
     return a - b * sympy.sign(a / b) * sympy.floor(sympy.Abs(a / b))
 
 
-_COMPARED = (("lt", "<", np.less), ("le", "<=", np.less_equal), ("gt", ">", np.greater), ("ge", ">=", np.greater_equal), ("eq", "==", np.equal))
+_COMPARED = (
+    ("lt", "<", np.less),
+    ("le", "<=", np.less_equal),
+    ("gt", ">", np.greater),
+    ("ge", ">=", np.greater_equal),
+    ("eq", "==", np.equal),
+)
 _COMPARED += (("ne", "!=", np.not_equal),)
 COMPARISONS = frozenset(name for name, *_ in _COMPARED)
 
 _ALL = [
-    Operation("add", np.add, lambda g, n, a, b, da, db: g.add(da, db), bounded=round_off.sum_, infix=("+", 1), sympy=lambda _, a, b: a + b, commutes=True),
-    Operation("sub", np.subtract, lambda g, n, a, b, da, db: g.sub(da, db), bounded=round_off.difference, infix=("-", 1), sympy=lambda _, a, b: a - b),
+    Operation(
+        "add",
+        np.add,
+        lambda g, n, a, b, da, db: g.add(da, db),
+        bounded=round_off.sum_,
+        infix=("+", 1),
+        sympy=lambda _, a, b: a + b,
+        commutes=True,
+    ),
+    Operation(
+        "sub",
+        np.subtract,
+        lambda g, n, a, b, da, db: g.sub(da, db),
+        bounded=round_off.difference,
+        infix=("-", 1),
+        sympy=lambda _, a, b: a - b,
+    ),
     Operation(
         "mul",
         np.multiply,
@@ -132,21 +153,47 @@ _ALL = [
         sympy=lambda _, a, b: a * b,
         commutes=True,
     ),
-    Operation("div", np.divide, _quotient, bounded=round_off.quotient, infix=("/", 2), sympy=lambda _, a, b: a / b),
-    Operation("neg", np.negative, lambda g, n, a, da: g.neg(da), bounded=round_off.negative, sympy=lambda _, a: -a),
+    Operation(
+        "div", np.divide, _quotient, bounded=round_off.quotient, infix=("/", 2), sympy=lambda _, a, b: a / b
+    ),
+    Operation(
+        "neg", np.negative, lambda g, n, a, da: g.neg(da), bounded=round_off.negative, sympy=lambda _, a: -a
+    ),
     Operation("sqrt", np.sqrt, lambda g, n, a, da: g.div(da, g.mul(g.const(2.0), n)), bounded=round_off.root),
     Operation("sin", np.sin, lambda g, n, a, da: g.mul(g.call("cos", a), da), bounded=round_off.wave(np.sin)),
-    Operation("cos", np.cos, lambda g, n, a, da: g.neg(g.mul(g.call("sin", a), da)), bounded=round_off.wave(np.cos)),
-    Operation("tan", np.tan, lambda g, n, a, da: g.mul(g.add(g.one, g.mul(n, n)), da), bounded=round_off.tangent),
+    Operation(
+        "cos", np.cos, lambda g, n, a, da: g.neg(g.mul(g.call("sin", a), da)), bounded=round_off.wave(np.cos)
+    ),
+    Operation(
+        "tan", np.tan, lambda g, n, a, da: g.mul(g.add(g.one, g.mul(n, n)), da), bounded=round_off.tangent
+    ),
     Operation("asin", np.arcsin, _of_asin),
     Operation("acos", np.arccos, lambda g, n, a, da: g.neg(_of_asin(g, n, a, da))),
     Operation("atan", np.arctan, lambda g, n, a, da: g.div(da, g.add(g.one, g.mul(a, a)))),
     Operation("atan2", np.arctan2, _arctangent),
     Operation("exp", np.exp, lambda g, n, a, da: g.mul(n, da), "flat"),
-    Operation("exp2", np.exp2, lambda g, n, a, da: g.mul(g.mul(n, g.const(math.log(2.0))), da), "flat", sympy=lambda _, a: 2**a),
-    Operation("expm1", np.expm1, lambda g, n, a, da: g.mul(g.add(n, g.one), da), "flat", sympy=lambda s, a: s.exp(a) - 1),
+    Operation(
+        "exp2",
+        np.exp2,
+        lambda g, n, a, da: g.mul(g.mul(n, g.const(math.log(2.0))), da),
+        "flat",
+        sympy=lambda _, a: 2**a,
+    ),
+    Operation(
+        "expm1",
+        np.expm1,
+        lambda g, n, a, da: g.mul(g.add(n, g.one), da),
+        "flat",
+        sympy=lambda s, a: s.exp(a) - 1,
+    ),
     Operation("log", np.log, lambda g, n, a, da: g.div(da, a)),
-    Operation("log1p", np.log1p, lambda g, n, a, da: g.div(da, g.add(g.one, a)), "flat", sympy=lambda s, a: s.log(a + 1)),
+    Operation(
+        "log1p",
+        np.log1p,
+        lambda g, n, a, da: g.div(da, g.add(g.one, a)),
+        "flat",
+        sympy=lambda s, a: s.log(a + 1),
+    ),
     Operation("pow", np.power, _real_power, sympy=lambda s, a, b: s.Pow(a, b)),
     Operation("cbrt", np.cbrt, lambda g, n, a, da: g.div(da, g.mul(g.const(3.0), g.mul(n, n)))),
     Operation("sinh", np.sinh, lambda g, n, a, da: g.mul(g.call("cosh", a), da), "flat"),
@@ -167,17 +214,65 @@ _ALL = [
     ),
     Operation("abs", np.absolute, _of_abs, "branch", python="abs", c="fabs", sympy=lambda s, a: s.Abs(a)),
     Operation("sign", np.sign, None, "branch", python="sign"),
-    Operation("max", np.maximum, _larger, "branch", python="max", c="fmax", sympy=lambda s, a, b: s.Max(a, b), commutes=True),
-    Operation("min", np.minimum, _smaller, "branch", python="min", c="fmin", sympy=lambda s, a, b: s.Min(a, b), commutes=True),
+    Operation(
+        "max",
+        np.maximum,
+        _larger,
+        "branch",
+        python="max",
+        c="fmax",
+        sympy=lambda s, a, b: s.Max(a, b),
+        commutes=True,
+    ),
+    Operation(
+        "min",
+        np.minimum,
+        _smaller,
+        "branch",
+        python="min",
+        c="fmin",
+        sympy=lambda s, a, b: s.Min(a, b),
+        commutes=True,
+    ),
     Operation("floor", np.floor, None, "branch"),
     Operation("ceil", np.ceil, None, "branch", sympy=lambda s, a: s.ceiling(a)),
-    Operation("round", np.rint, None, "branch", python="round", c="rint", sympy=lambda s, a: s.Function("round")(a)),
+    Operation(
+        "round", np.rint, None, "branch", python="round", c="rint", sympy=lambda s, a: s.Function("round")(a)
+    ),
     Operation("rem", np.fmod, _remainder, "branch", python="math.fmod", c="fmod", sympy=_whole_quotients),
-    *(Operation(name, f, None, "branch", infix=(sign, 0), sympy=lambda s, a, b, name=name: getattr(s, name.title())(a, b)) for name, sign, f in _COMPARED),
+    *(
+        Operation(
+            name,
+            f,
+            None,
+            "branch",
+            infix=(sign, 0),
+            sympy=lambda s, a, b, name=name: getattr(s, name.title())(a, b),
+        )
+        for name, sign, f in _COMPARED
+    ),
     Operation("is_finite", np.isfinite, None, "choice", python="math.isfinite", c="isfinite"),
-    Operation("and", np.logical_and, None, "choice", python="({0}) and ({1})", c="({0}) && ({1})", sympy=lambda s, a, b: s.And(a, b)),
-    Operation("or", np.logical_or, None, "choice", python="({0}) or ({1})", c="({0}) || ({1})", sympy=lambda s, a, b: s.Or(a, b)),
-    Operation("not", np.logical_not, None, "choice", python="not ({0})", c="!({0})", sympy=lambda s, a: s.Not(a)),
+    Operation(
+        "and",
+        np.logical_and,
+        None,
+        "choice",
+        python="({0}) and ({1})",
+        c="({0}) && ({1})",
+        sympy=lambda s, a, b: s.And(a, b),
+    ),
+    Operation(
+        "or",
+        np.logical_or,
+        None,
+        "choice",
+        python="({0}) or ({1})",
+        c="({0}) || ({1})",
+        sympy=lambda s, a, b: s.Or(a, b),
+    ),
+    Operation(
+        "not", np.logical_not, None, "choice", python="not ({0})", c="!({0})", sympy=lambda s, a: s.Not(a)
+    ),
     Operation(  # the third argument if the first is true, otherwise the second
         "select",
         lambda c, a, b: np.where(c, b, a),

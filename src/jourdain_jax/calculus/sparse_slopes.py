@@ -46,7 +46,9 @@ class Pattern:
         """Return the lengths of all rows, (states, rows)."""
         return np.sqrt(_summed(self.rows, self.shape[0], values**2))
 
-    def shortest(self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+    def shortest(
+        self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0
+    ) -> np.ndarray:
         """Return the shortest x with `G x = right` at every state. Where the sparse solution fails, use dense
         matrices as `roots.shortest` does.
 
@@ -75,7 +77,9 @@ class Pattern:
         found, known = np.full(f.shape, np.nan), all_finite(values, axis=1) & all_finite(f, axis=1)
         states, (rows, columns) = np.arange(np.count_nonzero(known))[:, None], self.shape
         places = (states * rows + self.rows).ravel(), (states * columns + self.columns).ravel()
-        G = sparse.csr_array((values[known].ravel(), places), shape=(states.size * rows, states.size * columns))
+        G = sparse.csr_array(
+            (values[known].ravel(), places), shape=(states.size * rows, states.size * columns)
+        )
         with contextlib.suppress(RuntimeError):  # zero pivot
             factors = splu((G @ G.T).tocsc())
             found[known] = factors.solve(f[known].ravel()).reshape(-1, rows)

@@ -15,11 +15,17 @@ DEMO = "Rigid"  # a measured bicycle with all standard errors and a stable speed
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    job = verbs.add_parser("bicycle",
-        help="stability speeds of measured bicycles with uncertainties, and simulated rides")
+    job = verbs.add_parser(
+        "bicycle", help="stability speeds of measured bicycles with uncertainties, and simulated rides"
+    )
     job.add_argument(
-        "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements "
+        "files",
+        nargs="+",
+        metavar="FILE",
+        help=(
+            "parameter files (NAME = VALUE+/-SIGMA), raw measurements "
             "(*Measured.txt), or names of shipped bicycles"
+        ),
     )
     _options(job, "bicycle-results")
     job.set_defaults(run=_job)
@@ -31,8 +37,9 @@ def add(verbs) -> None:
 
 def _options(parser, folder: str) -> None:
     parser.add_argument("--out", default=folder, help=f"folder for tables and figures (default: {folder})")
-    parser.add_argument("--samples", type=int, default=2000,
-        help="number of Monte Carlo samples (default 2000)")
+    parser.add_argument(
+        "--samples", type=int, default=2000, help="number of Monte Carlo samples (default 2000)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="random seed of the Monte Carlo (default 0)")
     parser.add_argument("--no-figures", action="store_true", help="numbers only")
     parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
@@ -48,8 +55,11 @@ def _job(options) -> bool:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(
-            f"cannot create the folder `{out}`: {error.strerror}; choose another with --out") from None
-    studies = run(paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr))
+            f"cannot create the folder `{out}`: {error.strerror}; choose another with --out"
+        ) from None
+    studies = run(
+        paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr)
+    )
     write_results(studies, out / "result.json")
     written = [out / "result.json"]
     good = [one for one in studies if isinstance(one, Study)]
@@ -62,11 +72,13 @@ def _job(options) -> bool:
 
 
 def prefixes(names: list[str]) -> list[str]:
-    """Return file name prefixes for the figures, numbered where bicycle names repeat; empty for one bicycle.
-    """
+    """Return file name prefixes for the figures, numbered where bicycle names repeat; empty for one bicycle."""
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     return (
-        [f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-" for k, name in enumerate(plain)]
+        [
+            f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-"
+            for k, name in enumerate(plain)
+        ]
         if len(names) > 1
         else [""] * len(names)
     )
@@ -75,7 +87,11 @@ def prefixes(names: list[str]) -> list[str]:
 def _figures(study: Study, out: Path, prefix: str) -> list[Path]:
     """Draw `eigenvalues.png`, `ride.png` and `ride.gif`; return their paths."""
     written = []
-    for name, draw in (("eigenvalues.png", draw_eigenvalues), ("ride.png", draw_rides), ("ride.gif", animate_ride)):
+    for name, draw in (
+        ("eigenvalues.png", draw_eigenvalues),
+        ("ride.png", draw_rides),
+        ("ride.gif", animate_ride),
+    ):
         path = out / f"{prefix}{name}"
         draw(study, path)
         written.append(path)

@@ -28,8 +28,10 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="jourdain-jax",
         description="Dynamics of holonomic and nonholonomic mechanical systems.",
-        epilog="exit codes: 0 success; 1 failed check, incomplete motion or rejected file; 2 "
-            "wrong usage or unknown name",
+        epilog=(
+            "exit codes: 0 success; 1 failed check, incomplete motion or rejected file; 2 "
+            "wrong usage or unknown name"
+        ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version_of('jourdain-jax')}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -52,8 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     # cheaper compilation for programs that run once; other series may not know the flags
     if jaxlib.__version__.startswith("0.10."):
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false "
-            "--xla_backend_optimization_level=0")
+        os.environ.setdefault(
+            "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+        )
     try:
         return OK if options.run(options) else FAILED
     except (ValueError, InUseError, ImportError) as error:
@@ -64,6 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except OSError as error:
         where = f"`{error.filename}`: " if error.filename else ""
-        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check "
-            "the path and its permissions", file=sys.stderr)
+        print(
+            f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check "
+            "the path and its permissions",
+            file=sys.stderr,
+        )
         return USAGE

@@ -24,14 +24,16 @@ from jourdain_jax.views.quantities import check_format, plot
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    listing = verbs.add_parser("models",
-        help="list the models, or describe one: parameters, coordinates, speeds, example start")
+    listing = verbs.add_parser(
+        "models", help="list the models, or describe one: parameters, coordinates, speeds, example start"
+    )
     listing.add_argument("model", nargs="?", help="model to describe (default: list all)")
     listing.add_argument("--json", action="store_true", help="print JSON")
     listing.set_defaults(run=_models)
 
-    about = verbs.add_parser("report",
-        help="degrees of freedom, constraints, integrability, cyclic coordinates")
+    about = verbs.add_parser(
+        "report", help="degrees of freedom, constraints, integrability, cyclic coordinates"
+    )
     _model_options(about)
     about.set_defaults(run=_report)
 
@@ -48,8 +50,9 @@ def add(verbs) -> None:
     running.add_argument("--rtol", type=float, default=1e-8, help="relative tolerance (default 1e-8)")
     running.add_argument("--atol", type=float, default=1e-8, help="absolute tolerance (default 1e-8)")
     running.add_argument("--out", help="write the trajectory to this file (.npz)")
-    running.add_argument("--plot", metavar="FILE",
-        help="write a plot of all coordinates to this file (.png, .svg, .pdf)")
+    running.add_argument(
+        "--plot", metavar="FILE", help="write a plot of all coordinates to this file (.png, .svg, .pdf)"
+    )
     running.add_argument("--animate", metavar="FILE", help="write an animation to this file (.gif)")
     running.set_defaults(run=_simulate)
 
@@ -62,7 +65,10 @@ def _model_options(parser) -> None:
 
 
 def _start_options(parser) -> None:
-    about = "initial coordinates and speeds; others start at zero and are projected onto the constraints (default: the model's example)"
+    about = (
+        "initial coordinates and speeds; others start at zero and are projected onto the constraints"
+        " (default: the model's example)"
+    )
     parser.add_argument("--start", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=about)
 
 
@@ -81,8 +87,10 @@ def _scene(options) -> Scene:
     for name in counts_of(kind):
         if name in values:
             if not values[name].is_integer():
-                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a "
-                    "count, expected a whole number")
+                raise ValueError(
+                    f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a "
+                    "count, expected a whole number"
+                )
             values[name] = int(values[name])
     return model(options.model, **values)
 
@@ -113,7 +121,9 @@ def _model_row(name: str) -> dict:
         "coordinates": scene.coordinate_names.entries,
         "speeds": scene.speed_names.entries,
         "inputs": scene.inputs.entries,
-        "parameters": {key: {"value": value, "unit": meta["unit"]} for key, value, meta in parameters_of(scene)},
+        "parameters": {
+            key: {"value": value, "unit": meta["unit"]} for key, value, meta in parameters_of(scene)
+        },
         "counts": {key: {"value": getattr(scene, key)} for key in counts_of(type(scene))},
         "events": names_of_events(scene),
         **{key: getattr(scene, key) for key in ("domain", "example", "example_span", "conventions")},
@@ -123,17 +133,27 @@ def _model_row(name: str) -> dict:
 
 def _description(row: dict) -> str:
     """Return the printed description of a model."""
-    values = {key: f"{key}={entry['value']:g} {entry['unit'] or ''}".strip() for key, entry in row["parameters"].items()}
+    values = {
+        key: f"{key}={entry['value']:g} {entry['unit'] or ''}".strip()
+        for key, entry in row["parameters"].items()
+    }
     lines = {
-        "parameters (--set)": ", ".join([*values.values(), *(f"{key}={entry['value']}" for key, entry in row["counts"].items())]),
+        "parameters (--set)": ", ".join(
+            [*values.values(), *(f"{key}={entry['value']}" for key, entry in row["counts"].items())]
+        ),
         "coordinates (--start)": ", ".join(row["coordinates"]),
         "speeds (--start)": ", ".join(row["speeds"]),
         "inputs": ", ".join(row["inputs"]),
         "stop events": ", ".join(row["events"]),
-        "example": ", ".join(f"{key}={value:g}" for key, value in row["example"].items()) + f"; {row['example_span']:g} s",
+        "example": (
+            ", ".join(f"{key}={value:g}" for key, value in row["example"].items())
+            + f"; {row['example_span']:g} s"
+        ),
         "conventions": row["conventions"],
     }
-    return "\n".join([f"{row['name']}: {row['about']}", *(f"  {key:<22} {text}" for key, text in lines.items() if text)])
+    return "\n".join(
+        [f"{row['name']}: {row['about']}", *(f"  {key:<22} {text}" for key, text in lines.items() if text)]
+    )
 
 
 def _report(options) -> bool:
@@ -160,7 +180,13 @@ def _simulate(options) -> bool:
     if not np.isfinite(t1) or t1 == 0:
         raise ValueError(f"--t1 is {t1:g}, expected a finite time in s other than zero")
     _check_files(options)
-    trajectory = simulate(scene, _state(scene, options), ts=np.linspace(0.0, t1, options.samples), rtol=options.rtol, atol=options.atol)
+    trajectory = simulate(
+        scene,
+        _state(scene, options),
+        ts=np.linspace(0.0, t1, options.samples),
+        rtol=options.rtol,
+        atol=options.atol,
+    )
     if options.out:
         save(trajectory, options.out)
     if options.plot:
@@ -176,7 +202,11 @@ def _simulate(options) -> bool:
 
 def _check_files(options) -> None:
     """Check before the run that the output files can be written."""
-    for check, path in ((check_place, options.out), (check_format, options.plot), (check_suffix, options.animate)):
+    for check, path in (
+        (check_place, options.out),
+        (check_format, options.plot),
+        (check_suffix, options.animate),
+    ):
         if path:
             check(path)
 
@@ -186,7 +216,9 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
     names = (*scene.coordinate_names, *scene.speed_names)
     # friction_needed: null where infinite
     of_contact = ("lowest_normal", "highest_normal", "friction_needed", "pulls", "determined")
-    contacts = {key: {what: getattr(contact, what) for what in of_contact} for key, contact in found.contacts.items()}
+    contacts = {
+        key: {what: getattr(contact, what) for what in of_contact} for key, contact in found.contacts.items()
+    }
     row = {
         "model": name,
         "result": trajectory.result,

@@ -37,14 +37,28 @@ from jourdain_jax.motion.options import OPTION_NAMES, SPAN
 from jourdain_jax.scene.names import check_names, nearest
 from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.studies.folder_lock import InUseError
-from jourdain_jax.studies.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
+from jourdain_jax.studies.outputs import (
+    End,
+    EventTime,
+    Happened,
+    Integral,
+    Largest,
+    LargestMagnitude,
+    Smallest,
+)
 from jourdain_jax.studies.result import LEVELS, StudyResult, load_study, merge_studies
 from jourdain_jax.studies.study import REFUSED, Study
 
 ACTIONS = ("status", "resume", "export", "merge")
-VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
+VARYING: dict[str, Callable] = {
+    "normal": Normal,
+    "uniform": Uniform,
+    "log-normal": LogNormal,
+    "log-uniform": LogUniform,
+}
 OUTPUTS: dict[str, Callable] = {
-    re.sub("(?<=.)(?=[A-Z])", "-", kind.__name__).lower(): kind for kind in (End, Largest, Smallest, LargestMagnitude, Integral, EventTime, Happened)
+    re.sub("(?<=.)(?=[A-Z])", "-", kind.__name__).lower(): kind
+    for kind in (End, Largest, Smallest, LargestMagnitude, Integral, EventTime, Happened)
 }
 TABLES = ("set", "vary", "start", "outputs", "options", "correlation")
 KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "keep_every", "chunk", *TABLES)
@@ -52,16 +66,26 @@ KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "keep_every", "chun
 
 def add(verbs) -> None:
     """Add the verb to the parser."""
-    sweep = verbs.add_parser("sweep", help="run a study described by a TOML file, or `sweep "
-        "status|resume|export|merge FOLDER`")
-    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER",
-        help="TOML file, or one of " + ", ".join(ACTIONS) + ", followed by folders of studies")
-    sweep.add_argument("--out",
-        help="folder of the study (created or continued); for `export`, the .nc file to write")
+    sweep = verbs.add_parser(
+        "sweep", help="run a study described by a TOML file, or `sweep status|resume|export|merge FOLDER`"
+    )
+    sweep.add_argument(
+        "words",
+        nargs="+",
+        metavar="FILE | ACTION FOLDER",
+        help="TOML file, or one of " + ", ".join(ACTIONS) + ", followed by folders of studies",
+    )
+    sweep.add_argument(
+        "--out", help="folder of the study (created or continued); for `export`, the .nc file to write"
+    )
     sweep.add_argument("--workers", type=int, default=1, help="number of worker processes (default 1)")
     sweep.add_argument("--memory", help="total memory, such as 2GB")
-    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute only the K-th of N shares; "
-        "join them with `sweep merge`")
+    sweep.add_argument(
+        "--shard",
+        default="1/1",
+        metavar="K/N",
+        help="compute only the K-th of N shares; join them with `sweep merge`",
+    )
     sweep.add_argument("--quiet", action="store_true", help="no bar")
     sweep.add_argument("--json", action="store_true", help="machine-readable")
     sweep.set_defaults(run=_sweep)
@@ -71,14 +95,17 @@ def _sweep(options) -> bool:
     action, *paths = options.words
     if action not in ACTIONS:
         if paths:
-            raise ValueError(f"`{action}` is not an action of `sweep`; {nearest(action, ACTIONS)} To run a "
-                "study: jourdain-jax sweep FILE.toml --out FOLDER")
+            raise ValueError(
+                f"`{action}` is not an action of `sweep`; {nearest(action, ACTIONS)} To run a "
+                "study: jourdain-jax sweep FILE.toml --out FOLDER"
+            )
         # size limit in bytes; tables may have one row per sample
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
         raise ValueError(
-            f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")
+            f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study"
+        )
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
@@ -93,14 +120,21 @@ def _sweep(options) -> bool:
 
 def _run(text: str, source: str, out: str, options) -> bool:
     asked = parsed(tomllib.loads, text, source, "valid TOML")
-    check_depth(asked, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), source)
+    check_depth(
+        asked, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), source
+    )
     study, how = described_study(asked, options.memory)
     try:
-        asked_here = {"processes": options.workers, "shard": _shard(options.shard), "progress": not options.quiet}
+        asked_here = {
+            "processes": options.workers,
+            "shard": _shard(options.shard),
+            "progress": not options.quiet,
+        }
         found = study.run(out, command=text, **asked_here, **how)
     except KeyboardInterrupt as stopped:
         print(
-            f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
+            f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr
+        )
         return False
     except (RuntimeError, MemoryError) as error:
         if isinstance(error, InUseError):
@@ -109,7 +143,9 @@ def _run(text: str, source: str, out: str, options) -> bool:
         return False
     _show(found, options)
     first, every = asked_here["shard"]
-    return not found.failed.size and not {*range(first - 1, found.store.chunks, every)}.difference(found.store.receipts())
+    return not found.failed.size and not {*range(first - 1, found.store.chunks, every)}.difference(
+        found.store.receipts()
+    )
 
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
@@ -118,31 +154,48 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):
             raise ValueError(
-                f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
+                f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it"
+            )
     known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
     check_names(asked.get("options", {}), known_options, "`{}` is not an entry of [options]")
     if "model" not in asked:
         raise ValueError("the file has no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))
     vary = {name: _varying(name, how) for name, how in asked.get("vary", {}).items()}
-    start = {name: _varying(name, how) if isinstance(how, Mapping) else how for name, how in asked["start"].items()} if "start" in asked else None
+    start = (
+        {
+            name: _varying(name, how) if isinstance(how, Mapping) else how
+            for name, how in asked["start"].items()
+        }
+        if "start" in asked
+        else None
+    )
     correlation = {tuple(pair.split()): value for pair, value in asked.get("correlation", {}).items()}
     known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
-    outputs = {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
-    how = {name: asked[name] for name in ("t1", "save", "keep_every", "chunk") if name in asked} | asked.get("options", {})
+    outputs = (
+        {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
+    )
+    how = {name: asked[name] for name in ("t1", "save", "keep_every", "chunk") if name in asked} | asked.get(
+        "options", {}
+    )
     scene = scene if memory is None else build(scene, memory=memory)
-    return Study(scene, vary=vary, start=start, correlation=correlation or None, **known), how | {"outputs": outputs}
+    return Study(scene, vary=vary, start=start, correlation=correlation or None, **known), how | {
+        "outputs": outputs
+    }
 
 
 def _varying(name: str, how):
     kinds = (*VARYING, "levels", "table")
     if not isinstance(how, Mapping) or len(how) != 1:
         raise ValueError(
-            f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
+            f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}"
+        )
     ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
-        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of "
-            f"numbers; {nearest(kind, kinds)}")
+        raise ValueError(
+            f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of "
+            f"numbers; {nearest(kind, kinds)}"
+        )
     if kind not in VARYING:
         return Levels(numbers) if kind == "levels" else numbers
     if len(numbers) != 2:
@@ -154,8 +207,10 @@ def _output(name: str, how):
     stated = dict(how) if isinstance(how, Mapping) else {}
     unit = stated.pop("unit", "")
     if len(stated) != 1 or (kind := OUTPUTS.get(*stated)) is None:
-        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = "
-            f"'rad' }}; {nearest(str([*stated][:1]), OUTPUTS)}")
+        raise ValueError(
+            f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = "
+            f"'rad' }}; {nearest(str([*stated][:1]), OUTPUTS)}"
+        )
     return kind(*stated.values(), *(() if kind in (EventTime, Happened) else (unit,)))
 
 
@@ -189,5 +244,11 @@ def _show(found: StudyResult, options) -> None:
         }
         for i, name in enumerate(found.outputs if found.counts else ())
     }
-    about = {"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts, "failed": found.failed}
+    about = {
+        "folder": str(found.store.path),
+        "lanes": len(found),
+        "complete": found.complete,
+        "counts": found.counts,
+        "failed": found.failed,
+    }
     print(json.dumps(plain(about | {"outputs": outputs}), indent=2))

@@ -1,6 +1,6 @@
 """Accelerations of a scene at one state: the dynamics underlying time integration.
 
-    kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
+kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
 """
 
 import equinox as eqx
@@ -27,7 +27,14 @@ from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_resi
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
+from jourdain_jax.scene.arguments import (
+    ChangingInputs,
+    as_coordinates,
+    as_input_vector,
+    as_scene,
+    as_speeds,
+    as_time,
+)
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import structure_of, usual_rows
@@ -89,11 +96,18 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         check_name(reduction, known, f"unknown reduction `{reduction}`")
         return known[reduction]
     check_kind(
-        reduction, Reduction | GibbsAppell, "`reduction`",
-        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.equations.NullSpaceQR()`"
+        reduction,
+        Reduction | GibbsAppell,
+        "`reduction`",
+        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.equations.NullSpaceQR()`",
     )
-    chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
-    if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+    chosen, count = (
+        reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (),
+        len(scene.speed_names),
+    )
+    if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(
+        set(chosen)
+    ) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
         raise ValueError(
             f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its "
@@ -109,7 +123,15 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
 
 
 def accelerations(
-    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+    scene: Scene,
+    t,
+    q,
+    u,
+    inputs=None,
+    *,
+    reduction=None,
+    stabilisation: Baumgarte | None = None,
+    usual: UsualRows | None = None,
 ) -> Accelerations:
     """Return accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
@@ -132,7 +154,9 @@ def accelerations(
     if usual is None:
         structure_of(scene)  # raises for impossible values of the scene
         usual = usual_rows(scene)
-    return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual)
+    return _accelerations(
+        scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual
+    )
 
 
 @eager_if_concrete
@@ -149,7 +173,9 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
         multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
         constraint_force=found.constraint_force,
         rank=numerical_rank(sigma),
-        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))),
+        smallest_singular_value=jax.lax.stop_gradient(
+            jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))
+        ),
         residual=largest(problem.d * (rows.A @ found.udot + rows.drift)),
         applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
     )
@@ -162,7 +188,9 @@ def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced
     return reduced_at(scene, t, q, u, inputs, reduction, None, usual_rows(scene))[0]
 
 
-def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+def reduced_at(
+    scene: Scene, t, q, u, inputs, reduction, stabilisation, usual
+) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
     """Return accelerations with the equations and constraint rows that they solve. Arguments as in
     `accelerations`, with `usual` required.
     """
@@ -180,5 +208,7 @@ def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -
 def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> ConstraintRows:
     g = position_residual(scene, t, q)
     count = g.shape[0]
-    extra = jnp.concatenate([2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]])
+    extra = jnp.concatenate(
+        [2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]]
+    )
     return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names, rows.usual)

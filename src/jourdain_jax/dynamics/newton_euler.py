@@ -12,7 +12,15 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.equations.kinematics import Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, of_bodies, partial_velocities
+from jourdain_jax.equations.kinematics import (
+    Velocities,
+    bias_accelerations,
+    coordinate_rates,
+    inertias,
+    motion_at,
+    of_bodies,
+    partial_velocities,
+)
 from jourdain_jax.equations.virtual_power import Resultants, inertia_resultants, resultants
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
@@ -39,7 +47,10 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     motion = motion_at(scene, t, q, u, inputs)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
     orientation = of_bodies(motion, "orientation")
-    return Velocities(force - loads.force - potential.force, jnp.einsum("bij,bj->bi", orientation, torque) - loads.torque - potential.torque)
+    return Velocities(
+        force - loads.force - potential.force,
+        jnp.einsum("bij,bj->bi", orientation, torque) - loads.torque - potential.torque,
+    )
 
 
 def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
@@ -52,7 +63,9 @@ def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
         return Resultants(zero, zero, jnp.zeros_like(u))
 
     def V(shift, turn, q):
-        bodies = {name: _displaced(body, shift[j], turn[j]) for j, (name, body) in enumerate(pose.bodies.items())}
+        bodies = {
+            name: _displaced(body, shift[j], turn[j]) for j, (name, body) in enumerate(pose.bodies.items())
+        }
         return potential_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))
 
     force, moment, direct = jax.grad(V, argnums=(0, 1, 2))(zero, zero, q)
@@ -66,5 +79,7 @@ def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
     """
     moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)
     if isinstance(pose.body, RigidBody):
-        moved = eqx.tree_at(lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation)
+        moved = eqx.tree_at(
+            lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation
+        )
     return moved

@@ -26,7 +26,14 @@ class Wrenches(eqx.Module):
     torque: Float[Array, "*rows bodies 3"]  # N m
 
 
-def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
+def normal_forces(
+    contacts: dict[str, Contact],
+    bodies: Labels,
+    positions: Float[Array, "bodies 3"],
+    hidden: Wrenches,
+    spare: Wrenches,
+    size,
+):
     """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
     determined.
 
@@ -36,7 +43,11 @@ def normal_forces(contacts: dict[str, Contact], bodies: Labels, positions: Float
       constraints.
     - `size`: the magnitude of the forces, N.
     """
-    carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
+    carried = {
+        name: _carried(contact, name, bodies)
+        for name, contact in contacts.items()
+        if contact.height == "coordinates"
+    }
     found: dict[str, tuple] = {}
     for names in _supports(carried):
         found |= _of_support(names, contacts, carried, bodies, positions, hidden, spare, size)
@@ -48,11 +59,15 @@ def _supports(carried: dict[str, Indices]) -> list[list[str]]:
     groups: list[list[str]] = []
     for name, own in carried.items():
         together = [group for group in groups if any(set(own) & set(carried[other]) for other in group)]
-        groups = [group for group in groups if group not in together] + [[*(other for group in together for other in group), name]]
+        groups = [group for group in groups if group not in together] + [
+            [*(other for group in together for other in group), name]
+        ]
     return groups
 
 
-def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, tuple]:
+def _of_support(
+    names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size
+) -> dict[str, tuple]:
     # of bodies, whose equations these contacts share
     sets = tuple(dict.fromkeys(carried[name] for name in names))
     points = jnp.stack([contacts[name].point for name in names])
@@ -65,12 +80,16 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
         normal = normals[0] @ forces
         return {names[0]: (normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
 
-    touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in names] for own in sets]
+    touches = [
+        [bodies.index(contacts[name].body) in own or carried[name] == own for name in names] for own in sets
+    ]
     by_set = jnp.asarray(touches, normals.dtype)[:, None, :]
     levers = points - here
     length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), tiny_of(levers))
     by_force = (by_set * normals.T).reshape(-1, len(points))  # f = by_force N
-    by_moment = (by_set * jnp.cross(levers, normals).T).reshape(-1, len(points)) / length  # moment/length = by_moment N
+    by_moment = (by_set * jnp.cross(levers, normals).T).reshape(
+        -1, len(points)
+    ) / length  # moment/length = by_moment N
 
     first = pseudo_inverse(by_force)
     left = jnp.eye(len(points)) - first @ by_force  # freedom left by the forces
@@ -85,16 +104,25 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
 
     N = solved(forces, moments)
     missed = largest(by_force @ N - forces), largest(by_moment @ N - moments / length)
-    met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + largest(hidden.torque) / length))
-    by_forces_alone, by_both = jnp.abs(jnp.diagonal(left)) <= tolerance, jnp.abs(jnp.diagonal(open_still)) <= tolerance
-    determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance))
+    met = (missed[0] <= tolerance * size) & (
+        missed[1] <= tolerance * (size + largest(hidden.torque) / length)
+    )
+    by_forces_alone, by_both = (
+        jnp.abs(jnp.diagonal(left)) <= tolerance,
+        jnp.abs(jnp.diagonal(open_still)) <= tolerance,
+    )
+    determined = jax.lax.stop_gradient(
+        (by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance)
+    )
     return {name: (N[i], determined[i]) for i, name in enumerate(names)}
 
 
 def _resultant(wrench: Wrenches, positions, sets: tuple[Indices, ...], here):
     """Return force and moment about a point `here` for each set of bodies."""
     moment = wrench.torque + jnp.cross(positions - here, wrench.force)
-    summed = [[jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)]
+    summed = [
+        [jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)
+    ]
     return tuple(jnp.concatenate(parts, axis=-1) for parts in summed)
 
 
@@ -107,4 +135,8 @@ def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance)
 def _carried(contact: Contact, name: str, bodies: Labels) -> Indices:
     """Return indices of the bodies that a contact supports."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
-    return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))
+    return (
+        tuple(range(len(bodies)))
+        if contact.carried is None
+        else tuple(sorted({bodies.index(body) for body in contact.carried}))
+    )

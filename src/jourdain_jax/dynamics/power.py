@@ -51,7 +51,12 @@ def needs_work(scene: Scene, structure: Structure) -> bool:
     """Return whether anything changes T + V, so that the work must be integrated with the motion. Terms that
     are zero by structure do not count.
     """
-    by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
+    by_structure = (
+        structure.driven
+        or structure.varying_inertia
+        or _rows_work(structure)
+        or "potential" in structure.timed
+    )
     return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
 
 
@@ -68,12 +73,18 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
         # lambda . (A u), which is lambda . phi = 0 for constraints homogeneous and linear in u
         rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
-        potential=explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
+        potential=(
+            explicit_rate(scene, motion, potential_energy)
+            if structure.driven or "potential" in structure.timed
+            else zero
+        ),
         inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
     )
 
 
-def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices) -> Scalar:
+def rate_of_work(
+    scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices
+) -> Scalar:
     """Return the integrand of the work, in W: the power of the loads. The loads `of_inputs` contribute by
     their forces instead of their potentials.
 
@@ -96,4 +107,7 @@ def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Scalar:
     """Return `sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
     t, q, now = motion.t, motion.q.array, velocities_of(motion)
     _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))
-    return 0.5 * (rate.mass @ jnp.sum(now.linear**2, axis=1) + jnp.einsum("bi,bij,bj->", now.angular, rate.inertia, now.angular))
+    return 0.5 * (
+        rate.mass @ jnp.sum(now.linear**2, axis=1)
+        + jnp.einsum("bi,bij,bj->", now.angular, rate.inertia, now.angular)
+    )

@@ -89,7 +89,15 @@ def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowRea
     on_bodies, direct, spare = unit
     force, torque = (multipliers[:, None, None] * part for part in (on_bodies.force, on_bodies.torque))
     determined = jnp.diagonal(spare) == 0  # a multiplier is unique if its row is no combination of the others
-    return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined, names_of_rows(scene), tuple(motion.bodies))
+    return RowReactions(
+        multipliers,
+        force,
+        torque,
+        multipliers[:, None] * direct,
+        determined,
+        names_of_rows(scene),
+        tuple(motion.bodies),
+    )
 
 
 def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
@@ -114,12 +122,19 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Arr
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     """Return the motion with the given velocities of bodies and speeds, which need not be consistent."""
-    bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
+    bodies = {
+        name: BodyMotion(name, body.body, v[j], omega[j])
+        for j, (name, body) in enumerate(motion.bodies.items())
+    }
     qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
-    return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
+    return Motion(
+        motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies
+    )
 
 
-def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]) -> Float[Array, "rows rows"]:
+def _spare_multipliers(
+    A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]
+) -> Float[Array, "rows rows"]:
     """Return multipliers, as columns, with `A' lambda = 0`, which do not affect the motion; zero for
     independent rows.
 
@@ -132,7 +147,9 @@ def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray
 
 
 @eager_if_concrete
-def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> dict[str, ContactForce]:
+def contact_forces(
+    scene: Scene, t, q, u, accelerations: Accelerations, inputs=None
+) -> dict[str, ContactForce]:
     """Return the normal and tangential force of every rolling contact, and the friction coefficient needed to
     roll without slip.
 

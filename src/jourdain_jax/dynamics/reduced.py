@@ -113,7 +113,9 @@ def dependence(scene: Scene) -> Dependence:
     values, one_speed = _probe(scene, t, q, u, shifts)
     changed = {name: _changed(value) for name, value in values.items()}
     appears = [changed[name].any(axis=0) for name in values if name not in ("rates", "accelerations")]
-    return Dependence(np.any(appears, axis=0), changed["rates"], changed["accelerations"].any(axis=0), one_speed.all(axis=0))
+    return Dependence(
+        np.any(appears, axis=0), changed["rates"], changed["accelerations"].any(axis=0), one_speed.all(axis=0)
+    )
 
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
@@ -158,9 +160,19 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     velocities = jnp.concatenate([jnp.concatenate([body.velocity, body.angular_velocity]) for body in bodies])
     turned = of_bodies(motion, "orientation")
     inertia = jnp.einsum("bij,bjk,blk->bil", turned, known.weights.inertia, turned)
-    beta, gamma = known.partial.bodies.linear @ C, jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C)
+    beta, gamma = (
+        known.partial.bodies.linear @ C,
+        jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C),
+    )
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
-    forces = [loads.force, loads.torque, loads.direct @ C, potential.force, potential.torque, potential.direct @ C]
+    forces = [
+        loads.force,
+        loads.torque,
+        loads.direct @ C,
+        potential.force,
+        potential.torque,
+        potential.direct @ C,
+    ]
     return {
         "rates": motion.qdot.array,
         # y, constant in the coordinates, gives free motion a size
@@ -176,7 +188,9 @@ def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
     """Return C, c, B and b at one state of a scene whose constraints are affine in the speeds."""
     structure = structure_of(scene)
     y = u[jnp.array(structure.independent, jnp.int32)]
-    return _rates_of(scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y))
+    return _rates_of(
+        scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
+    )
 
 
 def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
@@ -230,7 +244,9 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
     while True:
         groups, known = [], set(range(len(needs))) - droppable
         needed_by_kept = {j for j in droppable if any(needs[i, j] for i in known)}
-        while ready := [i for i in sorted(droppable - known) if set(np.flatnonzero(needs[i]).tolist()) <= known]:
+        while ready := [
+            i for i in sorted(droppable - known) if set(np.flatnonzero(needs[i]).tolist()) <= known
+        ]:
             groups.append(ready)
             known |= set(ready)
         in_circles = droppable - known  # rates that depend on themselves or on each other

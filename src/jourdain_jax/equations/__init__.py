@@ -10,9 +10,20 @@ from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gi
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, partial_velocities
 from jourdain_jax.equations.lagrange import lagrange_equations
-from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
+from jourdain_jax.equations.reductions import (
+    Multipliers,
+    NullSpaceQR,
+    NullSpaceSVD,
+    Privileged,
+    UdwadiaKalaba,
+)
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.virtual_power import generalized_forces, kinetic_energy, potential_energy, unconstrained_equations
+from jourdain_jax.equations.virtual_power import (
+    generalized_forces,
+    kinetic_energy,
+    potential_energy,
+    unconstrained_equations,
+)
 
 __all__ = [
     "GibbsAppell",

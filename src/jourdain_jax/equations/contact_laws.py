@@ -211,7 +211,9 @@ def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, 
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction
     least = ROUND_OFF * jnp.sum(jnp.abs(law.b))
     excess, slip, N = w[:, 0] - law.target, w[:, 1:], P[:, 0]
-    held = jnp.sum(P[:, 1:] ** 2, axis=1) <= (law.static * N) ** 2 * (1 + ROUND_OFF) + (least * tangential) ** 2
+    held = (
+        jnp.sum(P[:, 1:] ** 2, axis=1) <= (law.static * N) ** 2 * (1 + ROUND_OFF) + (least * tangential) ** 2
+    )
     aside = jnp.abs(e[:, 0] * slip[:, 1] - e[:, 1] * slip[:, 0])
     slips = law.slides | ((jnp.sum(e * slip, axis=1) >= -least) & (aside <= least))
     sticks = held & (jnp.sum(slip * slip, axis=1) <= least**2)

@@ -57,7 +57,9 @@ def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
     modes.
     """
     contacts = contacts_of(scene, motion.pose())
-    found = {name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction}
+    found = {
+        name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction
+    }
     rows = held_rows_of(scene, motion).items()
     found |= {name: SwitchingRow(row.friction, row.slip, None) for name, row in rows}
     return {name: found[name] for name in scene.switching.contacts}
@@ -86,7 +88,9 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 
     gap = gaps_of(scene, motion.pose())
     A = jax.jacfwd(lambda u: speeds(t, q, u))(u)
-    w, drift = jax.jvp(lambda t, q: speeds(t, q, u), (t, q), (jnp.ones_like(t), coordinate_rates(scene, t, q, u)))
+    w, drift = jax.jvp(
+        lambda t, q: speeds(t, q, u), (t, q), (jnp.ones_like(t), coordinate_rates(scene, t, q, u))
+    )
     return ContactRows(gap, w, A, drift)
 
 

@@ -34,7 +34,11 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
     a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
     weights = inertias(scene, t, q)
     gyroscopic = jnp.cross(omega, jnp.einsum("bij,bj->bi", weights.inertia, omega))
-    return 0.5 * jnp.sum(weights.mass * jnp.sum(a * a, 1)) + 0.5 * jnp.einsum("bi,bij,bj->", alpha, weights.inertia, alpha) + jnp.sum(alpha * gyroscopic)
+    return (
+        0.5 * jnp.sum(weights.mass * jnp.sum(a * a, 1))
+        + 0.5 * jnp.einsum("bi,bij,bj->", alpha, weights.inertia, alpha)
+        + jnp.sum(alpha * gyroscopic)
+    )
 
 
 @eager_if_concrete
@@ -63,11 +67,16 @@ class GibbsAppell(eqx.Module):
     independent: tuple[int, ...] = eqx.field(static=True)
     name = "Gibbs-Appell"
 
-    def accelerations(self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
+    def accelerations(
+        self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows
+    ) -> Reduced:
         """Return accelerations that satisfy the constraint `rows`; of `equations`, they use only Q."""
         problem = scaled(equations, rows)
         split = Partition(problem.A, self.independent)
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()
-        gradient, hessian = _gradient_and_hessian(lambda yddot: gibbs_function(scene, t, q, u, problem.c * (C @ yddot + c)), jnp.zeros(C.shape[1], u.dtype))
+        gradient, hessian = _gradient_and_hessian(
+            lambda yddot: gibbs_function(scene, t, q, u, problem.c * (C @ yddot + c)),
+            jnp.zeros(C.shape[1], u.dtype),
+        )
         yddot, definite = solve_definite(hessian, C.T @ (problem.c * equations.Q) - gradient)
         return reduced(problem.c * (C @ yddot + c), pivot, definite & (pivot > APPLICABLE_PIVOT), equations)

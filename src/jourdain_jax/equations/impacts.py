@@ -27,7 +27,16 @@ from jourdain_jax.equations.contact_laws import (
     unit,
 )
 from jourdain_jax.equations.contact_state import At, switched
-from jourdain_jax.scene.contact.friction_contacts import CREEPS, FLAT, FLIES, GAINS_ENERGY, PAINLEVE, ROLLS, SLIPS, UNDECIDED
+from jourdain_jax.scene.contact.friction_contacts import (
+    CREEPS,
+    FLAT,
+    FLIES,
+    GAINS_ENERGY,
+    PAINLEVE,
+    ROLLS,
+    SLIPS,
+    UNDECIDED,
+)
 
 LEAST_REBOUND = 1e-6  # m/s: below this speed of rebound a contact closes
 

@@ -14,7 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Scalar, as_real
-from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
+from jourdain_jax.equations.kinematics import (
+    Inertias,
+    Velocities,
+    coordinate_rates,
+    inertias_of,
+    motion_at,
+    velocities_of,
+)
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, velocity_rows
 from jourdain_jax.equations.scene_parts import names_of_rows
 from jourdain_jax.program.eager import eager_if_concrete
@@ -82,7 +89,9 @@ def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLeve
     """
     t, q, u = as_time(t), as_real(q), as_real(u)
     qdot = coordinate_rates(scene, t, q, u)
-    return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
+    return jax.jvp(
+        lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True
+    )
 
 
 @eqx.filter_jit  # one trace serves all its derivatives

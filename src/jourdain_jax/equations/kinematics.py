@@ -26,7 +26,9 @@ from jourdain_jax.scene.user_methods import bodies_of, coordinate_rates_of
 
 
 class Velocities(eqx.Module):
-    """Velocities of the mass centres (inertial frame) and angular velocities (body axes; zero rows for particles)."""
+    """Velocities of the mass centres (inertial frame) and angular velocities (body axes; zero rows for
+    particles).
+    """
 
     linear: Float[Array, "bodies 3"]  # m/s
     angular: Float[Array, "bodies 3"]  # rad/s
@@ -56,7 +58,9 @@ def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     """Return poses of all bodies (m, inertial frame), sorted by name as in JAX's dictionaries."""
     t, q = as_time(t), as_coordinates(scene, q)
     named = scene.coordinate_names.view(q)
-    return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
+    return Pose(
+        t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())}
+    )
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
@@ -68,16 +72,29 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
     qdot = coordinate_rates(scene, t, q, u)
     poses, rates = jax.jvp(lambda t, q: pose_at(scene, t, q).bodies, (t, q), (jnp.ones_like(t), qdot))
     bodies = {
-        name: BodyMotion(name, pose.body, rates[name].body.position, _space_angular_velocity(pose.body, rates[name].body)) for name, pose in poses.items()
+        name: BodyMotion(
+            name, pose.body, rates[name].body.position, _space_angular_velocity(pose.body, rates[name].body)
+        )
+        for name, pose in poses.items()
     }
-    return Motion(t, scene.coordinate_names.view(q), scene.speed_names.view(u), scene.coordinate_names.view(qdot), scene.inputs.view(inputs), bodies)
+    return Motion(
+        t,
+        scene.coordinate_names.view(q),
+        scene.speed_names.view(u),
+        scene.coordinate_names.view(qdot),
+        scene.inputs.view(inputs),
+        bodies,
+    )
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
     """Return the shapes of the values of `look(scene, motion)` by a trace only; with numbers, JAX would
     compile each operation.
     """
-    numbers = [jax.ShapeDtypeStruct(shape, real_type()) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))]
+    numbers = [
+        jax.ShapeDtypeStruct(shape, real_type())
+        for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))
+    ]
     return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
 
 

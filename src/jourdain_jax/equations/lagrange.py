@@ -42,4 +42,8 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
 
 def speeds_are_rates(scene: Scene) -> bool:
     """Return whether the speeds are the coordinates' own rates (no quaternions, no quasi-velocities)."""
-    return not scene.coordinates.quaternions and scene.speeds is None and type(scene).coordinate_rates is Scene.coordinate_rates
+    return (
+        not scene.coordinates.quaternions
+        and scene.speeds is None
+        and type(scene).coordinate_rates is Scene.coordinate_rates
+    )

@@ -46,7 +46,9 @@ def least_change(
     Differentiable in any mode at constant rank. `determined`: the constraints can be satisfied and determine
     all free entries, so that only the first term of the derivative remains.
     """
-    x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined)
+    x, K = _least_change(
+        (A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined
+    )
     return Change(x, jax.lax.stop_gradient(K))
 
 
@@ -66,13 +68,17 @@ def _solved(A, r, M, free, typical, cutoff) -> _Solved:
         W = A * c
     else:
         c = speed_scale(M)
-        L, definite = cholesky(jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(len(c), dtype=c.dtype)))
+        L, definite = cholesky(
+            jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(len(c), dtype=c.dtype))
+        )
         c = jnp.where(free, c, 0.0)
         W = jax.scipy.linalg.solve_triangular(L, (A * c).T, lower=True).T
     d = row_scale(W, typical)
     P = pseudo_inverse(d[:, None] * W, cutoff)
     y = P @ (d * r)
-    x, K = (c * y, c[:, None] * P * d) if L is None else (c * _backward(L, y), c[:, None] * _backward(L, P * d))
+    x, K = (
+        (c * y, c[:, None] * P * d) if L is None else (c * _backward(L, y), c[:, None] * _backward(L, P * d))
+    )
     return _Solved(Change(x, K), d * (P.T @ y), d, c, L, definite)
 
 
@@ -102,6 +108,8 @@ def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
         pull = jnp.zeros_like(x)
         pull = pull if dA is None else pull + dA.T @ mu
         pull = c * (pull if dM is None else pull - jnp.where(definite, dM @ x, 0.0))
-        moved = c * (pull if L is None else jax.scipy.linalg.cho_solve((L, True), pull))  # M^-1 (dA' mu - dM x)
+        moved = c * (
+            pull if L is None else jax.scipy.linalg.cho_solve((L, True), pull)
+        )  # M^-1 (dA' mu - dM x)
         dx += moved - K @ (A @ moved)
     return Change(x, K), Change(dx, jnp.zeros_like(K))

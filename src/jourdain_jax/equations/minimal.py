@@ -37,7 +37,9 @@ class MinimalKinematics(eqx.Module):
     rows: tuple[int, ...] = eqx.field(static=True)  # indices among the scene's rows
 
 
-def minimal_kinematics(scene: Scene, independent: tuple[int, ...], rows: tuple[int, ...], t, q, y, inputs=None) -> MinimalKinematics:
+def minimal_kinematics(
+    scene: Scene, independent: tuple[int, ...], rows: tuple[int, ...], t, q, y, inputs=None
+) -> MinimalKinematics:
     """Return `u = C y + c`, from the constraint `rows` with these indices."""
     at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
     partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
@@ -57,5 +59,11 @@ def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) 
     c = known.c
     # in scaled speeds, where definiteness is independent of units
     M, f = c[:, None] * equations.M * c, c * (equations.Q - equations.h)
-    w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows[np.array(known.rows, int)]), known.split.pivot())
+    w, pivot, applicable = appell(
+        M,
+        f,
+        known.split.C,
+        known.split.particular(-known.d * rate.rows[np.array(known.rows, int)]),
+        known.split.pivot(),
+    )
     return motion, reduced(c * w, pivot, applicable, equations)

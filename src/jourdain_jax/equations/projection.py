@@ -49,9 +49,13 @@ def _closures(scene: Scene, t, q):
     return closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
 
 
-def linearised_rows(scene: Scene, t, q, u, inputs) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
+def linearised_rows(
+    scene: Scene, t, q, u, inputs
+) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
     """Return phi and A = d phi/du."""
-    return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
+    return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(
+        lambda u: velocity_residual(scene, t, q, u, inputs)
+    )(u)
 
 
 BY_AUTODIFF = RowFunctions(_closures, linearised_rows, mass_matrix_at)

@@ -21,7 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, numerical_rank, pivots_qr, present, pseudo_inverse, singular_values
+from jourdain_jax.calculus.matrices import (
+    null_space_qr,
+    null_space_svd,
+    numerical_rank,
+    pivots_qr,
+    present,
+    pseudo_inverse,
+    singular_values,
+)
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds, rank_cutoff
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
@@ -85,7 +93,9 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
     """
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
     # a pivot at round-off, of either sign, means a singular matrix
-    definite = jnp.all(jnp.isfinite(factor)) & (jnp.min(jnp.diagonal(factor), initial=1.0) ** 2 > 16 * M.shape[0] * jnp.finfo(M.dtype).eps)
+    definite = jnp.all(jnp.isfinite(factor)) & (
+        jnp.min(jnp.diagonal(factor), initial=1.0) ** 2 > 16 * M.shape[0] * jnp.finfo(M.dtype).eps
+    )
     usable = definite | ~jnp.all(jnp.isfinite(M))  # keep NaN in M visible
     return jnp.linalg.cholesky(jnp.where(usable, M, jnp.eye(M.shape[0], dtype=M.dtype))), definite
 
@@ -136,7 +146,9 @@ class Partition(eqx.Module):
         """Return indices of the dependent speeds."""
         return tuple(i for i in range(self.A.shape[1]) if i not in self.independent)
 
-    def all_from(self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]) -> Float[Array, "speeds *k"]:
+    def all_from(
+        self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]
+    ) -> Float[Array, "speeds *k"]:
         """Return all speeds, in order, from the independent and the dependent ones."""
         order = np.argsort([*self.independent, *self.dependent])
         return jnp.concatenate([y, z])[order]
@@ -167,7 +179,9 @@ class Partition(eqx.Module):
     def orientation(self) -> Scalar:
         """Return the sign of det A_z, or 1 if A_z is not square; it has no derivative."""
         square = self.A.shape[0] == len(self.dependent) > 0
-        return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
+        return (
+            jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
+        )
 
     @property
     def _A_z(self):
@@ -182,7 +196,8 @@ class Partition(eqx.Module):
 
 
 def _by_null_space(problem: ScaledProblem, Z, cutoff: float | None = None):
-    # A udot_p = -drift;  (Z' M Z) zeta = Z' (Q - h - M udot_p);  absent columns of Z get a unit diagonal and a zero right-hand side
+    # A udot_p = -drift; (Z' M Z) zeta = Z' (Q - h - M udot_p); absent columns of Z get a unit diagonal and a
+    # zero right-hand side
     particular = pseudo_inverse(problem.A, cutoff) @ problem.b
     S = Z.T @ problem.M @ Z + jnp.diag(jnp.where(present(Z), 0.0, 1.0).astype(Z.dtype))
     zeta, definite = solve_definite(S, Z.T @ (problem.f - problem.M @ particular))
@@ -190,7 +205,8 @@ def _by_null_space(problem: ScaledProblem, Z, cutoff: float | None = None):
 
 
 class NullSpaceQR(Reduction):
-    """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
+    """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`,
+    `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
 
     It applies wherever `Z'MZ` is positive definite. The result does not depend on the choice of Z, since `F -
     m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: scaled rows count as dependent below this
@@ -242,9 +258,11 @@ class Multipliers(Reduction):
 
 
 class UdwadiaKalaba(Reduction):
-    """Gauss's least constraint: `udot = a + M^-1/2 (A M^-1/2)+ (b - A a)`, `a = M^-1 f`. Needs a positive definite M.
+    """Gauss's least constraint: `udot = a + M^-1/2 (A M^-1/2)+ (b - A a)`, `a = M^-1 f`. Needs a positive
+    definite M.
 
-    Source: F. E. Udwadia and R. E. Kalaba, Proc. R. Soc. A 439 (1992) 407, with the Cholesky factor in place of the square root.
+    Source: F. E. Udwadia and R. E. Kalaba, Proc. R. Soc. A 439 (1992) 407, with the Cholesky factor in place
+    of the square root.
     """
 
     name = "Udwadia-Kalaba (Gauss)"
@@ -254,8 +272,14 @@ class UdwadiaKalaba(Reduction):
         free = jax.scipy.linalg.solve_triangular(L, problem.f, lower=True)  # L' a
         weighted = jax.scipy.linalg.solve_triangular(L, problem.A.T, lower=True).T  # A L'^-1
         # rescale to the lengths in A, so that a vanishing row stays small
-        lengths, by_mass = (jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, axis=1)) for rows in (problem.A, weighted))
+        lengths, by_mass = (
+            jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, axis=1)) for rows in (problem.A, weighted)
+        )
         d = jnp.where(by_mass > 0, lengths / jnp.where(by_mass > 0, by_mass, 1.0), 1.0)
         weighted = d[:, None] * weighted
         x = free + _refined(pseudo_inverse(weighted), weighted, d * problem.b - weighted @ free)
-        return jnp.where(definite, jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.nan), jnp.ones((), L.dtype), definite
+        return (
+            jnp.where(definite, jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.nan),
+            jnp.ones((), L.dtype),
+            definite,
+        )

@@ -21,7 +21,12 @@ from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.user_methods import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
+from jourdain_jax.scene.user_methods import (
+    contacts_of,
+    geometric_constraints_of,
+    prescribed_of,
+    velocity_constraints_of,
+)
 
 
 class UsualRows(eqx.Module):
@@ -49,9 +54,16 @@ def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
     """Return values of all geometric constraints by name: prescribed coordinates, geometric constraints,
     contact heights.
     """
-    rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in prescribed_of(scene, pose.t).items()}
+    rows = {
+        f"prescribed {name}": pose.q[_coordinate(scene, name)] - value
+        for name, value in prescribed_of(scene, pose.t).items()
+    }
     rows |= geometric_constraints_of(scene, pose)
-    kept = {name: contact for name, contact in contacts_of(scene, pose).items() if contact.height == "row" and contact.friction is None}
+    kept = {
+        name: contact
+        for name, contact in contacts_of(scene, pose).items()
+        if contact.height == "row" and contact.friction is None
+    }
     return rows | {f"{name} height": contact.gap() for name, contact in kept.items()}
 
 
@@ -73,9 +85,10 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
 
 
 def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
-    """Return the velocity (m/s) of a contact's body at its point relative to the ground, along both tangents.
-    """
-    return contact.plane.tangents @ (motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point))
+    """Return the velocity (m/s) of a contact's body at its point relative to the ground, along both tangents."""
+    return contact.plane.tangents @ (
+        motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
+    )
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
@@ -92,7 +105,9 @@ def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str,
 
     pose = motion.pose()
     rates = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
-    found = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
+    found = jax.jvp(
+        g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates)
+    )[1]
     return dict(zip(names, found, strict=True))
 
 
@@ -102,8 +117,7 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """Return one name per scalar row: the name of its constraint, indexed if the constraint has several rows.
-    """
+    """Return one name per scalar row: the name of its constraint, indexed if the constraint has several rows."""
     names: list[str] = []
     for name, value in rows.items():
         names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]

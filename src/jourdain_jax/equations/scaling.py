@@ -37,7 +37,9 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
     return jnp.where(heavy, 1 / jnp.sqrt(jnp.where(heavy, diagonal, 1)), 1)
 
 
-def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
+def row_scale(
+    A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None
+) -> Float[Array, "rows"]:
     """Return one over the length of each row, or over its `typical` length if that is longer; 1 for a
     vanishing row without a typical length.
 
@@ -54,4 +56,12 @@ def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledPro
     """Return the scaled problem of one state."""
     c = speed_scale(equations.M)
     d = row_scale(rows.A * c, None if rows.usual is None else rows.usual.lengths)
-    return ScaledProblem(c[:, None] * equations.M * c, c * (equations.Q - equations.h), d[:, None] * rows.A * c, -d * rows.drift, c, d, rows.usual)
+    return ScaledProblem(
+        c[:, None] * equations.M * c,
+        c * (equations.Q - equations.h),
+        d[:, None] * rows.A * c,
+        -d * rows.drift,
+        c,
+        d,
+        rows.usual,
+    )

@@ -65,11 +65,20 @@ def _listed(scene: Scene) -> _Listed:
     noted: list[_Listed] = []
 
     def look(scene: Scene, motion: Motion) -> None:
-        rows, first = (tuple(row_names(found)) for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose())))
-        without = bool(scene.switching.contacts) or any(load.potential is None for load in loads_of(scene, motion))
-        stop = {name: event.stop for name, event in events_of(scene, motion).items()} | dict.fromkeys(scene.switching.events, False)
+        rows, first = (
+            tuple(row_names(found))
+            for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose()))
+        )
+        without = bool(scene.switching.contacts) or any(
+            load.potential is None for load in loads_of(scene, motion)
+        )
+        stop = {name: event.stop for name, event in events_of(scene, motion).items()} | dict.fromkeys(
+            scene.switching.events, False
+        )
         events = tuple(sorted(stop))
-        noted.append(_Listed(tuple(motion.bodies), rows, first, events, tuple(stop[name] for name in events), without))
+        noted.append(
+            _Listed(tuple(motion.bodies), rows, first, events, tuple(stop[name] for name in events), without)
+        )
 
     shapes_along_motion(look, scene)
     return noted[0]

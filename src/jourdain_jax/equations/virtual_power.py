@@ -1,4 +1,5 @@
-"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible virtual velocity.
+"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible virtual
+velocity.
 
     sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k  =  M udot + h - Q        (50), (56)
 
@@ -50,7 +51,9 @@ class UnconstrainedEquations(eqx.Module):
 
 
 class Resultants(eqx.Module):
-    """Impressed forces on the mass centres and torques about them (inertial frame), and forces directly on the speeds."""
+    """Impressed forces on the mass centres and torques about them (inertial frame), and forces directly on
+    the speeds.
+    """
 
     force: Float[Array, "bodies 3"]  # N
     torque: Float[Array, "bodies 3"]  # N m
@@ -58,7 +61,12 @@ class Resultants(eqx.Module):
 
 
 def resultants(
-    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
+    scene: Scene,
+    motion: Motion,
+    *,
+    conservative: bool | None = None,
+    among: tuple[int, ...] | None = None,
+    loads: tuple[Load, ...] | None = None,
 ) -> Resultants:
     """Return the sum of the loads per body and per speed, restricted to loads with a potential
     (`conservative=True`), without one (`False`), or with the indices `among`.
@@ -73,7 +81,11 @@ def resultants(
             continue
         if among is not None and number not in among:
             continue
-        for total, part, kind in ((force, load.forces, "body"), (torque, load.torques, "body"), (direct, load.generalized, "speed")):
+        for total, part, kind in (
+            (force, load.forces, "body"),
+            (torque, load.torques, "body"),
+            (direct, load.generalized, "speed"),
+        ):
             for name, value in part.items():
                 check_name(name, total, f"a load of `{type(scene).__name__}` acts on unknown {kind} `{name}`")
                 total[name] = total[name] + value
@@ -114,7 +126,8 @@ def _kinetic_energy(motion: Motion) -> Scalar:
 def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """Return M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
 
-    M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: values of the scene's inputs (default: zero).
+    M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: values of the scene's inputs
+    (default: zero).
     """
     return equations_of(scene, instant_at(scene, t, q, u, inputs))
 
@@ -125,7 +138,9 @@ def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[Unconstraine
     return equations_of(scene, instant), rows_of(scene, instant)
 
 
-def equations_of(scene: Scene, instant: Instant, loads: tuple[Load, ...] | None = None) -> UnconstrainedEquations:
+def equations_of(
+    scene: Scene, instant: Instant, loads: tuple[Load, ...] | None = None
+) -> UnconstrainedEquations:
     """Return M, h and Q of the equations without constraint forces, at a known instant; `loads`: as in
     `resultants`.
     """
@@ -164,7 +179,9 @@ def mass_matrix_at(scene: Scene, t, q) -> Float[Array, "speeds speeds"]:
 def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
     """Return `m a` and `I alpha + omega x I omega` per body."""
     momentum = jnp.einsum("bij,bj->bi", weights.inertia, velocity.angular)
-    torque = jnp.einsum("bij,bj->bi", weights.inertia, acceleration.angular) + jnp.cross(velocity.angular, momentum)
+    torque = jnp.einsum("bij,bj->bi", weights.inertia, acceleration.angular) + jnp.cross(
+        velocity.angular, momentum
+    )
     return weights.mass[:, None] * acceleration.linear, torque
 
 
@@ -178,9 +195,15 @@ def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Speeds:
     return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
 
 
-def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities, loads: tuple[Load, ...] | None = None) -> Speeds:
+def _generalized_forces(
+    scene: Scene, motion: Motion, partial: Velocities, loads: tuple[Load, ...] | None = None
+) -> Speeds:
     total = impressed(scene, motion, loads)
-    return jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bi->k", partial.angular, total.torque) + total.direct
+    return (
+        jnp.einsum("bik,bi->k", partial.linear, total.force)
+        + jnp.einsum("bik,bi->k", partial.angular, total.torque)
+        + total.direct
+    )
 
 
 class ContactResponse(eqx.Module):
@@ -201,20 +224,31 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     M (impulses, free) = (A', Q - h) + A_p' (multipliers, so that A_p impulses = 0 and A_p free = -drift_p)       A_p: rows that always hold
     """
     instant = instant_at(scene, motion.t, motion.q.array, motion.u.array, motion.inputs.array)
-    equations, held, rows = equations_of(scene, instant, loads_of(scene, motion)), rows_of(scene, instant), contact_rows(scene, motion)
+    equations, held, rows = (
+        equations_of(scene, instant, loads_of(scene, motion)),
+        rows_of(scene, instant),
+        contact_rows(scene, motion),
+    )
     count, kept = len(motion.u.array), len(held.phi)
     right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
     # the last speeds first: they belong to the leaves of a tree, and elimination from there creates no
     # fill-in
     moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]
     if kept:
-        by_rows, drift = moved[:, len(moved[0]) - kept :], jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1)
+        by_rows, drift = (
+            moved[:, len(moved[0]) - kept :],
+            jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1),
+        )
         moved = moved[:, : len(moved[0]) - kept]
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
     # a constraint that holds up to a force has unit normal force, the solution of L_n - 1 = 0
-    one = jnp.array([[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()], free.dtype).ravel()
-    return ContactResponse(rows, impulses, rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one)
+    one = jnp.array(
+        [[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()], free.dtype
+    ).ravel()
+    return ContactResponse(
+        rows, impulses, rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one
+    )
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
@@ -225,13 +259,17 @@ def contact_modes(scene: Scene, motion: Motion) -> Modes:
     number = jnp.stack([motion.modes[name] for name in names])
     e = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
     one = jnp.ones_like(number)
-    return Modes(jnp.where(number == FLIES, 0.0, one), jnp.where(number == ROLLS, one, 0.0), e * (number >= SLIPS)[:, None])
+    return Modes(
+        jnp.where(number == FLIES, 0.0, one),
+        jnp.where(number == ROLLS, one, 0.0),
+        e * (number >= SLIPS)[:, None],
+    )
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
     """Return rates of the directions of slip, 1/s; zero unless a contact slips or creeps.
 
-        de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
+    de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
     """
     e = contact_modes(scene, motion).direction
     slips = jnp.stack([motion.modes[name] for name in scene.switching.contacts]) == SLIPS
@@ -296,5 +334,8 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
     and only if `udot` is the constrained acceleration.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
-    udot, virtual_velocity = as_speeds(scene, udot, "udot"), as_speeds(scene, virtual_velocity, "virtual_velocity")
+    udot, virtual_velocity = (
+        as_speeds(scene, udot, "udot"),
+        as_speeds(scene, virtual_velocity, "virtual_velocity"),
+    )
     return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)

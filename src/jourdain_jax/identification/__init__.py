@@ -12,7 +12,11 @@ from jourdain_jax.identification.data.channels import Accelerometer, LoadCell
 from jourdain_jax.identification.data.estimate import joint_normal, unbounded
 from jourdain_jax.identification.data.sensors import Actuator, Sensor
 from jourdain_jax.identification.inference.filtering import filtered_log_likelihood
-from jourdain_jax.identification.inference.likelihood import PlannedInformation, log_likelihood, planned_information
+from jourdain_jax.identification.inference.likelihood import (
+    PlannedInformation,
+    log_likelihood,
+    planned_information,
+)
 from jourdain_jax.identification.inference.log_density import LogDensity, log_density
 from jourdain_jax.identification.report.fit_result import Fit
 from jourdain_jax.identification.solve.layout import possible_inertia

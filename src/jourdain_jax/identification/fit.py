@@ -67,7 +67,9 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
         return problem.minimum(begin, members, "whole runs", how, span)
 
-    found = of(np.arange(len(theta)), theta, replace(control, patience=3, near=large) if impatient else control)
+    found = of(
+        np.arange(len(theta)), theta, replace(control, patience=3, near=large) if impatient else control
+    )
     left, ended = ~(found.going | found.converged | found.stuck), found.theta.copy()
     poor = np.flatnonzero(~found.converged | (found.at.cost > large))
     if not poor.size or not samples or (problem.single and np.argmin(found.at.cost) not in poor):
@@ -77,7 +79,10 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     roughly = replace(control, most_steps=min(8, control.most_steps), tolerance=1.0)
     while (some := np.flatnonzero(place < len(spans))).size:
         grown = of(poor[some], way.theta[some], roughly, Span(spans[place[some]], theta[poor[some]]))
-        grown.trace[:] = [((f"the first {spans[k]:.3g} of each run", costs),) for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)]
+        grown.trace[:] = [
+            ((f"the first {spans[k]:.3g} of each run", costs),)
+            for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)
+        ]
         way = way.continued(some, grown)
         place[some] += 1
         followed = problem.is_followed(grown.at, spans, 100.0)  # in squares expected from noise
@@ -104,8 +109,9 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = problem.minimum(found.theta[going], going, "whole runs, after a turn of correlation "
-            "times", some)
+        again = problem.minimum(
+            found.theta[going], going, "whole runs, after a turn of correlation times", some
+        )
         found = found.continued(going, again)
         going = going[(changed > 1e-3) | ~again.converged]
     found.converged[going] = False
@@ -122,8 +128,9 @@ def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
         if not told.lower:
             break
         members = np.array(list(told.lower))
-        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, "whole runs, "
-            "off a bound")
+        again = problem.minimum(
+            np.stack([theta for _, theta in told.lower.values()]), members, "whole runs, off a bound"
+        )
         found = with_memory(problem, found.lowered(members, again.after(found, members)))
     return found, told
 
@@ -224,10 +231,15 @@ def fit_batch(
     return _fit(_asked(scene, free, by_name, "fit_batch"), data, repeats=True)
 
 
-def _asked(scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitFields, function: str) -> Asked:
+def _asked(
+    scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitFields, function: str
+) -> Asked:
     """Return the checked request, for one first guess of whole runs."""
     rest: dict[str, Any] = dict(by_name)
-    cutoff, tolerance, most_steps = (rest.pop(name, value) for name, value in (("cutoff", 1e-6), ("tolerance", 1e-4), ("max_iterations", 50)))
+    cutoff, tolerance, most_steps = (
+        rest.pop(name, value)
+        for name, value in (("cutoff", 1e-6), ("tolerance", 1e-4), ("max_iterations", 50))
+    )
     loss, errors, options = rest.pop("loss", None), rest.pop("errors", "sigmas"), rest.pop("options", None)
     settled = as_fit_options(scene, options, rest, function)
     if loss is not None and not isinstance(loss, Loss):
@@ -235,7 +247,16 @@ def _asked(scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitF
     if errors not in ("sigmas", "runs"):
         raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
     named = free if isinstance(free, Mapping) else tuple(as_names(free))
-    return Asked(as_scene(scene), named, settled, loss or LEAST_SQUARES, Control(tolerance, most_steps, cutoff), errors, 1, None)
+    return Asked(
+        as_scene(scene),
+        named,
+        settled,
+        loss or LEAST_SQUARES,
+        Control(tolerance, most_steps, cutoff),
+        errors,
+        1,
+        None,
+    )
 
 
 def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
@@ -258,8 +279,16 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
             raise ValueError(f"the channels hold {sorted(counts)} repeats; {said}")
         members = counts.pop()
     enough = _check_enough(runs, unknowns, repeats)
-    theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-    problem = Problem(asked, runs, unknowns, members) if asked.shooting is None else Piecewise(asked, runs, unknowns)
+    theta = (
+        unknowns.first_guesses(asked.guesses)
+        if members is None
+        else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
+    )
+    problem = (
+        Problem(asked, runs, unknowns, members)
+        if asked.shooting is None
+        else Piecewise(asked, runs, unknowns)
+    )
     found = shot(problem, theta) if isinstance(problem, Piecewise) else minimum(problem, theta)
     # without a step it is unknown whether starts can move with the unknowns
     if problem.failed or not found.steps.all():
@@ -267,7 +296,9 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
     if isinstance(problem, Piecewise):
         problem.keep(int(np.argmin(found.at.cost)))
-        problem.asked = replace(asked, control=replace(asked.control, cutoff=cutoff_of(problem, asked.control, np.array([0]))))
+        problem.asked = replace(
+            asked, control=replace(asked.control, cutoff=cutoff_of(problem, asked.control, np.array([0])))
+        )
     found = with_memory(problem, found if members else found.lowest())
     found, at_bounds = off_bounds(problem, found)
     found.converged &= enough
@@ -278,35 +309,54 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
 
 def _check_control(control: Control) -> None:
     if not 0 < control.cutoff < 1:
-        raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of "
-            "the largest singular value that counts as zero")
+        raise ValueError(
+            f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of "
+            "the largest singular value that counts as zero"
+        )
     if not control.tolerance > 0:
-        raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in "
-            "sigmas that ends the fit")
+        raise ValueError(
+            f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in "
+            "sigmas that ends the fit"
+        )
     checked_whole(control.most_steps, "`max_iterations`", 0, expected="of steps")
 
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
     if asked.errors == "runs" and len(runs) < 5:
-        raise ValueError('errors="runs" takes standard errors from the differences between runs, but there '
-            f'are {len(runs)}; give 5 or more, or errors="sigmas"')
-    robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
+        raise ValueError(
+            'errors="runs" takes standard errors from the differences between runs, but there '
+            f'are {len(runs)}; give 5 or more, or errors="sigmas"'
+        )
+    robust, unknown = (
+        asked.loss != LEAST_SQUARES,
+        in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma),
+    )
     if unknown and robust:
-        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of "
-            "outliers; give a number")
+        raise ValueError(
+            f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of "
+            "outliers; give a number"
+        )
     coloured = sorted({name for run in runs for name in run.correlation_time})
     if coloured and robust:
-        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss "
-            "assumes independent samples; omit one of them")
+        raise ValueError(
+            f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss "
+            "assumes independent samples; omit one of them"
+        )
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
-    """Return which repeats have at least as many measured values as unknowns. Raises ValueError if none has.
-    """
-    known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
+    """Return which repeats have at least as many measured values as unknowns. Raises ValueError if none has."""
+    known = [
+        np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats))
+        for run in runs
+        for name, values in run.values.items()
+    ]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
-    each, sigmas = sum(counts) + np.count_nonzero(unknowns.prior_weight), len({name for run in runs for name in run.unknown_sigma})
+    each, sigmas = (
+        sum(counts) + np.count_nonzero(unknowns.prior_weight),
+        len({name for run in runs for name in run.unknown_sigma}),
+    )
     samples = int(np.max(each))
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""

@@ -19,8 +19,25 @@ _FUNCTIONS = {
     **{"Equality": "equal", "Unequality": "not_equal", "StrictLessThan": "less", "LessThan": "less_equal"},
     **{"StrictGreaterThan": "greater", "GreaterThan": "greater_equal"},
 }
-_OF_MANY = {"Add": "add", "Mul": "multiply", "Min": "minimum", "Max": "maximum", "And": "logical_and", "Or": "logical_or"}
-_KNOWN = {*_FUNCTIONS, *_OF_MANY, "Pow", "Piecewise", "ExprCondPair", "sinc", "erf", "BooleanTrue", "BooleanFalse"}
+_OF_MANY = {
+    "Add": "add",
+    "Mul": "multiply",
+    "Min": "minimum",
+    "Max": "maximum",
+    "And": "logical_and",
+    "Or": "logical_or",
+}
+_KNOWN = {
+    *_FUNCTIONS,
+    *_OF_MANY,
+    "Pow",
+    "Piecewise",
+    "ExprCondPair",
+    "sinc",
+    "erf",
+    "BooleanTrue",
+    "BooleanFalse",
+}
 
 
 def sympy_package() -> Any:
@@ -30,8 +47,7 @@ def sympy_package() -> Any:
 
 
 class Formulas:
-    """Named lists of expressions that are evaluated together, as a function of the values of their symbols.
-    """
+    """Named lists of expressions that are evaluated together, as a function of the values of their symbols."""
 
     def __init__(self, lists: Mapping[Any, Any], leaves: Sequence[Any]):
         """Prepare the `lists` (or matrices) of expressions in the symbols `leaves`. Raises ValueError for a

@@ -12,9 +12,29 @@ import numpy as np
 
 from jourdain_jax.calculus.rotations import matrices_to_quaternions, onto_axis
 from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, all_of
-from jourdain_jax.importers.placement import SIZES, about, by_euler_angles, by_quaternion, combined, moments, volume
+from jourdain_jax.importers.placement import (
+    SIZES,
+    about,
+    by_euler_angles,
+    by_quaternion,
+    combined,
+    moments,
+    volume,
+)
 from jourdain_jax.importers.scene_class import identifier
-from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Push, Tree, Vector
+from jourdain_jax.importers.tree import (
+    Closure,
+    Follower,
+    Joint,
+    Link,
+    Look,
+    Mass,
+    Matrix,
+    Motor,
+    Push,
+    Tree,
+    Vector,
+)
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Element, Part, XmlFile
 from jourdain_jax.scene.names import Labels, as_labels, nearest
@@ -73,12 +93,21 @@ class _Reader:
 
     def __init__(self, file: XmlFile):
         self.file, self.defaults, self.compiler = file, Defaults(file), all_of(file, "compiler")
-        self.settings = {"angle": "degree", "eulerseq": "xyz", "inertiafromgeom": "auto", "autolimits": "true"} | dict(self.compiler.given)
+        self.settings = {
+            "angle": "degree",
+            "eulerseq": "xyz",
+            "inertiafromgeom": "auto",
+            "autolimits": "true",
+        } | dict(self.compiler.given)
         self.unit = 1.0 if self.settings["angle"] == "radian" else math.pi / 180
         if len(self.settings["eulerseq"]) != 3 or set(self.settings["eulerseq"].lower()) - set("xyz"):
-            raise self.compiler.fault("`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters "
-                "out of x, y, z, X, Y, Z")
-        self.meshes = {mesh.get("name") or Path(mesh.get("file", "")).stem: mesh for mesh in file.root.findall("asset/mesh")}
+            raise self.compiler.fault(
+                "`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters out of x, y, z, X, Y, Z"
+            )
+        self.meshes = {
+            mesh.get("name") or Path(mesh.get("file", "")).stem: mesh
+            for mesh in file.root.findall("asset/mesh")
+        }
         self.links: list[Link] = []
         # site -> its body, and its position and rotation there
         self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}
@@ -95,36 +124,55 @@ class _Reader:
         gravity = all_of(self.file, "option").numbers("gravity", 3, [0.0, 0.0, -9.81])
         if any(flag.get("gravity") == "disable" for flag in self.file.root.findall("option/flag")):
             gravity = np.zeros(3)
-        joints = [joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")]
-        name, motors, ties = self.file.root.get("model") or "Mjcf", tuple(self._motors(joints)), tuple(self._ties(joints))
+        joints = [
+            joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")
+        ]
+        name, motors, ties = (
+            self.file.root.get("model") or "Mjcf",
+            tuple(self._motors(joints)),
+            tuple(self._ties(joints)),
+        )
         return Tree(name, tuple(self.links), gravity, motors, ties, free, self.start)
 
     def _ties(self, joints: list[str]) -> Iterable[Follower | Closure]:
         """Yield the exact constraints that `equality` states."""
         stated = () if "equality" in self.file.ignore else self.file.root.findall("equality/*")
         for k, element in enumerate(stated):
-            tie, follows = Part(self.file, f"{element.tag} {k + 1} of `equality`", element), element.tag == "joint"
+            tie, follows = (
+                Part(self.file, f"{element.tag} {k + 1} of `equality`", element),
+                element.tag == "joint",
+            )
             one, other = (element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2))
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
-                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is not a "
-                                                      f"{'hinge or slide' if follows else 'body'}")
+                self.file.check_name(
+                    str(end),
+                    known,
+                    f"{tie.what} names `{end}`, which is not a {'hinge or slide' if follows else 'body'}",
+                )
             if element.get("active") == "false":
                 continue
             if follows:
                 yield Follower(one or "", other or "", tuple(tie.numbers("polycoef", None, [0.0, 1.0])))
             elif element.tag == "weld":  # its anchor is a point of the second body
-                yield Closure(element.get("name") or tie.what, other, one, tie.numbers("anchor", 3, np.zeros(3)), True)
+                yield Closure(
+                    element.get("name") or tie.what, other, one, tie.numbers("anchor", 3, np.zeros(3)), True
+                )
             else:
                 yield Closure(element.get("name") or tie.what, one, other, tie.numbers("anchor", 3), False)
 
     def _children(self, holder: Element, parent: str | None, childclass: str | None) -> None:
         for site, given, frame in self._held(holder, "site", childclass):
-            self.sites[site.get("name", "")] = parent, *_within(frame, self._place(self.defaults.of(site, given, f"site `{site.get('name')}`")))
+            self.sites[site.get("name", "")] = (
+                parent,
+                *_within(frame, self._place(self.defaults.of(site, given, f"site `{site.get('name')}`"))),
+            )
         for element, given, frame in self._held(holder, "body", childclass):
             self._body(element, parent, given, frame)
 
-    def _held(self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE) -> Iterable[tuple[Element, str | None, Place]]:
+    def _held(
+        self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE
+    ) -> Iterable[tuple[Element, str | None, Place]]:
         """Yield the elements of a kind in a body and in its nested frames, each with its default class and
         its frame relative to the body.
         """
@@ -140,13 +188,23 @@ class _Reader:
         what, childclass = f"body `{name}`", body.get("childclass") or childclass
         part = Part(self.file, what, body)
         position, turn = _within(frame, self._place(part))
-        joints = tuple(self._joint(element, childclass, name, k) for k, element in enumerate(part.children("joint", "freejoint")))
+        joints = tuple(
+            self._joint(element, childclass, name, k)
+            for k, element in enumerate(part.children("joint", "freejoint"))
+        )
         if any(joint.kind == "free" for joint in joints):
             if parent is not None or len(joints) > 1:
-                raise self.file.fault(f"{what} has a free joint and {'a parent' if parent else 'other joints'}; "
-                    "a free joint must be the only joint of a body that is directly in `worldbody`")
-            start = (*zip("xyz", position, strict=True), *zip(_ATTITUDE, matrices_to_quaternions(turn[None])[0], strict=True))
-            self.start |= {f"{identifier(joints[0].name)}_{part}": float(x) for part, x in start}  # the stated pose
+                raise self.file.fault(
+                    f"{what} has a free joint and {'a parent' if parent else 'other joints'}; "
+                    "a free joint must be the only joint of a body that is directly in `worldbody`"
+                )
+            start = (
+                *zip("xyz", position, strict=True),
+                *zip(_ATTITUDE, matrices_to_quaternions(turn[None])[0], strict=True),
+            )
+            self.start |= {
+                f"{identifier(joints[0].name)}_{part}": float(x) for part, x in start
+            }  # the stated pose
             position, turn = np.zeros(3), np.eye(3)
         moves = bool(joints) or parent in self.moving
         if moves:
@@ -159,18 +217,28 @@ class _Reader:
     def _joint(self, element: Element, childclass: str | None, body: str, number: int) -> Joint:
         name = element.get("name") or (f"{body}_joint" if number == 0 else f"{body}_joint{number + 1}")
         what = f"joint `{name}`"
-        given = Part(self.file, what, element) if element.tag == "freejoint" else self.defaults.of(element, childclass, what)
+        given = (
+            Part(self.file, what, element)
+            if element.tag == "freejoint"
+            else self.defaults.of(element, childclass, what)
+        )
         kind = "free" if element.tag == "freejoint" else given.given.get("type", "hinge")
         self.file.check_name(kind, _TYPES, f"{what} is of the type `{kind}`")
         unit = self.unit if kind in ("hinge", "ball") else 1.0
-        damping, stiffness, rest, reference = (given.number(word, 0.0) for word in ("damping", "stiffness", "springref", "ref"))
+        damping, stiffness, rest, reference = (
+            given.number(word, 0.0) for word in ("damping", "stiffness", "springref", "ref")
+        )
         if stiffness and kind not in ("hinge", "slide"):
             self.file.refuse("stiffness", f"the stiffness of the {kind} {what}")
             stiffness = 0.0
         low, high = given.numbers("range", 2, [0.0, 0.0]) * unit
         if reference and kind in ("hinge", "slide"):
             self.start[identifier(name)] = reference * unit
-        axis, anchor, limits = given.direction("axis", [0.0, 0.0, 1.0]), given.numbers("pos", 3, np.zeros(3)), (float(low), float(high)) if low < high else None
+        axis, anchor, limits = (
+            given.direction("axis", [0.0, 0.0, 1.0]),
+            given.numbers("pos", 3, np.zeros(3)),
+            (float(low), float(high)) if low < high else None,
+        )
         return Joint(name, kind, axis, anchor, reference * unit, damping, stiffness, rest * unit, limits)
 
     def _mass(self, body: Part, geoms: list[Geom]) -> Mass | None:
@@ -195,7 +263,11 @@ class _Reader:
     def _geoms(self, holder: Element, childclass: str | None, where: str) -> list[Geom]:
         found = []
         for geom, around, frame in self._held(holder, "geom", childclass):
-            given = self.defaults.of(geom, around, f"geom `{geom.get('name')}` of {where}" if geom.get("name") else f"a geom of {where}")
+            given = self.defaults.of(
+                geom,
+                around,
+                f"geom `{geom.get('name')}` of {where}" if geom.get("name") else f"a geom of {where}",
+            )
             found.append((given, given.given.get("type", "mesh" if "mesh" in given else "sphere"), frame))
         return found
 
@@ -207,8 +279,11 @@ class _Reader:
         if number == 0:
             return None
         if kind not in SIZES:
-            self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give the body an '
-                '`inertial`, or the geom mass="0"')
+            self.file.refuse(
+                kind,
+                f"the mass of {given.what}, of the type `{kind}`,",
+                'give the body an `inertial`, or the geom mass="0"',
+            )
             return None
         position, turn, size = self._solid(given, kind, frame)
         mass = number if word == "mass" else number * volume(kind, size)
@@ -225,8 +300,11 @@ class _Reader:
             position, turn = (ends[:3] + ends[3:]) / 2, onto_axis(along)
             size = np.array([size[0], half] if kind in ("capsule", "cylinder") else [size[0], size[0], half])
         if len(size) < SIZES[kind] or np.any(size[: SIZES[kind]] <= 0):
-            raise given.fault("size", f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above "
-                                      f"zero for the type `{kind}`")
+            raise given.fault(
+                "size",
+                f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above "
+                f"zero for the type `{kind}`",
+            )
         return *_within(frame, (position, turn)), size[: SIZES[kind]]
 
     def _looks(self, geoms: list[Geom]) -> tuple[Look, ...]:
@@ -242,9 +320,20 @@ class _Reader:
             return Look(look, tuple(map(float, size * factors)), position, turn, colour, opacity)
         if kind == "mesh" and given.given.get("mesh") in self.meshes:
             mesh = Part(self.file, f"the mesh of {given.what}", self.meshes[given.given["mesh"]])
-            path = self.file.folder / self.settings.get("meshdir", self.settings.get("assetdir", "")) / mesh.given.get("file", "")
+            path = (
+                self.file.folder
+                / self.settings.get("meshdir", self.settings.get("assetdir", ""))
+                / mesh.given.get("file", "")
+            )
             if os.path.isfile(path):
-                return Look("mesh", tuple(mesh.numbers("scale", 3, [1.0] * 3)), *_within(frame, self._place(given)), colour, opacity, str(path))
+                return Look(
+                    "mesh",
+                    tuple(mesh.numbers("scale", 3, [1.0] * 3)),
+                    *_within(frame, self._place(given)),
+                    colour,
+                    opacity,
+                    str(path),
+                )
         self.file.leave_out(f"geom of type {kind}")
         return None
 
@@ -288,12 +377,14 @@ class _Reader:
         for k, element in enumerate(self.file.root.findall("actuator/motor")):
             motor = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`")
             joint, site = motor.given.get("joint", ""), motor.given.get("site")
-            name, gear, push = element.get("name") or f"{site or joint}_motor", motor.numbers("gear", None, [1.0]), None
+            name, gear, push = (
+                element.get("name") or f"{site or joint}_motor",
+                motor.numbers("gear", None, [1.0]),
+                None,
+            )
             motor.what = f"motor `{name}`"
             if site is not None:
-                self.file.check_name(
-                    site, self.sites, f"{motor.what} pushes the unknown site `{site}`"
-                )
+                self.file.check_name(site, self.sites, f"{motor.what} pushes the unknown site `{site}`")
                 link, position, turn = self.sites[site]
                 if link not in heavy:
                     raise self.file.fault(
@@ -303,9 +394,12 @@ class _Reader:
                 force, moment = np.pad(gear, (0, 6 - len(gear))).reshape(2, 3) @ turn.T
                 gear, push = np.ones(1), Push(link, position, force, moment)
             elif joint not in names:
-                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is not a hinge or slide; "
-                    f"{nearest(joint, names)}")
-            yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
+                raise self.file.fault(
+                    f"{motor.what} pushes `{joint}`, which is not a hinge or slide; {nearest(joint, names)}"
+                )
+            yield Motor(
+                name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push
+            )
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
         """Return the range that limits a motor's control or force; None if there is none or it is switched
@@ -313,9 +407,13 @@ class _Reader:
         """
         low, high = motor.numbers(f"{what}range", 2, [0.0, 0.0])
         limited, inferred = motor.given.get(f"{what}limited", "auto"), self.settings["autolimits"] == "true"
-        if (limited == "true" and low >= high) or (limited == "auto" and not inferred and (low, high) != (0.0, 0.0)):
-            raise self.file.fault(f'`{what}range` of {motor.what} and `{what}limited` contradict each other; '
-                f'state low < high and `{what}limited="true"`')
+        if (limited == "true" and low >= high) or (
+            limited == "auto" and not inferred and (low, high) != (0.0, 0.0)
+        ):
+            raise self.file.fault(
+                f"`{what}range` of {motor.what} and `{what}limited` contradict each other; "
+                f'state low < high and `{what}limited="true"`'
+            )
         return (float(low), float(high)) if limited == "true" or (limited == "auto" and low < high) else None
 
 

@@ -6,7 +6,10 @@ Source: the XML reference of MuJoCo's documentation, version 3.
 from jourdain_jax.importers.xml_file import Element, Holds, Part, XmlFile
 
 _PLACE = "pos quat axisangle xyaxes zaxis euler"
-_CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
+_CONTACT = (
+    "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale"
+    " fluidcoef"
+)
 # actuators that share their defaults with `motor`, for the attributes that it has
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
 _IDLE = "camera light visual statistic size sensor keyframe custom contact texture material hfield skin"
@@ -15,12 +18,15 @@ _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
 # Supported contents of elements, and attributes of their classes; all others raise an error. `idle` are
 # contents on contacts, limits, drawing, and the other engine's computation.
 TABLE = {
-    "mujoco": Holds("model", many="compiler option default worldbody asset actuator equality "
-        "include", listed=_IDLE),
+    "mujoco": Holds(
+        "model", many="compiler option default worldbody asset actuator equality include", listed=_IDLE
+    ),
     "compiler": Holds(
         "angle eulerseq inertiafromgeom meshdir assetdir autolimits",
-        idle="texturedir strippath fusestatic discardvisual usethread saveinertial convexhull "
-            "exactmeshinertia fitaabb conflict lengthrange",
+        idle=(
+            "texturedir strippath fusestatic discardvisual usethread saveinertial convexhull "
+            "exactmeshinertia fitaabb conflict lengthrange"
+        ),
         off={
             "coordinate": "local",
             "boundmass": "0",
@@ -35,28 +41,47 @@ TABLE = {
     "option": Holds(
         "gravity",
         one="flag",
-        idle="timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance "
+        idle=(
+            "timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance "
             "o_margin o_solref o_solimp o_friction magnetic wind integrator cone jacobian solver iterations "
             "ls_iterations noslip_iterations ccd_iterations mpr_iterations sdf_iterations sdf_initpoints "
-            "sleep_tolerance",
+            "sleep_tolerance"
+        ),
         off={"density": "0", "viscosity": "0", "actuatorgroupdisable": ""},
     ),
     "include": Holds("file"),
     "flag": Holds(
         "gravity",
-        idle="constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase "
-            "eulerdamp autoreset nativeccd island multiccd energy invdiscrete sleep",
-        off=dict.fromkeys(("spring", "damper", "passive", "actuation", "clampctrl"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
+        idle=(
+            "constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase "
+            "eulerdamp autoreset nativeccd island multiccd energy invdiscrete sleep"
+        ),
+        off=dict.fromkeys(("spring", "damper", "passive", "actuation", "clampctrl"), "enable")
+        | {
+            "fwdinv": "disable enable",
+            "override": "disable",
+        },
         words={"gravity": ("enable", "disable")},
     ),
-    "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material "
-        "joint geom site camera light pair equality tendon"),
+    "default": Holds(
+        "class",
+        many="default",
+        idle=(
+            f"{' '.join(_ACTUATORS)} motor adhesion mesh material "
+            "joint geom site camera light pair equality tendon"
+        ),
+    ),
     "worldbody": Holds(many="geom body site frame", listed=_IDLE),
     "frame": Holds(f"name childclass {_PLACE}", many="geom body site frame", listed=_IDLE),
     "site": Holds(f"name class {_PLACE}", idle="type size fromto material rgba group user"),
     "asset": Holds(many="mesh", idle="texture material hfield skin model"),
-    "mesh": Holds("name class file scale", idle="content_type vertex normal texcoord face refpos refquat "
-        "smoothnormal maxhullvert inertia builtin params"),
+    "mesh": Holds(
+        "name class file scale",
+        idle=(
+            "content_type vertex normal texcoord face refpos refquat "
+            "smoothnormal maxhullvert inertia builtin params"
+        ),
+    ),
     "body": Holds(
         f"name childclass {_PLACE}",
         one="inertial",
@@ -80,15 +105,24 @@ TABLE = {
     ),
     "freejoint": Holds("name", idle="group", off={"align": "false auto"}),
     "geom": Holds(
-        f"name class type size fromto mass density rgba mesh {_PLACE}", idle=f"material hfield {_CONTACT}", off={"shellinertia": "false", "fluidshape": "none"}
+        f"name class type size fromto mass density rgba mesh {_PLACE}",
+        idle=f"material hfield {_CONTACT}",
+        off={"shellinertia": "false", "fluidshape": "none"},
     ),
     "actuator": Holds(many="motor"),
     "equality": Holds(many="connect weld joint"),
     "connect": Holds("name active body1 body2 anchor", idle=_SOFT, words={"active": _SWITCH}),
-    "weld": Holds("name active body1 body2 anchor", idle=f"torquescale {_SOFT}", off={"relpose": "0 1 0 0 0 0 0"}, words={"active": _SWITCH}),
+    "weld": Holds(
+        "name active body1 body2 anchor",
+        idle=f"torquescale {_SOFT}",
+        off={"relpose": "0 1 0 0 0 0 0"},
+        words={"active": _SWITCH},
+    ),
     "equality/joint": Holds("name active joint1 joint2 polycoef", idle=_SOFT, words={"active": _SWITCH}),
     "motor": Holds(
-        "name class joint site gear ctrllimited ctrlrange forcelimited forcerange", idle="group user", words={"ctrllimited": _RANGED, "forcelimited": _RANGED}
+        "name class joint site gear ctrllimited ctrlrange forcelimited forcerange",
+        idle="group user",
+        words={"ctrllimited": _RANGED, "forcelimited": _RANGED},
     ),
 }
 
@@ -118,8 +152,11 @@ class Defaults:
                 self._file.check_text(element, f"`{element.tag}` of the class `{name}`")
                 known[element.tag] = known.get(element.tag, {}) | dict(element.attrib)
             if element.tag in _ACTUATORS:
-                shared = {name: value for name, value in element.attrib.items() if name in f"{motor.read} "
-                    f"{motor.idle}".split()}
+                shared = {
+                    name: value
+                    for name, value in element.attrib.items()
+                    if name in f"{motor.read} {motor.idle}".split()
+                }
                 known["motor"] = known.get("motor", {}) | shared
         self._classes[name] = self._classes.get(name, {}) | known
         for element in section.findall("default"):
@@ -144,4 +181,9 @@ class Defaults:
 
 def all_of(file: XmlFile, path: str) -> Part:
     """Return all sections at a path merged into one. If several state an attribute, the last one counts."""
-    return Part(file, f"`{path.rpartition('/')[2]}`", None, {name: value for section in file.root.findall(path) for name, value in section.attrib.items()})
+    return Part(
+        file,
+        f"`{path.rpartition('/')[2]}`",
+        None,
+        {name: value for section in file.root.findall(path) for name, value in section.attrib.items()},
+    )

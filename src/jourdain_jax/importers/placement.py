@@ -35,7 +35,7 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 def combined(masses: list[Mass]) -> Mass:
     """Return several masses in one frame combined, with the inertia by the parallel-axis theorem,
 
-        I = sum I_i + m_i (d_i.d_i - d_i d_i').
+    I = sum I_i + m_i (d_i.d_i - d_i d_i').
     """
     total = sum(one.mass for one in masses)
     centre = sum(one.mass * one.centre for one in masses) / total if total else masses[0].centre
@@ -60,8 +60,7 @@ def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
-    """Return principal moments about the centre for a mass of 1 kg. Cylinders and capsules have the axis z.
-    """
+    """Return principal moments about the centre for a mass of 1 kg. Cylinders and capsules have the axis z."""
     if kind in ("sphere", "ellipsoid", "box"):
         squares = np.square(np.broadcast_to(size, 3))
         return (np.sum(squares) - squares) / (3 if kind == "box" else 5)

@@ -35,18 +35,28 @@ def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> d
         if twin == name:
             raise ValueError(f"two {kind}s are called `{name}`; give each its own name")
         if twin is not None:
-            raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of "
-                "them")
+            raise ValueError(
+                f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of them"
+            )
         found[name] = new
     return found
 
 
-def scene_class(base: type[Scene], name: str, about: str, fields: dict[str, Any], attributes: dict[str, Any]) -> type[Scene]:
+def scene_class(
+    base: type[Scene], name: str, about: str, fields: dict[str, Any], attributes: dict[str, Any]
+) -> type[Scene]:
     """Return a subclass of `base` called `name` (`my-robot` becomes `MyRobot`), with docstring `about`,
     `fields` made by `parameter`, and further class `attributes`.
     """
     words = [word for word in re.split(r"[\W_]+", name) if word]
     name = identifier("".join(word[0].upper() + word[1:] for word in words) or "Scene")
     annotations = dict.fromkeys(fields, object)
-    namespace = {"__module__": base.__module__, "__qualname__": name, "__doc__": about, "__annotations__": annotations, **fields, **attributes}
+    namespace = {
+        "__module__": base.__module__,
+        "__qualname__": name,
+        "__doc__": about,
+        "__annotations__": annotations,
+        **fields,
+        **attributes,
+    }
     return type(base)(name, (base,), namespace)

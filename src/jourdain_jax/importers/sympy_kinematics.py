@@ -134,7 +134,9 @@ def _constant(system: MechanicalSystem, matrix, what: str):
     matrix = system.resolved(matrix)
     if system.is_constant(matrix):
         return matrix
-    still = matrix.xreplace(dict.fromkeys([*matrix.atoms(sympy.core.function.AppliedUndef), system.time], sympy.S.Zero))
+    still = matrix.xreplace(
+        dict.fromkeys([*matrix.atoms(sympy.core.function.AppliedUndef), system.time], sympy.S.Zero)
+    )
     for sample in sampled(system, {what: matrix, f"{what}, at zero": still}):
         moving, zero = (sample.values[name] for name in (what, f"{what}, at zero"))
         if largest(moving - zero) > _SAME * largest(zero):
@@ -149,7 +151,10 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
     if pose.frame is None:
         return
     name, stated = f"orientation of body `{pose.name}`", f"angular velocity of body `{pose.name}`"
-    lists = {name: pose.orientation, stated: system.resolved(pose.frame.ang_vel_in(system.frame).to_matrix(system.frame))}
+    lists = {
+        name: pose.orientation,
+        stated: system.resolved(pose.frame.ang_vel_in(system.frame).to_matrix(system.frame)),
+    }
     for sample in sampled(system, lists):
         S = sample.rates[name].reshape(3, 3) @ sample.values[name].reshape(3, 3).T
         omega = np.array([S[2, 1], S[0, 2], S[1, 0]])
@@ -167,15 +172,22 @@ def _moved(system: MechanicalSystem, poses: list[Pose]) -> tuple[MechanicalSyste
     """
     sympy = sympy_package()
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]
-    places, speeds = ([f"{what} of body `{pose.name}`" for pose in poses] for what in ("position", "velocity"))
-    lists = dict(zip(places, [pose.position for pose in poses], strict=True)) | dict(zip(speeds, stated, strict=True))
+    places, speeds = (
+        [f"{what} of body `{pose.name}`" for pose in poses] for what in ("position", "velocity")
+    )
+    lists = dict(zip(places, [pose.position for pose in poses], strict=True)) | dict(
+        zip(speeds, stated, strict=True)
+    )
     samples = sampled(system, lists, (*system.velocity, *system.rates_of_configuration()))
     missing = []  # by body: stated velocity minus rate of the position, at all samples
     for place, speed in zip(places, speeds, strict=True):
         velocities = np.array([sample.values[speed] for sample in samples])
         difference = velocities - np.array([sample.rates[place] for sample in samples])
         missing.append(np.where(np.abs(difference) > _SAME * (1.0 + largest(velocities)), difference, 0.0))
-    leaders = [next(j for j in range(k + 1) if np.allclose(missing[j], missing[k], atol=_SAME)) for k in range(len(poses))]
+    leaders = [
+        next(j for j in range(k + 1) if np.allclose(missing[j], missing[k], atol=_SAME))
+        for k in range(len(poses))
+    ]
     taken = {str(x.func) for x in (*system.coordinates, *system.speeds)}
     added: dict[Any, Any] = {}
     new = list(poses)

@@ -32,11 +32,15 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
     time = sympy.physics.mechanics.dynamicsymbols._t
     found: set[Any] = set()
     for expression in map(sympy.sympify, expressions):
-        found |= expression.atoms(sympy.core.function.AppliedUndef, sympy.Derivative) | expression.free_symbols
+        found |= (
+            expression.atoms(sympy.core.function.AppliedUndef, sympy.Derivative) | expression.free_symbols
+        )
     return {x for x in found if x.args == (time,) or x.is_Symbol or isinstance(x, sympy.Derivative)}
 
 
-def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()) -> list[Sample]:
+def sampled(
+    system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()
+) -> list[Sample]:
     """Return the first random states at which all expressions are finite. Their speeds are the nearest to
     random ones that satisfy the constraints `rows`, which are affine in the speeds.
 
@@ -54,9 +58,13 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
     worst = ""
     for _ in range(_TRIES):
         drawn = generator.uniform(0.1, 0.9, len(symbols)) * generator.choice([-1.0, 1.0], len(symbols))
-        leaves = {x: system.given.get(str(x), float(number)) for x, number in zip(symbols, drawn, strict=True)}
+        leaves = {
+            x: system.given.get(str(x), float(number)) for x, number in zip(symbols, drawn, strict=True)
+        }
         if kept:
-            leaves |= _meeting(affine(lambda at: held.numbers(at)["rows"], leaves, system.speeds), leaves, system.speeds)
+            leaves |= _meeting(
+                affine(lambda at: held.numbers(at)["rows"], leaves, system.speeds), leaves, system.speeds
+            )
         values = formulas.numbers(leaves)
         ahead, behind = (
             formulas.numbers(
@@ -80,7 +88,9 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
     )
 
 
-def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]) -> Float[np.ndarray, "rows columns"]:
+def affine(
+    values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]
+) -> Float[np.ndarray, "rows columns"]:
     """Return `[A b]` of A u + b from the `values` at given leaves: the values at rest, and their increments
     for each speed.
     """
@@ -89,8 +99,14 @@ def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speed
     return np.stack([*(values(rest | {speed: 1.0}) - b for speed in speeds), b], axis=1)
 
 
-def _meeting(both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]) -> dict[Any, float]:
+def _meeting(
+    both: Float[np.ndarray, "rows columns"], leaves: dict[Any, float], speeds: Sequence[Any]
+) -> dict[Any, float]:
     """Return the nearest speeds that satisfy the constraints `both`; NaN if these are NaN."""
     u = np.array([leaves[speed] for speed in speeds])
-    u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if all_finite(both) else u * np.nan
+    u = (
+        u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1])
+        if all_finite(both)
+        else u * np.nan
+    )
     return dict(zip(speeds, map(float, u), strict=True))

@@ -41,7 +41,10 @@ class _Expressions:
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
             leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
         dtype = real_type()
-        return {key: [jnp.asarray(value, dtype) for value in values] for key, values in self.formulas[part].values(leaves).items()}
+        return {
+            key: [jnp.asarray(value, dtype) for value in values]
+            for key, values in self.formulas[part].values(leaves).items()
+        }
 
 
 class SympyScene(Scene):
@@ -51,12 +54,16 @@ class SympyScene(Scene):
 
     def bodies(self, t, q):
         """Return poses from SymPy's positions and rotation matrices."""
-        values = {key: jnp.stack(several) for key, several in self._expressions.values("bodies", self, t, q).items()}
+        values = {
+            key: jnp.stack(several) for key, several in self._expressions.values("bodies", self, t, q).items()
+        }
         found: dict[str, Particle | RigidBody] = {}
         for name, rigid in self._expressions.is_rigid.items():
             mass, position = values["mass", name][0], values["position", name]
             if rigid:
-                inertia, orientation = (values[what, name].reshape(3, 3) for what in ("inertia", "orientation"))
+                inertia, orientation = (
+                    values[what, name].reshape(3, 3) for what in ("inertia", "orientation")
+                )
                 found[name] = RigidBody(mass, inertia, position, orientation)
             else:
                 found[name] = Particle(mass, position)
@@ -69,15 +76,29 @@ class SympyScene(Scene):
     def loads(self, motion):
         """Return SymPy's loads; constant ones have a potential."""
         kinds: dict[str, dict] = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
-        for (kind, name), value in self._expressions.values("loads", self, motion.t, motion.q, motion.u, motion.inputs).items():
+        for (kind, name), value in self._expressions.values(
+            "loads", self, motion.t, motion.q, motion.u, motion.inputs
+        ).items():
             kinds[kind][name] = value[0] if kind == "generalized" else jnp.stack(value)
         weights, *others = kinds.values()
-        found = [Load(forces=weights, potential=-sum(force @ motion[name].position for name, force in weights.items()))] if weights else []
+        found = (
+            [
+                Load(
+                    forces=weights,
+                    potential=-sum(force @ motion[name].position for name, force in weights.items()),
+                )
+            ]
+            if weights
+            else []
+        )
         return (*found, Load(*others)) if any(others) else tuple(found)
 
     def geometric_constraints(self, pose):
         """Return SymPy's configuration constraints."""
-        return {f"configuration {k}": row for k, row in enumerate(self._expressions.values("geometric", self, pose.t, pose.q)["rows"], 1)}
+        return {
+            f"configuration {k}": row
+            for k, row in enumerate(self._expressions.values("geometric", self, pose.t, pose.q)["rows"], 1)
+        }
 
     def velocity_constraints(self, motion):
         """Return SymPy's velocity constraints, without rates of the configuration constraints."""
@@ -85,7 +106,9 @@ class SympyScene(Scene):
         return {f"velocity {k}": row for k, row in enumerate(rows, 1)}
 
 
-def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene") -> type[Scene]:
+def from_sympy(
+    system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene"
+) -> type[Scene]:
     """Return a class of scenes from SymPy's mechanics: poses, loads and constraints are imported, and the
     equations of motion derived.
 
@@ -127,7 +150,10 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
         print(jj.simulate(Pendulum(), {"q": 0.3}, t1=1.0))
     """
     check_kind(values, Mapping | None, "`values`", "a dictionary: symbol -> number")
-    checked = {str(x): float(checked_real(value, f"value of `{x}`", (), advice="give one number")) for x, value in (values or {}).items()}
+    checked = {
+        str(x): float(checked_real(value, f"value of `{x}`", (), advice="give one number"))
+        for x, value in (values or {}).items()
+    }
     return _scene_class(*poses_of(mechanical_system(system, origin, checked)), name)
 
 
@@ -137,9 +163,15 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
     for pose in poses:
         bodies |= {("mass", pose.name): [pose.mass], ("position", pose.name): pose.position}
         if pose.orientation is not None:
-            bodies |= {("inertia", pose.name): pose.inertia, ("orientation", pose.name): system.resolved(pose.orientation)}
+            bodies |= {
+                ("inertia", pose.name): pose.inertia,
+                ("orientation", pose.name): system.resolved(pose.orientation),
+            }
     u_names = identifiers([str(x.func) for x in system.speeds], "speed")
-    loads = {(kind, u_names[str(where.func)] if kind == "generalized" else where): value for (kind, where), value in forces_of(system, poses).items()}
+    loads = {
+        (kind, u_names[str(where.func)] if kind == "generalized" else where): value
+        for (kind, where), value in forces_of(system, poses).items()
+    }
     parts: dict[str, dict[Any, Any]] = {
         "bodies": bodies,
         "rates": {"rates": [system.rates[q.diff(system.time)] for q in system.coordinates]},
@@ -147,7 +179,10 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
         "loads": loads,
         "velocity": {"rows": velocity_rows(system)},
     }
-    symbols = {part: symbols_in(e for expressions in lists.values() for e in expressions) - {system.time} for part, lists in parts.items()}
+    symbols = {
+        part: symbols_in(e for expressions in lists.values() for e in expressions) - {system.time}
+        for part, lists in parts.items()
+    }
     used = sorted(set().union(*symbols.values()), key=str)
     constants = [x for x in used if x.is_Symbol]
     unknown = [x for x in used if not x.is_Symbol and x not in (*system.coordinates, *system.speeds)]
@@ -166,16 +201,28 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
         {part: Formulas(lists, leaves) for part, lists in parts.items()},
     )
     attributes = {
-        "coordinates": coordinates(" ".join(identifiers([str(x.func) for x in system.coordinates], "coordinate").values())),
+        "coordinates": coordinates(
+            " ".join(identifiers([str(x.func) for x in system.coordinates], "coordinate").values())
+        ),
         "speeds": speeds(" ".join(u_names.values())),
         "inputs": inputs(" ".join(identifiers([str(x.func) for x in unknown], "input").values())),
-        "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions are "
-                       f"from {system.origin.name}.",
+        "conventions": (
+            f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions are "
+            f"from {system.origin.name}."
+        ),
         "_expressions": expressions,
     }
-    parameters = {fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
-    return scene_class(SympyScene, name, "A scene from SymPy: "
-        f"{', '.join(pose.name for pose in poses)}.", parameters, attributes)
+    parameters = {
+        fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive))
+        for x in constants
+    }
+    return scene_class(
+        SympyScene,
+        name,
+        f"A scene from SymPy: {', '.join(pose.name for pose in poses)}.",
+        parameters,
+        attributes,
+    )
 
 
 def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str, Any], Any]:
@@ -213,7 +260,10 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
     samples = sampled(system, {f"{name} of rows": several for name, several in both.items()})
     formulas = Formulas(both, list(samples[0].leaves))
     for sample in samples:
-        given, implied = (affine(lambda at, name=name: formulas.numbers(at)[name], sample.leaves, system.speeds) for name in both)  # type: ignore[misc]
+        given, implied = (
+            affine(lambda at, name=name: formulas.numbers(at)[name], sample.leaves, system.speeds)
+            for name in both
+        )  # type: ignore[misc]
         left = given - given @ np.linalg.pinv(implied) @ implied
         # relative remainder of a row after the geometric rows
         kept |= largest(left, 1) > 1e-9 * largest(given, 1)
@@ -226,10 +276,17 @@ def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
     """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds
-        advice = "loads and constraints may contain speeds, not their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
+        advice = (
+            "loads and constraints may contain speeds, not their rates"
+            if speed
+            else f"make `{x.args[0]}` a coordinate or a speed"
+        )
         raise ValueError(f"`{x}` occurs, but no kinematic equation determines it; {advice}")
     if x in of_poses:
-        advice = "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a subclass"
+        advice = (
+            "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a"
+            " subclass"
+        )
         raise ValueError(
             f"`{x}` occurs in a position, an orientation or a configuration constraint, but is neither a "
             f"coordinate nor a speed; {advice}"
@@ -240,6 +297,8 @@ def _check_values(given: Mapping[str, float], names: set[str]) -> None:
     """Raise ValueError for constants without a value, and for values without a constant."""
     if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
-        raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each "
-            "constant, by symbol or name")
+        raise ValueError(
+            f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each "
+            "constant, by symbol or name"
+        )
     check_names(given, sorted(names), "`values` names `{}`, which does not occur in the system")

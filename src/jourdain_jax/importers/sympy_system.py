@@ -47,7 +47,9 @@ class MechanicalSystem:
 
     def is_constant(self, expression) -> bool:
         """Return whether it depends only on constants."""
-        return not expression.has(self.time) and not expression.atoms(sympy_package().core.function.AppliedUndef)
+        return not expression.has(self.time) and not expression.atoms(
+            sympy_package().core.function.AppliedUndef
+        )
 
 
 def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalSystem:
@@ -58,7 +60,11 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
     system = getattr(system, "method", None) or system  # of a JointsMethod
     if isinstance(system, mechanics.KanesMethod):
         read = _of_kane
-    elif type(system).__name__ == "System" and hasattr(system, "kdes") and hasattr(system, "holonomic_constraints"):
+    elif (
+        type(system).__name__ == "System"
+        and hasattr(system, "kdes")
+        and hasattr(system, "holonomic_constraints")
+    ):
         read, origin = _of_system, system.fixed_point if origin is None else origin
     else:
         raise ValueError(
@@ -66,37 +72,63 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
             "sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
         )
     check_kind(
-        origin, mechanics.Point, "`origin`",
-        "SymPy's point of origin for positions, such as Point('O')"
+        origin, mechanics.Point, "`origin`", "SymPy's point of origin for positions, such as Point('O')"
     )
     frame, rates, loads, *several = read(system)
     q, u, bodies, configuration, velocity, auxiliary = map(tuple, several)
     pairs = tuple((load[0], load[1]) for load in loads)
-    return MechanicalSystem(given, origin, frame, q, u, dict(rates), bodies, pairs, configuration, velocity, auxiliary)
+    return MechanicalSystem(
+        given, origin, frame, q, u, dict(rates), bodies, pairs, configuration, velocity, auxiliary
+    )
 
 
 def _of_kane(kane) -> tuple:
     if kane.bodies is None:
-        raise ValueError("the `KanesMethod` does not know its bodies; give it `bodies=` and `forcelist=`, or "
-            "call its `kanes_equations(bodies, loads)` first")
+        raise ValueError(
+            "the `KanesMethod` does not know its bodies; give it `bodies=` and `forcelist=`, or "
+            "call its `kanes_equations(bodies, loads)` first"
+        )
     try:
         rates = kane.kindiffdict()
     except AttributeError:
-        raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, the rates of the "
-            "coordinates in terms of the speeds") from None
+        raise ValueError(
+            "the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, the rates of the "
+            "coordinates in terms of the speeds"
+        ) from None
     velocity = kane._k_nh * kane.u + kane._f_nh if kane._f_nh else ()
-    return kane._inertial, rates, kane.forcelist or (), kane.q, kane.u, kane.bodies, kane._f_h, velocity, kane._uaux
+    return (
+        kane._inertial,
+        rates,
+        kane.forcelist or (),
+        kane.q,
+        kane.u,
+        kane.bodies,
+        kane._f_h,
+        velocity,
+        kane._uaux,
+    )
 
 
 def _of_system(system) -> tuple:
     sympy = sympy_package()
     q, kinematic = sympy.Matrix(system.q), sympy.Matrix(system.kdes)
     if len(kinematic) != len(q):
-        raise ValueError(f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; "
-            "add the missing ones by `add_kdes`")
+        raise ValueError(
+            f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; "
+            "add the missing ones by `add_kdes`"
+        )
     qdot = q.diff(sympy.physics.mechanics.dynamicsymbols._t)
     # kinematic = A qdot + b = 0
     solved = -kinematic.jacobian(qdot).LUsolve(kinematic.xreplace(dict.fromkeys(qdot, sympy.S.Zero)))
     loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
     rows = system.holonomic_constraints, system.velocity_constraints
-    return system.frame, zip(qdot, solved, strict=True), loads, q, system.u, system.bodies, *rows, system.u_aux
+    return (
+        system.frame,
+        zip(qdot, solved, strict=True),
+        loads,
+        q,
+        system.u,
+        system.bodies,
+        *rows,
+        system.u_aux,
+    )

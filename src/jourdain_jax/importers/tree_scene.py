@@ -42,7 +42,9 @@ class TreeScene(Scene):
                 R, origin = frames[link.name]
                 name = self._names[link.name]
                 mass, inertia = getattr(self, f"{name}_mass"), getattr(self, f"{name}_inertia")
-                found[link.name] = RigidBody(mass, inertia, _array(origin + R @ self._centre(link)), _array(R))
+                found[link.name] = RigidBody(
+                    mass, inertia, _array(origin + R @ self._centre(link)), _array(R)
+                )
         return found
 
     def loads(self, motion):
@@ -57,7 +59,9 @@ class TreeScene(Scene):
             for limits in (motor.control, motor.force):
                 push = push if limits is None else jnp.clip(push, *limits)
             if motor.push is None:
-                found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": motor.gear * push}))
+                found.append(
+                    generalized_force(motion, **{f"{self._names[motor.joint]}_rate": motor.gear * push})
+                )
             else:
                 found += self._of_push(motion, motor.push, push)
         return tuple(found)
@@ -67,20 +71,39 @@ class TreeScene(Scene):
         if not self._tree.ties:
             return {}
         q, found = self.coordinates.reference(), {}
-        q[[self.coordinate_names.entries.index(name) for name in self._tree.start]] = list(self._tree.start.values())
+        q[[self.coordinate_names.entries.index(name) for name in self._tree.start]] = list(
+            self._tree.start.values()
+        )
         now, stated = self._frames(pose.q), self._frames(self.coordinate_names.view(_array(q)))
-        moved = {j.name: pose.q[self._names[j.name]] - j.reference for link in self._tree.links for j in link.joints if j.kind in ("hinge", "slide")}
+        moved = {
+            j.name: pose.q[self._names[j.name]] - j.reference
+            for link in self._tree.links
+            for j in link.joints
+            if j.kind in ("hinge", "slide")
+        }
         for one in self._tree.ties:
             if isinstance(one, Follower):
-                expected = sum(c * moved.get(one.leader, 0.0) ** k for k, c in enumerate(one.coefficients) if c)
-                found[f"{one.joint} follows {one.leader}" if one.leader else f"{one.joint} is "
-                    "held"] = moved[one.joint] - expected
+                expected = sum(
+                    c * moved.get(one.leader, 0.0) ** k for k, c in enumerate(one.coefficients) if c
+                )
+                found[f"{one.joint} follows {one.leader}" if one.leader else f"{one.joint} is held"] = (
+                    moved[one.joint] - expected
+                )
                 continue
-            (R, r), (other_R, other_r), (S, s), (other_S, other_s) = now[one.link], now[one.other], stated[one.link], stated[one.other]
-            found[one.name] = r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
+            (R, r), (other_R, other_r), (S, s), (other_S, other_s) = (
+                now[one.link],
+                now[one.other],
+                stated[one.link],
+                stated[one.other],
+            )
+            found[one.name] = (
+                r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
+            )
             if one.turn:  # the vector part of the rotation since the stated pose
                 turned = R.T @ other_R @ other_S.T @ S
-                found[f"{one.name}, attitude"] = jnp.stack([turned[k - 1, k - 2] - turned[k - 2, k - 1] for k in range(3)])
+                found[f"{one.name}, attitude"] = jnp.stack(
+                    [turned[k - 1, k - 2] - turned[k - 2, k - 1] for k in range(3)]
+                )
         return found
 
     def visuals(self, pose):
@@ -90,7 +113,9 @@ class TreeScene(Scene):
         for link in self._tree.links:
             for look in link.looks:
                 if link.name in pose:
-                    found.setdefault(link.name, []).append(_visual(look, look.position - self._centre(link), look.turn))
+                    found.setdefault(link.name, []).append(
+                        _visual(look, look.position - self._centre(link), look.turn)
+                    )
                 else:
                     R, origin = frames[link.name]
                     found.setdefault("", []).append(_visual(look, origin + R @ look.position, R @ look.turn))
@@ -126,7 +151,13 @@ class TreeScene(Scene):
             yield Load(generalized={f"{name}_rate": -k * stretch}, potential=0.5 * k * stretch**2)
         if joint.damping:
             c = getattr(self, f"{name}_damping")
-            yield generalized_force(motion, **{speed: -c * motion.u[speed] for speed in coordinates(*parts_of(joint, name)).default_speeds})
+            yield generalized_force(
+                motion,
+                **{
+                    speed: -c * motion.u[speed]
+                    for speed in coordinates(*parts_of(joint, name)).default_speeds
+                },
+            )
 
 
 def _array(x) -> Float[Array, "*shape"]:
@@ -155,8 +186,14 @@ def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
         return R @ quaternion_to_matrix(q[f"{label}attitude"]), origin + R @ shift
     if joint.kind == "planar":
         across = _in_plane(joint.axis)
-        return R @ _about(joint.axis, q[f"{label}heading"]), origin + R @ (across[0] * q[f"{label}x"] + across[1] * q[f"{label}y"])
-    turn = quaternion_to_matrix(q[name]) if joint.kind == "ball" else _about(joint.axis, q[name] - joint.reference)
+        return R @ _about(joint.axis, q[f"{label}heading"]), origin + R @ (
+            across[0] * q[f"{label}x"] + across[1] * q[f"{label}y"]
+        )
+    turn = (
+        quaternion_to_matrix(q[name])
+        if joint.kind == "ball"
+        else _about(joint.axis, q[name] - joint.reference)
+    )
     held = origin + R @ joint.anchor
     R = R @ turn
     return R, held - R @ joint.anchor
@@ -177,7 +214,12 @@ def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
 
 
 def _visual(look: Look, at, turn) -> Visual:
-    options: dict[str, Any] = {"at": _array(at), "turn": _array(turn), "colour": look.colour, "opacity": look.opacity}
+    options: dict[str, Any] = {
+        "at": _array(at),
+        "turn": _array(turn),
+        "colour": look.colour,
+        "opacity": look.opacity,
+    }
     if look.kind == "mesh":
         mesh = _mesh(look.path)
         return Visual.mesh(mesh.faces.corners, mesh.faces.polygons, scale=np.array(look.size), **options)
@@ -199,7 +241,7 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     moving = tree.moving()
     if not moving:
         raise ValueError(
-            f'{source}: no joint moves a body; expected at least one moving joint, or a moving base, such as '
+            f"{source}: no joint moves a body; expected at least one moving joint, or a moving base, such as "
             'base="free"'
         )
     _check_masses(tree, source, ignore)
@@ -219,21 +261,35 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
             parameters |= _mass_parameters(link, name)
     for joint in joints:
         turns = joint.kind == "hinge"
-        for what, unit in (("damping", "N m s" if turns else "N s/m"), ("stiffness", "N m" if turns else "N/m")):
+        for what, unit in (
+            ("damping", "N m s" if turns else "N s/m"),
+            ("stiffness", "N m" if turns else "N/m"),
+        ):
             if getattr(joint, what):
-                parameters[f"{names[joint.name]}_{what}"] = parameter(getattr(joint, what), unit=unit, about=f"of {joint.name}")
+                parameters[f"{names[joint.name]}_{what}"] = parameter(
+                    getattr(joint, what), unit=unit, about=f"of {joint.name}"
+                )
     if np.any(tree.gravity):
         parameters["gravity"] = parameter(float(np.linalg.norm(tree.gravity)), unit="m/s^2")
-    limits = {names[joint.name]: joint.limits for joint in joints if joint.limits is not None and joint.kind in ("hinge", "slide")}
+    limits = {
+        names[joint.name]: joint.limits
+        for joint in joints
+        if joint.limits is not None and joint.kind in ("hinge", "slide")
+    }
     attributes = {
-        "coordinates": coordinates(*(part for joint in joints for part in parts_of(joint, names[joint.name]))),
+        "coordinates": coordinates(
+            *(part for joint in joints for part in parts_of(joint, names[joint.name]))
+        ),
         "inputs": inputs(" ".join(names[motor.name] for motor in tree.motors)),
         "domain": limits,
         "example": dict(tree.start),
         "_tree": tree,
         "_names": names,
     }
-    about = f"{tree.name}, from {source}: {', '.join(link.name for link in tree.links if link.name in moving and link.mass is not None)}."
+    about = (
+        f"{tree.name}, from {source}:"
+        f" {', '.join(link.name for link in tree.links if link.name in moving and link.mass is not None)}."
+    )
     return scene_class(TreeScene, tree.name, about, parameters, attributes)
 
 
@@ -243,11 +299,16 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     is_diagonal = not np.any(inertia - np.diag(np.diag(inertia)))
     found = {
         f"{name}_mass": parameter(link.mass.mass, unit="kg", positive=link.mass.mass > 0),
-        f"{name}_inertia": parameter(np.diag(inertia) if is_diagonal else inertia, unit="kg m^2", about="about its mass centre, along its axes"),
+        f"{name}_inertia": parameter(
+            np.diag(inertia) if is_diagonal else inertia,
+            unit="kg m^2",
+            about="about its mass centre, along its axes",
+        ),
     }
     if np.any(link.mass.centre):
-        found[f"{name}_mass_centre"] = parameter(link.mass.centre, unit="m", about="in the frame of "
-            f"{link.name}")
+        found[f"{name}_mass_centre"] = parameter(
+            link.mass.centre, unit="m", about=f"in the frame of {link.name}"
+        )
     return found
 
 
@@ -256,14 +317,22 @@ def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
     each other count together.
     """
     heavy: set[str] = set()
-    fixed: dict[str | None, list[Mass]] = {link.name: [] if link.mass is None else [link.mass] for link in tree.links} | {None: []}
+    fixed: dict[str | None, list[Mass]] = {
+        link.name: [] if link.mass is None else [link.mass] for link in tree.links
+    } | {None: []}
     for link in reversed(tree.links):
         if link.joints or link.parent is None:
             if fixed[link.name] and "inertia" not in ignore:
-                _check_moments(combined(fixed[link.name]), f"{source}: link "
-                                                           f"`{link.name}`{', with links fixed to it,' if len(fixed[link.name]) > 1 else ''}")
+                _check_moments(
+                    combined(fixed[link.name]),
+                    f"{source}: link "
+                    f"`{link.name}`{', with links fixed to it,' if len(fixed[link.name]) > 1 else ''}",
+                )
         else:
-            fixed[link.parent] += [Mass(m.mass, link.position + link.turn @ m.centre, link.turn @ m.inertia @ link.turn.T) for m in fixed[link.name]]
+            fixed[link.parent] += [
+                Mass(m.mass, link.position + link.turn @ m.centre, link.turn @ m.inertia @ link.turn.T)
+                for m in fixed[link.name]
+            ]
         if (link.mass is not None or link.name in heavy) and link.parent is not None:
             heavy.add(link.parent)
         if link.joints and link.mass is None and link.name not in heavy:

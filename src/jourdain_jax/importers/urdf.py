@@ -18,14 +18,27 @@ from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
 from jourdain_jax.scene.names import Labels, as_labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene
 
-_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
+_KINDS = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "floating": "free",
+    "planar": "planar",
+    "fixed": "",
+}
 _BASES = ("fixed", "planar", "free")
-_SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")}
+_SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {
+    kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")
+}
 # Supported contents of elements; all others raise an error. Contents without effect on the motion are idle,
 # or listed in a warning.
 _TABLE = {
-    "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor "
-        "ros2_control mujoco"),
+    "robot": Holds(
+        "name",
+        many="link joint material",
+        idle="version",
+        listed="transmission gazebo sensor ros2_control mujoco",
+    ),
     "link": Holds(
         "name",
         one="inertial",
@@ -45,13 +58,20 @@ _TABLE = {
     "mesh": Holds("filename scale"),
     "material": Holds("name", one="color", idle="texture"),
     "color": Holds("rgba"),
-    "joint": Holds("name type", one="parent child origin axis limit dynamics mimic", idle="dont_collapse", listed="calibration safety_controller"),
+    "joint": Holds(
+        "name type",
+        one="parent child origin axis limit dynamics mimic",
+        idle="dont_collapse",
+        listed="calibration safety_controller",
+    ),
     "parent": Holds("link"),
     "child": Holds("link"),
     "origin": Holds("xyz rpy"),
     "axis": Holds("xyz"),
-    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk command_effort "
-        "current gear_velocity"),
+    "limit": Holds(
+        "lower upper",
+        idle="effort velocity acceleration deceleration jerk command_effort current gear_velocity",
+    ),
     "dynamics": Holds("damping friction"),
     "mimic": Holds("joint multiplier offset"),
 }
@@ -115,15 +135,23 @@ class _Reader:
 
     def __init__(self, file: XmlFile, packages: Mapping[str, str], locked: Mapping[str, float]):
         self.file, self.packages = file, packages
-        self.locked = {name: float(checked_known(value, f"`locked` of `{name}`", (), advice="give one number")) for name, value in locked.items()}
+        self.locked = {
+            name: float(checked_known(value, f"`locked` of `{name}`", (), advice="give one number"))
+            for name, value in locked.items()
+        }
         self.links, self.joints = file.named("link"), file.named("joint")
         self.colours = {m.get("name"): Part(file, "a material", m) for m in file.root.findall("material")}
         if not self.links:
             raise file.fault("it has no links")
         for name in self.locked:
-            if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in ("hinge", "slide"):
-                raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; "
-                    f"{nearest(name, self.joints)}")
+            if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in (
+                "hinge",
+                "slide",
+            ):
+                raise ValueError(
+                    f"`locked` names `{name}`, which is not a joint with one coordinate; "
+                    f"{nearest(name, self.joints)}"
+                )
 
     def tree(self, base: str, motors: Labels, free: Labels) -> Tree:
         """Return the mechanism."""
@@ -131,17 +159,34 @@ class _Reader:
         for name, joint in self.joints.items():
             child, parent = (self._end(joint, which) for which in ("child", "parent"))
             if child in above:
-                raise self.file.fault(f"link `{child}` is the child of joints `{above[child][0]}` and "
-                    f"`{name}`; a link has one parent")
+                raise self.file.fault(
+                    f"link `{child}` is the child of joints `{above[child][0]}` and "
+                    f"`{name}`; a link has one parent"
+                )
             above[child] = name, parent
         roots = [name for name in self.links if name not in above]
         if len(roots) != 1:
-            found = f"links {', '.join(f'`{name}`' for name in roots)} have none" if roots else "there is a loop"
+            found = (
+                f"links {', '.join(f'`{name}`' for name in roots)} have none" if roots else "there is a loop"
+            )
             raise self.file.fault(f"expected one link without a parent, the root; {found}")
         at_root = () if base == "fixed" else (Joint("", base),)
-        links = [Link(roots[0], None, np.zeros(3), np.eye(3), at_root, *self._content(self.links[roots[0]], base != "fixed"))]
+        links = [
+            Link(
+                roots[0],
+                None,
+                np.zeros(3),
+                np.eye(3),
+                at_root,
+                *self._content(self.links[roots[0]], base != "fixed"),
+            )
+        ]
         for link in links:  # the list grows during the loop
-            links += [self._link(name, joint, parent) for name, (joint, parent) in above.items() if parent == link.name]
+            links += [
+                self._link(name, joint, parent)
+                for name, (joint, parent) in above.items()
+                if parent == link.name
+            ]
         if len(links) < len(self.links):
             lost = next(name for name in self.links if name not in {link.name for link in links})
             raise self.file.fault(
@@ -152,9 +197,18 @@ class _Reader:
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
         check_names(motors, names, "`motors` names `{}`, which is not a joint with one coordinate")
         mimics = {joint.name: self.joints[joint.name].child("mimic") for joint in joints if joint.name}
-        followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None)
+        followers = tuple(
+            self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None
+        )
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
-        return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free=free)
+        return Tree(
+            self.file.root.get("name") or "Robot",
+            tuple(links),
+            np.array([0.0, 0.0, -9.81]),
+            pushed,
+            followers,
+            free=free,
+        )
 
     def _end(self, joint: Part, which: str) -> str:
         link = joint.child(which).given.get("link")
@@ -170,20 +224,31 @@ class _Reader:
         joints, (position, turn) = (self._joint(joint, label, kind),) if _KINDS[kind] else (), _origin(joint)
         if label in self.locked:
             axis, value, joints = joints[0].axis, self.locked[label], ()
-            position, turn = (position + turn @ axis * value, turn) if kind == "prismatic" else (position, turn @ about(axis, value))
+            position, turn = (
+                (position + turn @ axis * value, turn)
+                if kind == "prismatic"
+                else (position, turn @ about(axis, value))
+            )
         return Link(name, parent, position, turn, joints, *self._content(self.links[name], bool(joints)))
 
     def _joint(self, joint: Part, name: str, kind: str) -> Joint:
         dynamics, limit = joint.child("dynamics"), joint.child("limit")
         damping = dynamics.number("damping", 0.0)
         if dynamics.number("friction", 0.0):
-            self.file.refuse("friction", f"the friction of {joint.what}", "state a smooth torque in `loads` "
-                "of a subclass")
+            self.file.refuse(
+                "friction", f"the friction of {joint.what}", "state a smooth torque in `loads` of a subclass"
+            )
         if damping < 0:
             raise dynamics.fault("damping", f"{damping:g}, expected a number >= 0")
         low, high = (limit.number(which, 0.0) for which in ("lower", "upper"))
         limits = (low, high) if low < high and kind in ("revolute", "prismatic") else None
-        return Joint(name, _KINDS[kind], joint.child("axis").direction("xyz", [1.0, 0.0, 0.0]), damping=damping, limits=limits)
+        return Joint(
+            name,
+            _KINDS[kind],
+            joint.child("axis").direction("xyz", [1.0, 0.0, 0.0]),
+            damping=damping,
+            limits=limits,
+        )
 
     def _follower(self, name: str, mimic: Part, names: list[str]) -> Follower:
         leader = mimic.given.get("joint") or ""
@@ -195,7 +260,10 @@ class _Reader:
 
     def _content(self, link: Part, moved: bool) -> tuple[Mass | None, tuple[Look, ...]]:
         """Return mass and shapes of a link."""
-        looks = [self._look(Part(self.file, f"visual of {link.what}", visual)) for visual in link.children("visual")]
+        looks = [
+            self._look(Part(self.file, f"visual of {link.what}", visual))
+            for visual in link.children("visual")
+        ]
         return self._mass(link, moved), tuple(look for look in looks if look is not None)
 
     def _mass(self, link: Part, moved: bool) -> Mass | None:
@@ -206,7 +274,9 @@ class _Reader:
             if not inertial.children(kind):
                 raise self.file.fault(f"{link.what} has an `inertial` without `{kind}`; give both")
         centre, turn = _origin(inertial)
-        xx, xy, xz, yy, yz, zz = (inertial.child("inertia").number(f"i{axes}") for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+        xx, xy, xz, yy, yz, zz = (
+            inertial.child("inertia").number(f"i{axes}") for axes in ("xx", "xy", "xz", "yy", "yz", "zz")
+        )
         inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
         return link.mass(inertial.child("mass").number("value"), centre, inertia, moved=moved)
 
@@ -214,8 +284,10 @@ class _Reader:
         geometry, material = visual.child("geometry"), visual.child("material")
         shapes = [] if geometry.element is None else list(geometry.element)
         if len(shapes) != 1:
-            raise self.file.fault(f"{visual.what} has {'several shapes' if shapes else 'no shape'} in its "
-                "`geometry`, expected one")
+            raise self.file.fault(
+                f"{visual.what} has {'several shapes' if shapes else 'no shape'} in its "
+                "`geometry`, expected one"
+            )
         if not material.children("color"):
             material = self.colours.get(material.given.get("name"), material)
         colour, opacity = material.child("color").colour()
@@ -225,7 +297,11 @@ class _Reader:
         path = None
         if kind in _SHAPES:
             look, words = _SHAPES[kind]
-            size = tuple(shape.numbers("size", 3)) if look == "box" else tuple(shape.number(word) for word in words)
+            size = (
+                tuple(shape.numbers("size", 3))
+                if look == "box"
+                else tuple(shape.number(word) for word in words)
+            )
         elif (path := self._mesh_path(shape.given.get("filename"))) is not None:
             look, size = "mesh", tuple(shape.numbers("scale", 3, [1.0] * 3))
         else:
@@ -242,7 +318,11 @@ class _Reader:
         folders, rest = [here], name.removeprefix("file://")
         if name.startswith("package://"):
             package, _, rest = name.removeprefix("package://").partition("/")
-            folders = [Path(self.packages[package])] if package in self.packages else [above / package for above in (here, *here.parents)]
+            folders = (
+                [Path(self.packages[package])]
+                if package in self.packages
+                else [above / package for above in (here, *here.parents)]
+            )
             folders += [above for above in here.parents if above.name == package]
         return next((str(folder / rest) for folder in folders if os.path.isfile(folder / rest)), None)
 

@@ -93,7 +93,11 @@ class XmlFile:
             tag, name = str(child.tag).rpartition("}")[2], child.get("name")
             if child.tag in holds.one.split() + holds.many.split():
                 inner = f"{kind}/{tag}" if f"{kind}/{tag}" in self.table else tag
-                self._check(child, f"{tag} `{name}`" if name and tag in holds.many.split() else f"`{tag}`{where}", inner)
+                self._check(
+                    child,
+                    f"{tag} `{name}`" if name and tag in holds.many.split() else f"`{tag}`{where}",
+                    inner,
+                )
             elif child.tag in holds.listed.split():
                 self.leave_out(child.tag)
             elif child.tag not in holds.idle.split():
@@ -113,10 +117,17 @@ class XmlFile:
         holds = self.table[kind]
         for name, value in attributes.items():
             if value not in holds.words.get(name, (value,)):
-                raise self.fault(f"`{name}` of {what} is `{shortened(value)}`; "
-                    f"{nearest(value, holds.words[name])}")
-            if name not in f"{holds.read} {holds.idle}".split() and not (name in holds.off and _is_off(value, holds.off[name])):
-                self.refuse(name.rpartition("}")[2], f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}', valid=holds.read)
+                raise self.fault(
+                    f"`{name}` of {what} is `{shortened(value)}`; {nearest(value, holds.words[name])}"
+                )
+            if name not in f"{holds.read} {holds.idle}".split() and not (
+                name in holds.off and _is_off(value, holds.off[name])
+            ):
+                self.refuse(
+                    name.rpartition("}")[2],
+                    f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}',
+                    valid=holds.read,
+                )
 
     def leave_out(self, what: str) -> None:
         """Record an omitted element without effect on the motion, or ignored by the user."""
@@ -127,14 +138,21 @@ class XmlFile:
         suggest.
         """
         if key not in self.ignore:
-            meant = "".join(f"did you mean `{name}`? Otherwise " for name in difflib.get_close_matches(key, valid.split(), 1, 0.7))
-            raise ValueError(f'{self.source}: {what} is not supported; {meant}{advice}, and give '
-                f'ignore=("{shortened(key)}",) to read the file without it')
+            meant = "".join(
+                f"did you mean `{name}`? Otherwise "
+                for name in difflib.get_close_matches(key, valid.split(), 1, 0.7)
+            )
+            raise ValueError(
+                f"{self.source}: {what} is not supported; {meant}{advice}, and give "
+                f'ignore=("{shortened(key)}",) to read the file without it'
+            )
 
     def warn(self) -> None:
         """Issue a warning that lists omitted elements, except those in `ignore`."""
         counted = {what: count for what, count in sorted(self._left_out.items()) if what not in self.ignore}
-        listed = [f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()]
+        listed = [
+            f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()
+        ]
         if listed:
             warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this")
 
@@ -172,7 +190,9 @@ class Part:
     it is missing.
     """
 
-    def __init__(self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None):
+    def __init__(
+        self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None
+    ):
         """Store the element; `attributes` replaces its own attributes."""
         self.file, self.what, self.element = file, what, element
         self.given: Mapping[str, str] = attributes or ({} if element is None else element.attrib)
@@ -197,10 +217,14 @@ class Part:
             if default is None:
                 raise self.file.fault(f"{what} is missing")
             return np.asarray(default, float)
-        found = np.array([number(x, f"{self.file.source}: {what}") for x in re.findall(r"[^ \t\r\n]+", text)], float)
+        found = np.array(
+            [number(x, f"{self.file.source}: {what}") for x in re.findall(r"[^ \t\r\n]+", text)], float
+        )
         if len(found) != (count or max(1, len(found))):
-            raise self.file.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} "
-                f"number{'' if count == 1 else 's'}")
+            raise self.file.fault(
+                f"{what} is `{shortened(text)}`, expected {count or 'finite'} "
+                f"number{'' if count == 1 else 's'}"
+            )
         return found
 
     def number(self, word: str, default: float | None = None) -> float:

@@ -56,8 +56,10 @@ class DiscreteGradient(FixedStepMethod):
         """
         fault = _fault(scene, field, asked)
         if fault:
-            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use "
-                "solver=jj.ImplicitMidpoint(step=...)")
+            raise ValueError(
+                f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use "
+                "solver=jj.ImplicitMidpoint(step=...)"
+            )
         return field
 
     def solve(self, args: tuple, t, y: Integrated, h) -> Solution:
@@ -72,7 +74,9 @@ def _solved(args, t, h, y: Integrated) -> Solution:
     guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
     found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, sizes(len(z0), z0, guess))
     change = jnp.where(found.converged, found.x, 0.0)
-    return Solution(Integrated(change[:n], change[n:], jax.tree.map(jnp.zeros_like, y.work)), None, found.converged)
+    return Solution(
+        Integrated(change[:n], change[n:], jax.tree.map(jnp.zeros_like, y.work)), None, found.converged
+    )
 
 
 @eqx.filter_jit  # traced once, and differentiated from that trace
@@ -97,7 +101,9 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
 
     def r(v):
         # m ydot + W' H_q, which does not contain the potential
-        return m @ _rates(args, t, q, v)[1] + W.T @ jax.grad(lambda q: _energy(args, t, jnp.concatenate([q, v]), n))(q)
+        return m @ _rates(args, t, q, v)[1] + W.T @ jax.grad(
+            lambda q: _energy(args, t, jnp.concatenate([q, v]), n)
+        )(q)
 
     velocity = jnp.linalg.solve(m, gbar[n:])  # m^-1 gbar_y
     J = jax.jacfwd(r)(v)
@@ -116,17 +122,26 @@ def _rates(args, t, q, v):
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """Return H = T + V in J."""
     field, scene, inputs, fixed, _ = args
-    return sum(energies_at(scene, field.motion(Instant(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t)))))
+    return sum(
+        energies_at(scene, field.motion(Instant(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))))
+    )
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:
     """Return why the method does not apply; empty if it does."""
     structure = structure_of(scene)
     if needs_work(scene, structure):
-        return "its T + V is not constant (loads without a potential, constraints that do work, or explicit time dependence)"
+        return (
+            "its T + V is not constant (loads without a potential, constraints that do work, or explicit time"
+            " dependence)"
+        )
     if names_of_position_rows(scene):
         return "its geometric constraints would need a projection after each step, which changes the energy"
     if field.independent is None:
-        way_out = "" if asked == "full" or not structure.affine else " (`jj.Formulation('minimal')` uses the independent speeds, where the motion allows it)"
+        way_out = (
+            ""
+            if asked == "full" or not structure.affine
+            else " (`jj.Formulation('minimal')` uses the independent speeds, where the motion allows it)"
+        )
         return f"all its speeds are integrated, but the method needs the minimal state{way_out}"
     return ""

@@ -47,7 +47,9 @@ def lagrangian(scene: Scene, t, q, u, inputs) -> Scalar:
     T, V = energies_at(scene, motion_at(scene, t, q, u, inputs))
     if gauge_of(scene, pose_at(scene, t, q)) is None:
         return T - V
-    return T - V - jax.jvp(lambda t, q: gauge_of(scene, pose_at(scene, t, q)), (t, q), (jnp.ones_like(t), u))[1]
+    return (
+        T - V - jax.jvp(lambda t, q: gauge_of(scene, pose_at(scene, t, q)), (t, q), (jnp.ones_like(t), u))[1]
+    )
 
 
 def momentum(scene: Scene, t, q, u, inputs) -> Speeds:
@@ -92,10 +94,14 @@ def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
         t, q = (over.t0 + over.t1) / 2, (q0 + q1) / 2
         force = half * _force(scene, t, q, v, inputs(t))
         return -d0 - force, d1 + force
-    return -d0 - half * _force(scene, over.t0, q0, v, inputs(over.t0)), d1 + half * _force(scene, over.t1, q1, v, inputs(over.t1))
+    return -d0 - half * _force(scene, over.t0, q0, v, inputs(over.t0)), d1 + half * _force(
+        scene, over.t1, q1, v, inputs(over.t1)
+    )
 
 
-def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int) -> Float[Array, "rows"]:
+def discrete_rows(
+    scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int
+) -> Float[Array, "rows"]:
     """Return all constraint residuals over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so
     that they vanish at every node.
     """
@@ -114,7 +120,11 @@ def _force(scene: Scene, t, q, u, inputs) -> Speeds:
     loads = resultants(scene, motion, conservative=False)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
     torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)  # body axes, as gamma
-    return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, torque) + loads.direct
+    return (
+        jnp.einsum("bik,bi->k", partial.linear, loads.force)
+        + jnp.einsum("bik,bi->k", partial.angular, torque)
+        + loads.direct
+    )
 
 
 class DiscreteLagrangeDAlembert(FixedStepMethod):
@@ -145,8 +155,9 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
 
     def __check_init__(self):
         if self.rule not in RULES:
-            raise ValueError(f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; "
-                f"{nearest(str(self.rule), RULES)}")
+            raise ValueError(
+                f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; {nearest(str(self.rule), RULES)}"
+            )
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """Return the full `field` of the state, without projection because the method satisfies the
@@ -156,11 +167,15 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)
         if fault:
-            raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use "
-                "solver=jj.ImplicitMidpoint(step=...)")
+            raise ValueError(
+                f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use "
+                "solver=jj.ImplicitMidpoint(step=...)"
+            )
         if asked == "minimal":
-            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of "
-                "its `Formulation` at 'auto'")
+            raise ValueError(
+                "`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of "
+                "its `Formulation` at 'auto'"
+            )
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
@@ -207,7 +222,10 @@ def _projected(args, over: Interval, q0, q1) -> Speeds:
     _, p1 = discrete_momenta(scene, over, q0, q1, inputs)
 
     def level(u):
-        here = momentum(scene, t1, q1, u, inputs(t1)), _kept(scene, velocity_residual(scene, t1, q1, u, inputs(t1)))
+        here = (
+            momentum(scene, t1, q1, u, inputs(t1)),
+            _kept(scene, velocity_residual(scene, t1, q1, u, inputs(t1))),
+        )
         return here, here
 
     (M, A), (b, phi) = jax.jacfwd(level, has_aux=True)(rest)
@@ -239,4 +257,9 @@ def _work(args, over: Interval, y: Integrated, q1, u1):
         return None
     field, scene, inputs, fixed, _ = args
     t = (over.t0 + over.t1) / 2
-    return over.h * field.rates(Instant(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t))).work
+    return (
+        over.h
+        * field.rates(
+            Instant(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t))
+        ).work
+    )

@@ -126,7 +126,9 @@ def trial(w, t, c, step, last, guess) -> tuple:
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
     xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
     safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
+    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (
+        c_2 - c_3
+    )
     share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
@@ -134,7 +136,9 @@ def trial(w, t, c, step, last, guess) -> tuple:
     # jumping values, nor is the mean slope of the whole step before any trial.
     slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
     slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
-    small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
+    small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (
+        w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2)
+    )
     zero = w.equal(c_1, 0.0)  # at the event, or beyond it if the value stays zero
     near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
     closed = (w.magnitude(width) <= 2.0 * tiny) | last
@@ -167,7 +171,9 @@ def search_of(form: Form, p: Lanes) -> Search:
     return Search(p.every("search_t"), c, step, left, shift, p.every("search_slope"))
 
 
-def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
+def _follow(
+    w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple
+) -> Number:
     """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time,
     values of all events, rates). `begins`: whether the event is in this step. Returns the index of the
     event that the search follows."""
@@ -178,7 +184,10 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
     t = _each(w, begins, (t_1, t_0, math.inf), _each(w, old.trying, narrowed_t, old.t))
     fresh_c = c_1, c_0, [math.nan] * len(c_1)
-    c = [_each(w, begins, a, _each(w, old.trying, b, kept)) for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True)]
+    c = [
+        _each(w, begins, a, _each(w, old.trying, b, kept))
+        for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True)
+    ]
     step = w.where(begins, w.magnitude(t_1 - t_0), old.step)
     left = w.where(begins, float(MOST_STEPS), w.larger(old.left - 1.0, 0.0))
     is_before = no_event(c[0])
@@ -192,7 +201,12 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     value, rate = chosen(w, first, c_1), chosen(w, first, rate_0)
     # stay within the bracket; a value that was zero shortly before belongs to another event
     to = t_1 - value / rate
-    usable = (old.left > 0.0) & (to > w.smaller(t[0], t[1]) - slack) & (to < w.larger(t[0], t[1]) + slack) & (w.magnitude(rate) < math.inf)
+    usable = (
+        (old.left > 0.0)
+        & (to > w.smaller(t[0], t[1]) - slack)
+        & (to < w.larger(t[0], t[1]) + slack)
+        & (w.magnitude(rate) < math.inf)
+    )
     slope = []
     for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
         mean = w.magnitude((b - a) / (t_1 - t_0))
@@ -200,7 +214,14 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     # its value beyond the event may be NaN
     newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)
     shift = w.where(trying, w.where(near, 0.0, tried - t_0), newton)
-    rows = {"t": t, "c": [x for part in c for x in part], "step": [step], "left": [left], "shift": [shift], "slope": slope}
+    rows = {
+        "t": t,
+        "c": [x for part in c for x in part],
+        "step": [step],
+        "left": [left],
+        "shift": [shift],
+        "slope": slope,
+    }
     for name, values in rows.items():
         p.put(f"search_{name}", _each(w, changes, values, p.every(f"search_{name}")))
     return first
@@ -238,7 +259,14 @@ def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sink
 
 
 def monitored(
-    w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
+    w: StepWriter,
+    form: Form,
+    p: Lanes,
+    k: tuple[Number, Number],
+    y1: Number,
+    new: dict[str, Number],
+    h: Number,
+    accept: Number,
 ) -> dict[str, Number]:
     """Return the result of a step `h` that may contain an event, or in which an event is being located;
     update `y1`. `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`:
@@ -257,7 +285,10 @@ def monitored(
         found = leaving(w, form, p, found)
         over = [w.literal(stops and not form.stopping, w.truth) for stops in form.stops]
         disarmed = [(off > 0.0) | passed for off, passed in zip(p.every("disarmed"), over, strict=True)]
-        return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
+        return [
+            [w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)]
+            for part, value in zip(found, (1.0, 0.0), strict=True)
+        ]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
         """Reverse the sign of events that were not left: rising above zero and falling
@@ -265,7 +296,10 @@ def monitored(
         if not form.goes_on:
             return found
         off = p.every("disarmed")
-        return [[w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)] for pair in zip(found, armed(found), strict=True)]
+        return [
+            [w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)]
+            for pair in zip(found, armed(found), strict=True)
+        ]
 
     at_begin = events(t, y, k[0])
     c_0, rate_0 = armed(at_begin)
@@ -291,7 +325,12 @@ def monitored(
     w.store(p["event"], first)
 
     def follow() -> None:
-        w.store(w.literal(_follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1)), w.real), first)
+        w.store(
+            w.literal(
+                _follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1)), w.real
+            ),
+            first,
+        )
 
     w.if_any(changes, follow)
     search = search_of(form, p)
@@ -302,13 +341,17 @@ def monitored(
 
     def state(i: int | Number) -> Number:
         after = w.load(y1, i)
-        return w.where(stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after))
+        return w.where(
+            stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after)
+        )
 
     each_row(w, form.integrated, y1, state)
     which = float(count - 1)
     for i in reversed(range(count - 1)):
         which = w.where(sunk[i] | sinks[i], i, which)
-    code = w.where(happened, LOCATING, w.where(found, result_codes.EVENT, w.where(locating, LOCATING, new["code"])))
+    code = w.where(
+        happened, LOCATING, w.where(found, result_codes.EVENT, w.where(locating, LOCATING, new["code"]))
+    )
     code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
     shorter = share * w.magnitude(h)
     p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of Taylor series, whose steps have no `h`
@@ -333,7 +376,10 @@ def monitored(
         p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
         left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
-        p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
+        p.put(
+            "disarmed",
+            [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)],
+        )
         rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
         side = is_side(w, form, changed["event"])  # one may vanish together with another
         flat = ~side & (over | is_flat(w, rate, slope))
@@ -361,7 +407,9 @@ def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
     return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
 
 
-def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
+def put_tangents(
+    w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number
+) -> None:
     """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each
     time tangent shifts the state along the directions e of which it is composed (values and rates before
     the event; NaN without slope),
@@ -390,7 +438,9 @@ def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, 
     w.if_any(found, put)
 
 
-def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
+def _move_rows(
+    w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number
+) -> None:
     """Add `dt` times rows of `k`, from row `rates` on, to rows of `y`, from row `rows` on."""
 
     def moved(i: int | Number) -> Number:

@@ -82,9 +82,24 @@ TSIT5 = _method(
         [2.8971530571054935, -6.359448489975075, 4.3622954328695815],
         [5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525],
         [5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383],
-        [0.09646076681806523, 0.01, 0.4798896504144996, 1.379008574103742, -3.290069515436081, 2.324710524099774],
+        [
+            0.09646076681806523,
+            0.01,
+            0.4798896504144996,
+            1.379008574103742,
+            -3.290069515436081,
+            2.324710524099774,
+        ],
     ],
-    [0.09468075576583945, 0.009183565540343254, 0.4877705284247616, 1.234297566930479, -2.7077123499835256, 1.866628418170587, 1 / 66],
+    [
+        0.09468075576583945,
+        0.009183565540343254,
+        0.4877705284247616,
+        1.234297566930479,
+        -2.7077123499835256,
+        1.866628418170587,
+        1 / 66,
+    ],
 )
 
 DOPRI5 = _method(
@@ -180,7 +195,13 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
     arrived = accept & w.equal(aim.t_1, p["last_goal"])
     code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, result_codes.MAX_STEPS, RUNNING)
     code = w.where(too_short, result_codes.STEP_TOO_SMALL, code)
-    return {"t": w.where(accept, aim.t_1, p["t"]), "h": next_h, "code": code, "accepted": accepted, "rejected": rejected}
+    return {
+        "t": w.where(accept, aim.t_1, p["t"]),
+        "h": next_h,
+        "code": code,
+        "accepted": accepted,
+        "rejected": rejected,
+    }
 
 
 def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
@@ -215,8 +236,15 @@ class Taylor(eqx.Module):
     order: int | None = static(default=None)
 
     def __check_init__(self) -> None:
-        if self.order is not None and (not isinstance(self.order, int) or isinstance(self.order, bool) or not LEAST_ORDER <= self.order <= MOST_ORDER):
-            raise ValueError(f"`order` is {self.order!r}, expected a whole number from {LEAST_ORDER} to {MOST_ORDER}, or None to choose it by the tolerance")
+        if self.order is not None and (
+            not isinstance(self.order, int)
+            or isinstance(self.order, bool)
+            or not LEAST_ORDER <= self.order <= MOST_ORDER
+        ):
+            raise ValueError(
+                f"`order` is {self.order!r}, expected a whole number from {LEAST_ORDER} to {MOST_ORDER}, or"
+                " None to choose it by the tolerance"
+            )
 
 
 def order_for(rtol: Number) -> int:

@@ -64,14 +64,18 @@ class FixedStepMethod(ImplicitMethod):
     even: ClassVar[bool] = True
 
     def __check_init__(self):
-        step = checked_unless_traced(self.step, f"`step` of `{self.name}`", (),
-            advice="pass the length of steps in s")
+        step = checked_unless_traced(
+            self.step, f"`step` of `{self.name}`", (), advice="pass the length of steps in s"
+        )
         if isinstance(step, np.ndarray) and not 0 < float(step) < np.inf:
             raise ValueError(
-                f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length in s")
+                f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length in s"
+            )
 
 
-def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
+def sizes(
+    unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]
+) -> Float[Array, "unknowns"]:
     """Return the size of each unknown, relative to which round-off is judged: the state x plus
     its change; 1 if both are zero.
     """

@@ -28,7 +28,17 @@ from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.calculus.reals import PerLane, as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, largest, real_type
+from jourdain_jax.calculus.reals import (
+    PerLane,
+    as_real,
+    checked_unless_traced,
+    compiled,
+    described,
+    in_default_precision,
+    is_traced,
+    largest,
+    real_type,
+)
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.program.eager import uncompiled_lanes
@@ -51,18 +61,25 @@ class TimeProgram:
         taken: list[tuple[Var, Literal]] = []
 
         def lifted(atoms):
-            return [lift(x) if isinstance(x, Literal) and x.aval.shape == () and x.aval.dtype == real else x for x in atoms]
+            return [
+                lift(x) if isinstance(x, Literal) and x.aval.shape == () and x.aval.dtype == real else x
+                for x in atoms
+            ]
 
         def lift(number: Literal) -> Var:
             taken.append((Var(number.aval), number))
             return taken[-1][0]
 
         jaxpr = closed.jaxpr
-        equations = [e.replace(invars=lifted(e.invars)) if e.primitive.name in _TAKE_NUMBERS else e for e in jaxpr.eqns]
+        equations = [
+            e.replace(invars=lifted(e.invars)) if e.primitive.name in _TAKE_NUMBERS else e for e in jaxpr.eqns
+        ]
         outputs = lifted(jaxpr.outvars)
         arguments = [*(v for v, _ in taken), *jaxpr.constvars, *jaxpr.invars]
         self.numbers = np.array([number.val for _, number in taken], real)  # not part of comparisons
-        self.closed = ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), [])
+        self.closed = ClosedJaxpr(
+            jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), []
+        )
         self._key = description(self.closed)
         self._hash = hash(self._key)
 
@@ -91,9 +108,17 @@ def _without_rules(described):
     """Return a description without custom derivative rules."""
     if not isinstance(described, tuple):
         return described
-    if len(described) == 4 and isinstance(described[0], Primitive) and described[0].name.startswith("custom_"):
+    if (
+        len(described) == 4
+        and isinstance(described[0], Primitive)
+        and described[0].name.startswith("custom_")
+    ):
         primitive, inputs, parameters, outputs = described
-        kept = tuple((name, _without_rules(value)) for name, value in parameters if isinstance(value, tuple | str | int | None))
+        kept = tuple(
+            (name, _without_rules(value))
+            for name, value in parameters
+            if isinstance(value, tuple | str | int | None)
+        )
         return primitive, inputs, kept, outputs
     return tuple(map(_without_rules, described))
 
@@ -111,7 +136,8 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time with its captured values, or None unless its value is a number; and its shape.
+    """Return a function of time with its captured values, or None unless its value is a number; and its
+    shape.
 
     A function is traced again if it is new, or if a value that it reads has changed (`scene/identity.py`).
     """
@@ -128,7 +154,9 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
         program = TimeProgram(closed, real)
         if kept.program is None or not kept.program.does_the_same_as(program):
             kept.program = program
-        found = FunctionOfTime(kept.program, jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts))
+        found = FunctionOfTime(
+            kept.program, jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts)
+        )
     if kept.again and found is not None and not is_traced(found):
         kept.now, kept.found = now, (found, shape)
     kept.again = True
@@ -207,7 +235,11 @@ class Inputs(eqx.Module):
 
     def __call__(self, t) -> Float[Array, "inputs"]:
         """Return the vector of inputs at time t."""
-        return jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels]) if self.channels else jnp.zeros(0)
+        return (
+            jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels])
+            if self.channels
+            else jnp.zeros(0)
+        )
 
     @property
     def constant(self) -> bool:
@@ -228,21 +260,26 @@ class Inputs(eqx.Module):
             said = str(error).splitlines()[0]
             raise ValueError(
                 "constraints depend on inputs and need their rates, but one cannot be differentiated "
-                    f"({said}); pass it as `jj.Sampled`"
+                f"({said}); pass it as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
 
 
 def in_phases(
-    inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
+    inputs: Inputs,
+    ts: Float[Array, "transitions"],
+    modes: Float[Array | np.ndarray, "modes transitions"],
+    direction,
 ) -> Inputs:
     """Return inputs whose modes change at each transition; missing transitions are at infinity."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
     values = iter(jax.lax.stop_gradient(modes))
-    phases = lambda channel: Mode(jnp.asarray(channel.value), ts, next(values), direction)  # noqa: E731
-    return Inputs(tuple(phases(channel) if isinstance(channel, Mode) else channel for channel in inputs.channels))
+    phases = lambda channel: Mode(jnp.asarray(channel.value), ts, next(values), direction)
+    return Inputs(
+        tuple(phases(channel) if isinstance(channel, Mode) else channel for channel in inputs.channels)
+    )
 
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
@@ -267,7 +304,9 @@ def _as_channel(f: Callable, where: str) -> Callable:
     try:
         channel, found = traced(f, real_type())
     except TypeError as error:
-        raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
+        raise ValueError(
+            f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}"
+        ) from None
     if not (hasattr(found, "shape") and hasattr(found, "dtype")):
         raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")
     if found.shape != ():
@@ -283,11 +322,16 @@ def as_inputs(scene: Scene, given) -> Inputs:
     """Return inputs from name -> number, function of time or `Sampled`; omitted ones are zero."""
     if isinstance(given, Inputs):
         if len(given.channels) != len(scene.inputs):
-            raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has "
-                f"{len(scene.inputs)} inputs; pass them by name")
+            raise ValueError(
+                f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has "
+                f"{len(scene.inputs)} inputs; pass them by name"
+            )
         return given
     if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
+        raise ValueError(
+            f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or"
+            " `jj.Sampled`"
+        )
     if not given and not scene.modes.pairs:
         return Inputs((_ZERO,) * len(scene.inputs))
     given = given or {}
@@ -299,13 +343,23 @@ def as_inputs(scene: Scene, given) -> Inputs:
         advice = "pass a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
         if name in modes:
-            channels.append(Mode(np.asarray(scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type())))
+            channels.append(
+                Mode(
+                    np.asarray(
+                        scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type()
+                    )
+                )
+            )
         elif isinstance(value, Sampled):  # checked on construction
             channels.append(value)
         elif callable(value):
             channels.append(_as_channel(value, where))
         else:
-            channels.append(_ZERO if value is _NOTHING else Constant(checked_unless_traced(value, where, (), advice=advice)))
+            channels.append(
+                _ZERO
+                if value is _NOTHING
+                else Constant(checked_unless_traced(value, where, (), advice=advice))
+            )
     return Inputs(tuple(channels))
 
 
@@ -314,25 +368,38 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
-            raise ValueError(f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
-                "loads and potentials may switch")
+            raise ValueError(
+                f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
+                "loads and potentials may switch"
+            )
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
-    for name, node, channel in zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True):
-        if isinstance(channel, Constant | Sampled) or not any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
+    for name, node, channel in zip(
+        scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True
+    ):
+        if isinstance(channel, Constant | Sampled) or not any(
+            depend_on(traced.graph, traced.at.phi.tolist(), [node])
+        ):
             continue
         with jax.ensure_compile_time_eval():  # all values are concrete, also inside a `jit`
             values, ts = uncompiled_lanes(channel), np.linspace(float(t0), float(t1), 257)[:, None]
-            for _, _, behind in jumps(lambda t, values=values: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:]):
+            for _, _, behind in jumps(
+                lambda t, values=values: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:]
+            ):
                 raise ValueError(
-                    f"input `{name}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s, but velocity constraints depend on it: {SPEEDS_WOULD_JUMP}"
+                    f"input `{name}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s, but velocity"
+                    f" constraints depend on it: {SPEEDS_WOULD_JUMP}"
                 )
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
     """Return the knots (times since `t0`) at which steps must end, of all samples in `holders`, in the order
     of the motion, without the times `ts`, then at least one infinite time. None without samples."""
-    samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
+    samples = [
+        x
+        for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled))
+        if isinstance(x, Sampled) and len(x.ts) > 1
+    ]
     if not samples:
         return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
@@ -341,7 +408,11 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
     share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
     # the choice of knots has no derivative, but their times do
     since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
-    ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))
+    ends = jnp.sort(
+        jnp.concatenate(
+            [(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]
+        )
+    )
     number = jax.lax.stop_gradient(since)
     after = jnp.clip(jnp.searchsorted(ends, number), 1, len(ends) - 1)
     is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
@@ -363,7 +434,10 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
         straight = (slope >= low) & (slope <= high)
         t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
         least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
-        low, high = jnp.where(straight, jnp.maximum(low, least), least), jnp.where(straight, jnp.minimum(high, most), most)
+        low, high = (
+            jnp.where(straight, jnp.maximum(low, least), least),
+            jnp.where(straight, jnp.minimum(high, most), most),
+        )
         return (t_a, v_a, t_k, v_k, low, high), ~straight
 
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
@@ -386,7 +460,9 @@ class SeenFromWithin(eqx.Module):
         at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
         k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
         after = jnp.minimum(k + 1, len(ts) - 1)
-        on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (values[after] - values[k])
+        on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (
+            values[after] - values[k]
+        )
         return jnp.where(at < knots[0], values[0], jnp.where(at > knots[-1], values[-1], on_line))
 
 
@@ -395,6 +471,10 @@ def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel
-        return SeenFromWithin(sampled, jax.lax.stop_gradient(middle)) if isinstance(sampled, Sampled) else channel
+        return (
+            SeenFromWithin(sampled, jax.lax.stop_gradient(middle))
+            if isinstance(sampled, Sampled)
+            else channel
+        )
 
     return Inputs(tuple(within(channel) for channel in inputs.channels))

@@ -12,7 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, pushed_by_jax, with_rules
+from jourdain_jax.calculus.derivatives import (
+    SECOND_ORDER_MESSAGE,
+    DifferentiationModeError,
+    Rules,
+    pushed_by_jax,
+    with_rules,
+)
 from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays
@@ -64,15 +70,22 @@ class OwnSteps(Integrator):
             return "another backend was requested"
         if not isinstance(self.solver, Method):
             return "the solver is implicit"
-        return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
+        return native_motion.reason_against(
+            setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order
+        )
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if setup.reason_against_machine_code:
-            run, pull, mover, reason = self._on_arrays, self._pulled_on_arrays, on_arrays.mover, lambda: SECOND_ORDER_MESSAGE
+            run, pull, mover, reason = (
+                self._on_arrays,
+                self._pulled_on_arrays,
+                on_arrays.mover,
+                lambda: SECOND_ORDER_MESSAGE,
+            )
         else:
             form = self._form(setup)
             run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)
-            reason = lambda: reason_against_derivatives(form, 2)  # noqa: E731
+            reason = lambda: reason_against_derivatives(form, 2)
         rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
         run = run if self.alongside else with_rules(run, rules)
         return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
@@ -87,11 +100,17 @@ class OwnSteps(Integrator):
         of, start, at_once = self._loop(setup, begun)
         return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
 
-    def _pulled_on_arrays(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
+    def _pulled_on_arrays(
+        self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved
+    ) -> tuple:
         """Return cotangents of varying values from the cotangents of the motion."""
         setup, begun = arguments
         of, start, at_once = self._loop(setup, begun)
-        varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
+        varies = [
+            v
+            for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True)
+            if eqx.is_array(x)
+        ]
         asked = tuple(i for i, v in enumerate(varies) if v)
         states = native_motion.cotangents_of_states(g)
         ends = g.y_end.rows, g.t_end, g.passed.ts[: of.form.transitions]
@@ -114,27 +133,45 @@ class OwnSteps(Integrator):
     def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
         """Return cotangents of varying values from the cotangents of the motion."""
         setup, begun = arguments
-        sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
+        sampled = [
+            channel
+            for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels)
+            if isinstance(channel, Sampled)
+        ]
         if any(jax.tree.leaves(sampled)):
             raise DifferentiationModeError(OF_SAMPLES)
         asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
         assert isinstance(self.solver, Method)
         start = native_motion.start_of(setup, begun)
-        by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, start, asked, self.memory, g)
+        by_start, by_known = native_motion.cotangents(
+            self._form(setup), self.solver, start, asked, self.memory, g
+        )
 
         def args(by_args: tuple) -> tuple:
             field, scene, inputs, fixed, origin = by_args
-            return field, scene, native_motion.with_known(inputs, by_known[len(fixed) :]), tuple(by_known[: len(fixed)]), origin
+            return (
+                field,
+                scene,
+                native_motion.with_known(inputs, by_known[len(fixed) :]),
+                tuple(by_known[: len(fixed)]),
+                origin,
+            )
 
         return _by_start(perturbed, arguments, by_start, args)
 
 
-def _by_start(perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]) -> tuple:
+def _by_start(
+    perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]
+) -> tuple:
     """Return cotangents of a setup and of its start from the cotangents of the state
     and of the rates' arguments.
     """
-    by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments)
-    return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None)
+    by_setup, by_begun = jax.tree.map(
+        lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments
+    )
+    return by_setup, eqx.tree_at(
+        lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None
+    )
 
 
 def own_steps(solver, **static) -> OwnSteps | None:
@@ -197,8 +234,12 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
         return setup, begun
     if program is not field.program:
         functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
-        fixed += tuple(jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel))
-        inputs = Inputs(tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)))
+        fixed += tuple(
+            jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel)
+        )
+        inputs = Inputs(
+            tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime))
+        )
     program = with_sides(program, has_events, native_motion.modes_among(inputs))
     inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * len(program.sides)))
     field = replace(field, program=program, stops=program.stops)
@@ -222,7 +263,9 @@ def _reason_against_sides(setup: Setup) -> str:
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
         return "the scene has no scalar program" if jump else ""
-    program, numbers = _relations(setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names))
+    program, numbers = _relations(
+        setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names)
+    )
     if not numbers:
         return ""
     if not setup.integrator.own:
@@ -233,7 +276,11 @@ def _reason_against_sides(setup: Setup) -> str:
         return "an event has no scalar form"
     if any(program.graph.op[n] in ARRAYS for n in program.fixed):
         return "the scene keeps parts as calls"
-    sampled = [n for n, channel in zip(program.traced.inputs.tolist(), others_of(setup.inputs), strict=True) if isinstance(channel, Sampled)]
+    sampled = [
+        n
+        for n, channel in zip(program.traced.inputs.tolist(), others_of(setup.inputs), strict=True)
+        if isinstance(channel, Sampled)
+    ]
     if set(sampled) & set(program.graph.reachable(numbers)):
         return "one depends on samples"
     return f"they are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
@@ -246,15 +293,25 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     """
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
-        functions = [(x.program, numbers_of(y)) for x, y in zip(inputs.channels, traced, strict=True) if isinstance(x, FunctionOfTime)]
+        functions = [
+            (x.program, numbers_of(y))
+            for x, y in zip(inputs.channels, traced, strict=True)
+            if isinstance(x, FunctionOfTime)
+        ]
         return loads_may_jump(scene) or any(may_jump(program, varies) for program, varies in functions)
     program, _ = _relations(field.lowered, inputs, False)
     left_out = [n for n in program.jumps if not watched or n not in program.sided]
     if not left_out:
         return False
-    lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
+    lowered = [
+        isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels
+    ]
     numbers = [varies for channel in compress(traced, lowered) for varies in numbers_of(channel)]
-    others = [any(jax.tree.leaves(channel)) for channel, is_lowered in zip(traced, lowered, strict=True) if not is_lowered]
+    others = [
+        any(jax.tree.leaves(channel))
+        for channel, is_lowered in zip(traced, lowered, strict=True)
+        if not is_lowered
+    ]
     count = len(program.traced.q) + len(program.independent)
     varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
     return any(depend_on(program.graph, left_out, compress(program.variables, varies)))

@@ -23,7 +23,9 @@ _NODES = np.array([(4 - np.sqrt(6)) / 10, (4 + np.sqrt(6)) / 10, 1.0])
 _POWERS = np.arange(1, 4)
 # collocation: sum_j a_ij c_j^(k-1) = c_i^k / k for k = 1, 2, 3
 _A = np.linalg.solve((_NODES[:, None] ** (_POWERS - 1)).T, (_NODES[:, None] ** _POWERS / _POWERS).T).T
-_REAL = 1 / next(float(value.real) for value in np.linalg.eigvals(np.linalg.inv(_A)) if abs(value.imag) < 1e-6)
+_REAL = 1 / next(
+    float(value.real) for value in np.linalg.eigvals(np.linalg.inv(_A)) if abs(value.imag) < 1e-6
+)
 _ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1.0])
 
 
@@ -66,6 +68,8 @@ class RadauIIA(ImplicitMethod):
         found = newton_root(equations, jnp.zeros(3 * n, x0.dtype), sizes(3 * n, x0, h * slope))
         z = found.x.reshape(3, n)
         one = jnp.eye(n, dtype=x0.dtype)
-        error = jnp.linalg.solve(one - h * _REAL * jax.vmap(along, 1, 1)(one), _REAL * h * slope + estimate @ z)
+        error = jnp.linalg.solve(
+            one - h * _REAL * jax.vmap(along, 1, 1)(one), _REAL * h * slope + estimate @ z
+        )
         error = jax.lax.stop_gradient(jnp.where(found.converged, jnp.abs(error), jnp.inf))
         return Solution(unravel(jnp.where(found.converged, z[2], 0.0)), unravel(error), found.converged)

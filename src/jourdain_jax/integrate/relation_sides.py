@@ -22,7 +22,12 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
         def stage(i: Number, _: tuple) -> tuple:
             time = w.fma(d, shares[i], t)
-            each_row(w, form.integrated, y, lambda row: w.fma(d * shares[i], w.load(f, row), w.load(p.pointer, row)))
+            each_row(
+                w,
+                form.integrated,
+                y,
+                lambda row: w.fma(d * shares[i], w.load(f, row), w.load(p.pointer, row)),
+            )
             w.run("rates", p.pointer, time, y, f, pivots)
             w.run("events", p.pointer, time, y, f, ahead, rates)
             each_row(w, form.events, values, lambda k: w.at_first(i, w.load(ahead, k), w.load(values, k)))

@@ -95,8 +95,7 @@ class Integrator(abc.ABC):
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
-        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
-        """
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it."""
 
     @abc.abstractmethod
     def solved(self, setup: "Setup", begun: "Begun") -> Solved:
@@ -136,14 +135,24 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        shares = {"ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype), "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
+        shares = {
+            "ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype),
+            "t0": 0.0,
+            "t1": 1.0,
+            "dt0": 0.1,
+            "longest": 1.0,
+        }
         # 1e-9 s, for motions that are not requested
-        return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x) for name, x in shares.items()})
+        return self._replace(
+            **{
+                name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x)
+                for name, x in shares.items()
+            }
+        )
 
     @property
     def reason_against_machine_code(self) -> str:
-        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it.
-        """
+        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it."""
         return self.integrator.reason_against_machine_code(self)
 
     def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
@@ -166,8 +175,7 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as given: without derivatives, and without a batch axis if all samples share them.
-    """
+    """Numbers of a motion as given: without derivatives, and without a batch axis if all samples share them."""
 
     times: dict  # as in a `Setup`
     known: tuple  # `native_motion.known_of`
@@ -193,4 +201,10 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     # times at an end of the span may lie beyond it by four units in the last place
     slack = 4 * eps_of(ts) * xp.maximum(xp.abs(t0), xp.abs(t1))
     from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
-    return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
+    return (
+        (direction != 0)
+        & xp.isfinite(t1 - t0)
+        & xp.all((ts[1:] - ts[:-1]) * direction > 0)
+        & (from_start >= -slack)
+        & (to_end >= -slack)
+    )

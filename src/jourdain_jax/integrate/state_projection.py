@@ -23,7 +23,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.derivatives import differentiated_as
-from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, rank_cutoff, real_type, static
+from jourdain_jax.calculus.reals import (
+    Count,
+    Entries,
+    Flag,
+    Scalar,
+    Speeds,
+    eps_of,
+    rank_cutoff,
+    real_type,
+    static,
+)
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.scaling import row_scale
@@ -42,7 +52,13 @@ from jourdain_jax.structure.plausibility import elsewhere, faults_at
 from jourdain_jax.structure.probes import coordinates_on_rows
 from jourdain_jax.structure.row_program import RowProgram, row_program
 from jourdain_jax.structure.sampling import NEARLY_INSIDE
-from jourdain_jax.structure.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
+from jourdain_jax.structure.structure import (
+    Structure,
+    closure_lengths,
+    plain_row_lengths,
+    structure_whatever_its_faults,
+    usual_rows,
+)
 
 OFF = 1e4  # a residual above this many eps is more than round-off
 
@@ -74,12 +90,24 @@ class State(Printed, eqx.Module):
 
     def _text(self) -> str:
         if self.q.ndim > 1:
-            return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
-        entries, values = (*self.names[0].entries, *self.names[1].entries), in_digits(np.concatenate([self.q, self.u]))
+            return (
+                f"States of shape {self.q.shape[:-1]}:"
+                f" {', '.join((*self.names[0].entries, *self.names[1].entries))}"
+            )
+        entries, values = (
+            (*self.names[0].entries, *self.names[1].entries),
+            in_digits(np.concatenate([self.q, self.u])),
+        )
         pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
-        moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
+        moved = (
+            f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual"
+            f" {self.residual:.1e}"
+        )
         if int(self.guess):
-            moved += f"; from guess {int(self.guess)}: omitted coordinates start elsewhere in the domain, because the reference led to no solution"
+            moved += (
+                f"; from guess {int(self.guess)}: omitted coordinates start elsewhere in the domain, because"
+                " the reference led to no solution"
+            )
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
@@ -114,16 +142,39 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
         # the stated domain, slightly widened, for coordinates on which constraints depend
-        bounded, more = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries], NEARLY_INSIDE * (high - low)
+        bounded, more = (
+            coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries],
+            NEARLY_INSIDE * (high - low),
+        )
         low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
         affine = structure_whatever_its_faults(scene).affine
-        return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), affine, determined, program)
+        return Usual(
+            closure_lengths(scene),
+            rows,
+            width,
+            low.astype(width.dtype),
+            high.astype(width.dtype),
+            affine,
+            determined,
+            program,
+        )
     except ValueError:  # the scene is invalid, which is reported when its structure is requested
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
+        return Usual(
+            np.zeros(geometric + norms),
+            np.zeros(len(names_of_rows(scene))),
+            width,
+            -np.inf * width,
+            np.inf * width,
+            False,
+            False,
+            None,
+        )
 
 
-def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+def put_positions(
+    scene: Scene, t, q, free, usual: Usual, known: tuple | None = None
+) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
     """Return the coordinates on the geometric constraints nearest to q, and the residual, without repeating
     the projection if both are `known`.
     """
@@ -151,11 +202,15 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
         return u, jnp.zeros(0, u.dtype)
 
     def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
-        near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by)
+        near_u = project_speeds(
+            scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by
+        )
         return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
 
     kind = "determined speeds" if determined else "speeds"
-    return _by_either(usual, kind, affine or determined, by_xla)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
+    return _by_either(usual, kind, affine or determined, by_xla)(
+        scene, jnp.asarray(t), q, u, inputs, free, usual.rows
+    )
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
@@ -207,7 +262,9 @@ def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray
 def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
     """Project a state as `consistent` does, as a part of a larger compiled function."""
     every_q, every_u = np.ones(len(start.q), bool), np.ones(len(start.u), bool)
-    return put_onto_constraints(scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
+    return put_onto_constraints(
+        scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None
+    )[0]
 
 
 def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Flag]:
@@ -216,13 +273,25 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
     The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
     """
-    given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
+    given_q, u, free, usual = (
+        jnp.asarray(start.q),
+        jnp.asarray(start.u),
+        jnp.asarray(start.free_q),
+        start.usual,
+    )
     q = given_q
     here, at, begin = jax.lax.stop_gradient((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
-    arrived, found = _arrived(begin, near_q, g, start), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
+    arrived, found = (
+        _arrived(begin, near_q, g, start),
+        _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True)),
+    )
     if guesses is not None and len(usual.closures):
-        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)), lambda: found)
+        other = jax.lax.cond(
+            eqxi.unvmap_any(~arrived),
+            lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)),
+            lambda: found,
+        )
         better = ~arrived & (left_of(other.g) <= left_of(g))
         found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
         q = jnp.where(better & free, found.begin, q)
@@ -232,9 +301,20 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
     left = jnp.concatenate([g, phi])
     right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
-    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
+    moved_q, moved_u, residual = (
+        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left)
+    )
     names = scene.coordinate_names, scene.speed_names
-    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(right, residual, jnp.inf), names, guess.astype(q.dtype))
+    state = State(
+        jnp.asarray(t),
+        near_q,
+        near_u,
+        moved_q,
+        moved_u,
+        jnp.where(right, residual, jnp.inf),
+        names,
+        guess.astype(q.dtype),
+    )
     return state, arrived
 
 
@@ -299,12 +379,14 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
     by = functions_of_rows(usual)
     given = by.given(scene)
     G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
-    low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
+    low, high = (
+        jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1))
+    )
     # coordinates on which no constraint depends stay
     every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(eps_of(q))
-    scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
+    scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))
     good = float(eps_of(q)) ** 0.5
     found, guess = first_root(scaled, every, size, tolerance, good, low, high)
     begin, met = jnp.where(free, found.x, q), found.left <= good
@@ -319,7 +401,12 @@ def contradiction(dtype) -> float:
     return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: for numbers with few digits
 
 
-def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
+def may_contradict(
+    scene: Scene,
+    known: Structure,
+    free_q: Bool[np.ndarray, "coordinates"],
+    free_u: Bool[np.ndarray, "speeds"],
+) -> bool:
     """Return whether held values (entries that are not free) may contradict each other.
     `known`: structure of the scene.
 
@@ -332,7 +419,9 @@ def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coo
     of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
     if of_speeds and not known.affine:
         return True
-    return (of_coordinates and _loses_rank(known.closure_slopes, free_q)) or (of_speeds and _loses_rank(known.row_slopes, free_u))
+    return (of_coordinates and _loses_rank(known.closure_slopes, free_q)) or (
+        of_speeds and _loses_rank(known.row_slopes, free_u)
+    )
 
 
 def _loses_rank(matrices, free) -> bool:
@@ -345,7 +434,10 @@ def row_functions(program: RowProgram) -> RowFunctions:
     use automatic differentiation.
     """
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
-    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > projection_kernel.LARGEST_PROGRAM:
+    if (
+        unsupported(program.graph, nodes)
+        or program.graph.operations(nodes) > projection_kernel.LARGEST_PROGRAM
+    ):
         return BY_AUTODIFF
     rows, speeds = len(program.phi), len(program.u)
     closures, coordinates = len(program.g), len(program.q)
@@ -356,7 +448,9 @@ def row_functions(program: RowProgram) -> RowFunctions:
         return [entries.get((i, k), program.graph.zero) for i in range(rows) for k in range(columns)]
 
     of_closures = values_of_nodes(program.graph, [*program.g, *matrix(program.G, closures, coordinates)], at)
-    of_rows = values_of_nodes(program.graph, [*program.phi, *matrix(program.A, rows, speeds)], [*at, *program.u, *program.inputs])
+    of_rows = values_of_nodes(
+        program.graph, [*program.phi, *matrix(program.A, rows, speeds)], [*at, *program.u, *program.inputs]
+    )
     M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
     of_masses = values_of_nodes(program.graph, matrix(M, speeds, speeds), at)
 
@@ -379,4 +473,6 @@ def row_functions(program: RowProgram) -> RowFunctions:
     def masses_at(given, t, q):
         return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
 
-    return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)
+    return RowFunctions(
+        closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of
+    )

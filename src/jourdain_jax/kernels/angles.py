@@ -32,7 +32,9 @@ def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
     """
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
-        return w.fma(polynomial(w, coefficients[1 - odd :: 2], square), x, polynomial(w, coefficients[odd::2], square))
+        return w.fma(
+            polynomial(w, coefficients[1 - odd :: 2], square), x, polynomial(w, coefficients[odd::2], square)
+        )
     total = w.number(coefficients[0])
     for c in coefficients[1:]:
         total = w.fma(total, x, c)
@@ -130,14 +132,23 @@ def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Cal
         w.store(value, place)
     with w.when(w.any(far)):
         for value, place, (name, function) in zip(quick, places, far_ones.items(), strict=True):
-            w.store(w.where(far, w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x), value), place)
+            w.store(
+                w.where(
+                    far,
+                    w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x),
+                    value,
+                ),
+                place,
+            )
     return [w.load(place) for place in places]
 
 
 def _sine_and_cosine(w: Writer, angle: Triple) -> DoubleDouble:
     (r, less), (most, more), quadrant = _waves(w, *angle)
     sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
-    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
+    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(
+        w, w.where(odd, sine, cosine), quadrant + 1
+    )
 
 
 def _tangent(w: Writer, angle: Triple) -> Value:
@@ -150,7 +161,10 @@ def _tangent(w: Writer, angle: Triple) -> Value:
     return head - over
 
 
-_FAR_SINE_AND_COSINE = {"far_sine": lambda w, angle: _sine_and_cosine(w, angle)[0], "far_cosine": lambda w, angle: _sine_and_cosine(w, angle)[1]}
+_FAR_SINE_AND_COSINE = {
+    "far_sine": lambda w, angle: _sine_and_cosine(w, angle)[0],
+    "far_cosine": lambda w, angle: _sine_and_cosine(w, angle)[1],
+}
 _FAR_TANGENT = {"far_tangent": _tangent}
 
 
@@ -277,7 +291,9 @@ def arctangent_of_two(w: Writer, y: Value, x: Value) -> Value:
     far = huge | _tiny(a) | _tiny(b)
     with w.when(w.any(far)):
         endless, scale = a.equals(math.inf) | b.equals(math.inf), w.where(huge, 2.0**-600, w.number(2.0**600))
-        near_a, near_b = (w.where(c.equals(math.inf), 1.0, w.where(endless, c - c, c * scale)) for c in (a, b))
+        near_a, near_b = (
+            w.where(c.equals(math.inf), 1.0, w.where(endless, c - c, c * scale)) for c in (a, b)
+        )
         found = _direction(w, near_a, w.intrinsic("copysign", near_b, x))
         flat = ~(w.converted("bitcast", x, w.whole) < 0) & (near_a < 2.0**-900) & (near_b > 2.0**-600)
         w.store(w.where(far, w.where(flat, a / b, found), w.load(place)), place)
@@ -321,7 +337,11 @@ def _arc(w: Writer, halves: Value, way: Value, s: Value, rest: Value) -> Value:
 def arcsine(w: Writer, x: Value) -> Value:
     """Return asin x."""
     large, s, rest = _of_half(w, x)
-    return w.intrinsic("copysign", _arc(w, w.where(large, 0.5, w.number(0.0)), w.where(large, -2.0, w.number(1.0)), s, rest), x)
+    return w.intrinsic(
+        "copysign",
+        _arc(w, w.where(large, 0.5, w.number(0.0)), w.where(large, -2.0, w.number(1.0)), s, rest),
+        x,
+    )
 
 
 def arccosine(w: Writer, x: Value) -> Value:
@@ -329,7 +349,9 @@ def arccosine(w: Writer, x: Value) -> Value:
     large, s, rest = _of_half(w, x)
     negative = x < 0.0
     halves = w.where(large, w.where(negative, 1.0, 0.0), 0.5)
-    return _arc(w, halves, w.where(large, 2.0, w.number(-1.0)) * w.where(negative, -1.0, w.number(1.0)), s, rest)
+    return _arc(
+        w, halves, w.where(large, 2.0, w.number(-1.0)) * w.where(negative, -1.0, w.number(1.0)), s, rest
+    )
 
 
 def _of_half(w: Writer, x: Value) -> Triple:

@@ -52,7 +52,7 @@ def version() -> tuple[int, int] | None:
     if found is None:
         warnings.warn(
             "this jaxlib has an unknown foreign function interface, so XLA integrates motions, more slowly; "
-                "install a supported version of jaxlib",
+            "install a supported version of jaxlib",
             stacklevel=2,
         )
     return found
@@ -80,8 +80,9 @@ def _stated_version() -> tuple[int, int] | None:
     except OSError:
         return None
     numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]
-    same = all(_members(header, struct) == "struct_size extension_start "
-        f"{rest}" for struct, rest in _LAYOUTS.items())
+    same = all(
+        _members(header, struct) == f"struct_size extension_start {rest}" for struct, rest in _LAYOUTS.items()
+    )
     functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[:5:4]
     if not same or functions != _FUNCTIONS or None in numbers:
         return None
@@ -109,8 +110,7 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes except the last 1 or 3. For a GPU the host has computed it.
-    """
+    """Return the product of the sizes of all axes except the last 1 or 3. For a GPU the host has computed it."""
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
     total = w.room(type="i64")
@@ -156,11 +156,15 @@ def answer_metadata(w: Writer, frame: Value) -> None:
 def _write_kernel(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write `kernel(words)`, which every thread of a GPU runs. The last result is scratch memory of the call.
-    """
-    with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
+    """Write `kernel(words)`, which every thread of a GPU runs. The last result is scratch memory of the call."""
+    with w.function(
+        KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"
+    ):
         words = Value(w, "ptr", "%words")
-        each = [Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
+        each = [
+            Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words)
+            for k in range(arguments + results + 1)
+        ]
         w.own = each[-1].data, last_size(w, each[-1])
         body(each[:arguments], each[arguments:-1])
         w.give()
@@ -180,17 +184,27 @@ def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callabl
     def converted(x, old, new):
         if old.dtype == new.dtype:
             return x
-        convert = mlir.lower_fun(lambda x: jax.lax.convert_element_type_p.bind(x, new_dtype=new.dtype, weak_type=False, sharding=None), multiple_results=False)
+        convert = mlir.lower_fun(
+            lambda x: jax.lax.convert_element_type_p.bind(
+                x, new_dtype=new.dtype, weak_type=False, sharding=None
+            ),
+            multiple_results=False,
+        )
         return convert(ctx.replace(primitive=None, avals_in=[old], avals_out=[new]), x)[0]
 
-    taken, found = ([x.update(dtype=np.dtype(np.float64), weak_type=False) for x in avals] for avals in (ctx.avals_in, ctx.avals_out))
-    results = call(ctx.replace(primitive=None, avals_in=taken, avals_out=[*found, *more]), *map(converted, arguments, ctx.avals_in, taken))
+    taken, found = (
+        [x.update(dtype=np.dtype(np.float64), weak_type=False) for x in avals]
+        for avals in (ctx.avals_in, ctx.avals_out)
+    )
+    results = call(
+        ctx.replace(primitive=None, avals_in=taken, avals_out=[*found, *more]),
+        *map(converted, arguments, ctx.avals_in, taken),
+    )
     return list(map(converted, results, found, ctx.avals_out))
 
 
 def registered(text: str, effort: int = 2) -> str:
-    """Register the handler of a module of LLVM IR and return its name; `effort`: as for `host.object_code`.
-    """
+    """Register the handler of a module of LLVM IR and return its name; `effort`: as for `host.object_code`."""
     name = _name(text, effort)
     register(name, text, "cpu", effort)
     return name
@@ -209,7 +223,11 @@ def register(name: str, text: str, platform: str, effort: int = 2) -> None:
     code = host.kept(_name(text, effort), host.description(), lambda: host.object_code(text, effort))
     with _REGISTERING:
         if name not in _REGISTERED:  # another thread may have registered it meanwhile
-            jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform=platform)
+            jax.ffi.register_ffi_target(
+                name,
+                capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None),
+                platform=platform,
+            )
             _REGISTERED.add(name)
 
 
@@ -235,7 +253,12 @@ def lanes_taken(w: Writer, job: Value, word: int) -> Value:
 def share(w: Writer, job: Value, count: Value) -> None:
     """Call the module's `loop(job)` in up to `w.threads` threads, fewer for small batches."""
     threads = w.threads
-    loop, nothing, others, started = Value(w, "ptr", "@loop"), w.null, w.room(threads, "i64"), w.room(type="i64")
+    loop, nothing, others, started = (
+        Value(w, "ptr", "@loop"),
+        w.null,
+        w.room(threads, "i64"),
+        w.room(type="i64"),
+    )
     w.store(w.literal(0, "i64"), started)
     how = w.room(16, "i64")  # a `pthread_attr_t`, which takes up to 64 bytes
     if threads > 1:

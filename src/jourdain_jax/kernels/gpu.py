@@ -47,15 +47,22 @@ def handler_text() -> str:
     _write_described(w)
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
-        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists come two words before
+        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists come two words
+        # before
         nothing, attributes = w.null, w.load(frame, 20, "ptr")
-        blocks, number = (w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in (_BLOCKS, _KERNEL))
+        blocks, number = (
+            w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in (_BLOCKS, _KERNEL)
+        )
         words, count = w.room(ffi.WORDS * ffi.MOST_BUFFERS, "i64"), w.room(type="i64")
         w.store(w.literal(0, "i64"), count)
         for of, buffers in ((ffi.ARGS - 2, ffi.ARGS), (ffi.RETS - 2, ffi.RETS)):
             with w.counted(w.load(frame, of, "i64")) as k:
                 place = w.load(count, type="i64")
-                w.run("described", w.load(w.load(frame, buffers, "ptr"), k, "ptr"), w.at(words, place * ffi.WORDS, "i64"))
+                w.run(
+                    "described",
+                    w.load(w.load(frame, buffers, "ptr"), k, "ptr"),
+                    w.at(words, place * ffi.WORDS, "i64"),
+                )
                 w.store(place + 1, count)
         scratch = w.load(words, (w.load(count, type="i64") - 1) * ffi.WORDS, "i64")
         table, entry = Value(w, "ptr", "@jourdain_jax_kernels"), w.room(type="i64")
@@ -67,23 +74,38 @@ def handler_text() -> str:
             w.store(place + _WORDS, entry)
         function = w.load(table, w.load(entry, type="i64") + _FUNCTION, "ptr")
         api, asked = w.load(frame, 2, "ptr"), w.room(4, "i64")
-        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load(frame, 3, "i64"), w.literal(0, "i64"))):
+        for word, value in enumerate(
+            (w.literal(32, "i64"), w.literal(0, "i64"), w.load(frame, 3, "i64"), w.literal(0, "i64"))
+        ):
             w.store(value, asked, word)
         failed = w.call(w.load(api, 10, "ptr"), "ptr", asked)  # `XLA_FFI_Stream_Get`
         w.give_where(w.converted("ptrtoint", failed, "i64").differs(0), failed)
         stream, code, parameters = w.load(asked, 3, "ptr"), w.room(type="i32"), w.room(type="ptr")
         w.store(words, parameters)
-        w.store(w.external("cuMemsetD32Async", "i32", scratch, w.literal(0, "i32"), w.literal(2, "i64"), stream), code)
+        w.store(
+            w.external("cuMemsetD32Async", "i32", scratch, w.literal(0, "i32"), w.literal(2, "i64"), stream),
+            code,
+        )
         one, zero = w.literal(1, "i32"), w.literal(0, "i32")
         with w.when(w.load(code, type="i32").equals(0)):
-            shape = [w.converted("trunc", blocks, "i32"), one, one, w.literal(nvidia.WARP, "i32"), one, one, zero]
+            shape = [
+                w.converted("trunc", blocks, "i32"),
+                one,
+                one,
+                w.literal(nvidia.WARP, "i32"),
+                one,
+                one,
+                zero,
+            ]
             w.store(w.external("cuLaunchKernel", "i32", function, *shape, stream, parameters, nothing), code)
         with w.when(w.load(code, type="i32").differs(0)):
             message, error = w.room(type="ptr"), w.room(4, "i64")
             w.external("cuGetErrorString", "i32", w.load(code, type="i32"), message)
             # out of memory in the driver is XLA's RESOURCE_EXHAUSTED, any other error INTERNAL
             kind = w.where(w.load(code, type="i32").equals(2), w.literal(8, "i64"), 13)
-            for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load(message, type="i64"), kind)):
+            for word, value in enumerate(
+                (w.literal(28, "i64"), w.literal(0, "i64"), w.load(message, type="i64"), kind)
+            ):
                 w.store(value, error, word)
             w.give(w.call(w.load(api, 6, "ptr"), "ptr", error))  # `XLA_FFI_Error_Create`
             w.place(w.label())
@@ -95,7 +117,12 @@ def _write_described(w: Writer) -> None:
     """Write `described(buffer, words)`, which fills in the words that describe an array to a kernel."""
     with w.function("described", "void", {"buffer": "ptr", "words": "ptr"}) as (buffer, words):
         x = ffi.given(w, buffer)
-        told = (w.converted("ptrtoint", x.data, "i64"), ffi.last_size(w, x), ffi.product(w, x, 1), ffi.product(w, x, 3))
+        told = (
+            w.converted("ptrtoint", x.data, "i64"),
+            ffi.last_size(w, x),
+            ffi.product(w, x, 1),
+            ffi.product(w, x, 3),
+        )
         for word, value in enumerate(told):
             w.store(value, words, word)
         w.give()
@@ -119,8 +146,13 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
         if number not in _kernels:
             if len(_kernels) == MOST_KERNELS:
                 raise RuntimeError(
-                    f"this process has compiled {MOST_KERNELS} GPU kernels, the maximum; start a new process")
-            ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
+                    f"this process has compiled {MOST_KERNELS} GPU kernels, the maximum; start a new process"
+                )
+            ptx = host.kept(
+                f"jourdain_jax_{digest.hexdigest()[:24]}",
+                made_by,
+                lambda: nvidia.text_for(text, nvidia.architecture()).encode(),
+            )
             _kernels[number] = found = nvidia.loaded(ptx, ffi.KERNEL)
             place = _WORDS * (len(_kernels) - 1)
             _table[place + _FUNCTION] = found.function
@@ -147,7 +179,11 @@ def lowered(
     slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
     blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # a grid needs at least one block
     each = min(4096, slots // blocks)  # slots per thread
-    scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,), dtype=np.dtype(np.float64), weak_type=False)
+    scratch = ctx.avals_out[0].update(
+        shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,),
+        dtype=np.dtype(np.float64),
+        weak_type=False,
+    )
     # arrays without batch axes have one axis, whose layout is unique
     own = [aval.shape[: len(batch)] == batch and k >= samples for k, aval in enumerate(ctx.avals_in)]
     layouts = {

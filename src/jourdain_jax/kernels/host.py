@@ -48,9 +48,21 @@ _engines: list = []  # own the machine code, and live as long as the process, wh
 
 
 # C functions that machine code calls. LLVM ends the process if one of them is missing.
-_CALLED = ("aligned_alloc", "free", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
+_CALLED = (
+    "aligned_alloc",
+    "free",
+    "memcpy",
+    "memset",
+    "pthread_attr_init",
+    "pthread_attr_setstacksize",
+    "pthread_create",
+    "pthread_join",
+)
 # Module with the syntax that llvmlite must understand; LLVM 15 and older do not.
-_TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x, splat (double 1.0)\n  ret <2 x double> %y\n}\n"
+_TRIAL = (
+    "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x,"
+    " splat (double 1.0)\n  ret <2 x double> %y\n}\n"
+)
 
 
 @functools.cache
@@ -109,12 +121,16 @@ def fuses() -> bool:
 @functools.cache
 def _machine(effort: int):
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=effort, jit=True)
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=effort, jit=True
+    )
 
 
 def description() -> str:
     """Return everything except the program on which machine code depends."""
-    machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    machine = (
+        f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    )
     return f"{EFFORT} {llvm.llvm_version_info} {machine}"
 
 
@@ -217,7 +233,7 @@ def _against(found: os.stat_result) -> str:
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
         f"the folder `{place}` is not used to cache machine code, which every process must then compile: "
-            f"{against}; set JOURDAIN_JAX_CACHE to a folder of your own (0: none)",
+        f"{against}; set JOURDAIN_JAX_CACHE to a folder of your own (0: none)",
         stacklevel=2,
     )
 

@@ -16,12 +16,18 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-_COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
+_COMPARED = {
+    "lt": ("olt", "slt"),
+    "le": ("ole", "sle"),
+    "gt": ("ogt", "sgt"),
+    "ge": ("oge", "sge"),
+    "eq": ("oeq", "eq"),
+    "ne": ("une", "ne"),
+}
 
 
 def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
-    """Return the method of values that appends this operation or comparison; `turned`: with swapped operands.
-    """
+    """Return the method of values that appends this operation or comparison; `turned`: with swapped operands."""
 
     def appended(self: "Value", other) -> "Value":
         a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)
@@ -83,9 +89,14 @@ class Writer:
     # functions and control
 
     @contextmanager
-    def function(self, name: str, result: str, arguments: dict[str, str], how: str = "internal", attributes: str = "") -> Iterator[list[Value]]:
+    def function(
+        self, name: str, result: str, arguments: dict[str, str], how: str = "internal", attributes: str = ""
+    ) -> Iterator[list[Value]]:
         """Write a function; yields its arguments (name -> type) as values."""
-        self._lines.append(f"define {how} {result} @{name}({', '.join(f'{type} %{n}' for n, type in arguments.items())}) nounwind {attributes} {{")
+        self._lines.append(
+            f"define {how} {result} @{name}({', '.join(f'{type} %{n}' for n, type in arguments.items())})"
+            f" nounwind {attributes} {{"
+        )
         self._entry = len(self._lines)
         yield [Value(self, type, f"%{n}") for n, type in arguments.items()]
         self._lines.append("}\n")
@@ -93,7 +104,10 @@ class Writer:
     @contextmanager
     def procedure(self, name: str, arguments: str) -> Iterator[list[Value]]:
         """Write a function without result; `arguments`: pointers, and others as `name:type`."""
-        known, pairs = {"": "ptr", "real": self.real, "noalias": "ptr noalias"}, (argument.partition(":") for argument in arguments.split())
+        known, pairs = (
+            {"": "ptr", "real": self.real, "noalias": "ptr noalias"},
+            (argument.partition(":") for argument in arguments.split()),
+        )
         types = {n: known.get(type, type) for n, _, type in pairs}
         with self.function(name, "void", types, attributes="noinline") as given:
             yield given
@@ -125,7 +139,11 @@ class Writer:
 
     def go(self, label: str, condition: Value | None = None, otherwise: str = "") -> None:
         """Jump to a label, or to `otherwise` if the condition does not hold."""
-        self._lines.append(f"  br label %{label}" if condition is None else f"  br i1 {condition.name}, label %{label}, label %{otherwise}")
+        self._lines.append(
+            f"  br label %{label}"
+            if condition is None
+            else f"  br i1 {condition.name}, label %{label}, label %{otherwise}"
+        )
 
     @contextmanager
     def when(self, condition: Value) -> Iterator[None]:
@@ -181,7 +199,9 @@ class Writer:
         if isinstance(number, Value):
             return number
         scalar = type.split(" x ")[-1].rstrip(">")
-        text = f"0x{struct.pack('>d', float(number)).hex().upper()}" if scalar == "double" else str(int(number))
+        text = (
+            f"0x{struct.pack('>d', float(number)).hex().upper()}" if scalar == "double" else str(int(number))
+        )
         return Value(self, type, text if scalar == type else f"splat ({scalar} {text})")
 
     def number(self, value: float) -> Value:
@@ -197,7 +217,10 @@ class Writer:
         """Return a comparison; with NaN only `ne` holds."""
         b, real = self.literal(b, a.type), "double" in a.type
         found = self.truth if a.type.startswith("<") else "i1"
-        return self.instruction(found, f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}")
+        return self.instruction(
+            found,
+            f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}",
+        )
 
     def is_nan(self, a: Value) -> Value:
         """Return whether a number is NaN."""
@@ -207,12 +230,16 @@ class Writer:
         """Return a where the condition holds, otherwise b."""
         like = a if isinstance(a, Value) else b if isinstance(b, Value) else self.number(0.0)
         a, b = self.literal(a, like.type), self.literal(b, like.type)
-        return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
+        return self.instruction(
+            a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}"
+        )
 
     def call(self, function: str | Value, result: str, *arguments: Value) -> Value:
         """Call a function, given by name or pointer, and return its result."""
         name = function.name if isinstance(function, Value) else f"@{function}"
-        return self.instruction(result, f"call {result} {name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
+        return self.instruction(
+            result, f"call {result} {name}({', '.join(f'{a.type} {a.name}' for a in arguments)})"
+        )
 
     def run(self, function: str, *arguments: Value) -> None:
         """Call a function that returns nothing."""
@@ -233,7 +260,12 @@ class Writer:
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
         """Return the result of a function that the module contains once; `body(w, *arguments)` writes it."""
         function = f"shared_{name}"
-        self.once(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, lambda w, *given: w.give(body(w, *given)))
+        self.once(
+            function,
+            self.real,
+            {f"a{i}": a.type for i, a in enumerate(arguments)},
+            lambda w, *given: w.give(body(w, *given)),
+        )
         return self.call(function, self.real, *arguments)
 
     def once(self, function: str, result: str, arguments: dict[str, str], body: Callable) -> None:
@@ -285,18 +317,25 @@ class Writer:
     def spread(self, a: Value) -> Value:
         """Return a scalar in all lanes."""
         first = self.instruction(self.real, f"insertelement {self.real} poison, double {a.name}, i64 0")
-        return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
+        return self.instruction(
+            self.real,
+            f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32>"
+            " zeroinitializer",
+        )
 
     def together(self, a: Value) -> Value:
         """Return whether a value is true in any thread of a warp, whose threads wait
         here. On a CPU, return the value.
         """
-        return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
+        return (
+            self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
+        )
 
     def thread(self) -> tuple[Value, Value]:
         """Return the index of a GPU thread and the number of threads."""
         block, size, own, blocks = (
-            self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64") for name in ("ctaid", "ntid", "tid", "nctaid")
+            self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64")
+            for name in ("ctaid", "ntid", "tid", "nctaid")
         )
         return block * size + own, blocks * size
 
@@ -324,7 +363,9 @@ class Writer:
     def at(self, pointer: Value, index, type: str = "") -> Value:
         """Return a pointer to the value with this index."""
         type = type or self.real
-        return self.instruction("ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}")
+        return self.instruction(
+            "ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}"
+        )
 
     def load(self, pointer: Value, index=0, type: str = "") -> Value:
         """Return a value from memory."""
@@ -333,11 +374,14 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, so that it occupies no register; on a GPU, the value itself.
-        """
+        """Return a value reloaded from memory, so that it occupies no register; on a GPU, the value itself."""
         if self.device:
             return value
-        return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
+        return (
+            self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}")
+            if value.place
+            else value
+        )
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
         """Return pointers to rows of memory, each in its own register, from which LLVM
@@ -352,7 +396,9 @@ class Writer:
 
     def counted_up(self, pointer: Value, index) -> Value:
         """Atomically increment an integer in memory and return its old value."""
-        return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
+        return self.instruction(
+            "i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic"
+        )
 
     def store(self, value, pointer: Value, index=0) -> Value:
         """Store a value, or one number for all lanes, in memory, and return it."""
@@ -364,7 +410,10 @@ class Writer:
 
 def _inlined(text: str) -> str:
     """Return a module that inlines small functions and those called once, and marks all others `noinline`."""
-    parts = {found[1]: found[0] for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)}
+    parts = {
+        found[1]: found[0]
+        for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)
+    }
     calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
     sizes: dict[str, int] = {}
 
@@ -373,8 +422,12 @@ def _inlined(text: str) -> str:
 
     def size(name: str) -> int:
         if name not in sizes:
-            written_out = {inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)}
-            sizes[name] = parts[name].count("\n") + sum(count * size(inner) for inner, count in written_out.items())
+            written_out = {
+                inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)
+            }
+            sizes[name] = parts[name].count("\n") + sum(
+                count * size(inner) for inner, count in written_out.items()
+            )
         return sizes[name]
 
     def is_small(name: str) -> bool:

@@ -78,7 +78,9 @@ def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Va
     near = w.fma(-turns, _LN2[0], x)  # exact
     r, less = two_sum(near, more - turns * _LN2[1])
     square = r * r
-    head, rest = two_sum(r, w.fma(square * r, polynomial(w, EXP[:-1], r), w.fma(square, EXP[-1], w.fma(less, r, less))))
+    head, rest = two_sum(
+        r, w.fma(square * r, polynomial(w, EXP[:-1], r), w.fma(square, EXP[-1], w.fma(less, r, less)))
+    )
     return k, head, rest
 
 
@@ -100,7 +102,9 @@ def _mantissa(w: Writer, x: Value) -> DoubleDouble:
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
     biased = w.binary("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
     m = w.converted("bitcast", bits - w.binary("shl", biased, 52) + _bits(1.0), w.real)
-    k = w.converted("bitcast", biased | _bits(2.0**52), w.real) - w.where(small, 2.0**52 + 1077, w.number(2.0**52 + 1023))
+    k = w.converted("bitcast", biased | _bits(2.0**52), w.real) - w.where(
+        small, 2.0**52 + 1077, w.number(2.0**52 + 1023)
+    )
     return k, m
 
 
@@ -170,7 +174,9 @@ def _root(w: Writer, head: Value, less: Value) -> DoubleDouble:
 def _logarithm_with(w: Writer, a: Value, x: Value, more: Value) -> Value:
     """Return log(1 + x + more), or log 2a if a is large."""
     large = a > 2.0**30
-    return _logarithm_of_more(w, w.where(large, a - 1.0, x), w.where(large, 0.0, more), w.where(large, math.log(2.0), w.number(0.0)))
+    return _logarithm_of_more(
+        w, w.where(large, a - 1.0, x), w.where(large, 0.0, more), w.where(large, math.log(2.0), w.number(0.0))
+    )
 
 
 def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
@@ -235,7 +241,9 @@ def three_halves_power(w: Writer, x: Value) -> Value:
     # x (root - sqrt(x)) = x (root^2 - x)/(root + sqrt(x)) = root (root^2 - x)/2
     rest = product_less(w, x, root, head) - 0.5 * root * product_less(w, root, root, x)
     # otherwise the low part over- or underflows
-    return w.where((x < 2.0**650) & (x > 2.0**-600), head + rest, w.where(x.equals(-math.inf), math.inf, head))
+    return w.where(
+        (x < 2.0**650) & (x > 2.0**-600), head + rest, w.where(x.equals(-math.inf), math.inf, head)
+    )
 
 
 def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
@@ -293,7 +301,9 @@ def hyperbolic_sine(w: Writer, x: Value) -> Value:
     head, less = _quarter_less_one(w, _within(w, a, 0.0, 710.5))
     q, over = quotient(w, (head, less), _plus(0.25, head, less))  # d/(1 + d)
     total, rest = two_sum(head, 0.25 * q)
-    return w.where(a < 2.0**-28, x, w.intrinsic("copysign", 2.0 * (total + (rest + w.fma(over, -0.25, less))), x))
+    return w.where(
+        a < 2.0**-28, x, w.intrinsic("copysign", 2.0 * (total + (rest + w.fma(over, -0.25, less))), x)
+    )
 
 
 def hyperbolic_cosine(w: Writer, x: Value) -> Value:
@@ -322,7 +332,9 @@ def logistic(w: Writer, x: Value) -> Value:
     head, less = two_sum(1.0, p)
     head, less = _scaled(w, head, k), _scaled(w, less + rest, k)
     negative = x < 0.0
-    q, over = quotient(w, (w.where(negative, head, 1.0), w.where(negative, less, 0.0)), _plus(1.0, head, less))
+    q, over = quotient(
+        w, (w.where(negative, head, 1.0), w.where(negative, less, 0.0)), _plus(1.0, head, less)
+    )
     return q - over
 
 
@@ -382,4 +394,6 @@ def _power(w: Writer, x: Value, y: Value) -> Value:
     return _shared("pow", w, x, y)
 
 
-FUNCTIONS: dict[str, Callable[..., Value]] = {name: partial(_shared, name) for name in BY_POLYNOMIALS} | {"pow": _power} | _BY_INSTRUCTIONS
+FUNCTIONS: dict[str, Callable[..., Value]] = (
+    {name: partial(_shared, name) for name in BY_POLYNOMIALS} | {"pow": _power} | _BY_INSTRUCTIONS
+)

@@ -103,7 +103,10 @@ def _capabilities() -> list[int]:
     GPU runs code for older ones.
     """
     major, minor = 75, 76  # attributes of a device
-    own = [10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device) for device in _devices()]
+    own = [
+        10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device)
+        for device in _devices()
+    ]
     return [known for known in (75, 80, 86, 89, 90, 100, 120) if known <= min(own)]
 
 
@@ -147,10 +150,16 @@ def loaded(text: bytes, name: str) -> Loaded:
     """Return the kernel of this name in PTX."""
     with _in_context():
         library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
-        _checked(driver().cuLibraryLoadData(ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0))
+        _checked(
+            driver().cuLibraryLoadData(
+                ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0
+            )
+        )
         _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
         # attributes of a kernel: 3 bytes of local memory, 4 registers
-        return Loaded(kernel.value or 0, *(_said("cuKernelGetAttribute", attribute, kernel, 0) for attribute in (3, 4)))
+        return Loaded(
+            kernel.value or 0, *(_said("cuKernelGetAttribute", attribute, kernel, 0) for attribute in (3, 4))
+        )
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:

@@ -30,7 +30,9 @@ class Turn:
     stored: list[tuple[int, int]] = field(default_factory=list)
 
 
-def turns(uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int) -> tuple[list[Turn], int]:
+def turns(
+    uses: Sequence[tuple[int, Iterable[int]]], there: Collection[int], registers: int
+) -> tuple[list[Turn], int]:
     """Return the loads and stores (a `Turn`) for each computed value, and the number of memory slots.
 
     `uses`: the values in order, each with its operands; `there`: values that are already in memory. A slot is
@@ -90,11 +92,15 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
     return ""
 
 
-def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
+def written(
+    w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
+) -> list[Value]:
     """Return the values of the outputs, given inputs and known nodes. `by_llvm`: let
     LLVM allocate the registers.
     """
-    return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]
+    return [
+        value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))
+    ]
 
 
 def written_in_turn(
@@ -107,7 +113,9 @@ def written_in_turn(
     for number, node in enumerate(outputs):
         numbers.setdefault(node, []).append(number)
     needed = graph.needed(numbers, known)
-    values: dict[int, Value] = dict(known) | {n: w.number(graph.value[n]) for n in needed if graph.op[n] == "const"}
+    values: dict[int, Value] = dict(known) | {
+        n: w.number(graph.value[n]) for n in needed if graph.op[n] == "const"
+    }
     yield from ((number, values[node]) for node in numbers if node in values for number in numbers[node])
     fusible = _used_once_in_a_sum(graph, needed, numbers)
     steps = [(n, _made_of(graph, n, fusible)) for n in needed if n not in values and n not in fusible]
@@ -129,8 +137,7 @@ def written_in_turn(
 
 
 class _AtHand:
-    """Spills values of a long function to memory and reloads them before their next use, as `turns` decides.
-    """
+    """Spills values of a long function to memory and reloads them before their next use, as `turns` decides."""
 
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
         self.w, self.values, self.places = w, values, dict(values)
@@ -149,7 +156,9 @@ class _AtHand:
         for node, row in self.turns[i].stored if self.turns else ():
             if self.values[node].type == self.w.real:
                 which = row // (2 * REACH)
-                self.places[node] = self.w.store(self.values[node], self.rooms[which], row - (2 * which + 1) * REACH)
+                self.places[node] = self.w.store(
+                    self.values[node], self.rooms[which], row - (2 * which + 1) * REACH
+                )
             else:
                 self.places[node] = self.values[node]
 
@@ -179,7 +188,12 @@ def _operation(w: Writer, op: str, args: list[Value]) -> Value:
 
 def _made_of(graph: Graph, node: int, fusible: set[int]) -> list[int]:
     """Return operands of a node after fusing multiply-adds, without constants."""
-    return [b for a in graph.args[node] for b in (graph.args[a] if a in fusible else (a,)) if graph.op[b] != "const"]
+    return [
+        b
+        for a in graph.args[node]
+        for b in (graph.args[a] if a in fusible else (a,))
+        if graph.op[b] != "const"
+    ]
 
 
 def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[int]) -> set[int]:
@@ -194,14 +208,20 @@ def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[in
     return {n for n in products if users.get(n) in (["add"], ["sub"])}
 
 
-def _fused(w: Writer, graph: Graph, op: str, args: tuple[int, ...], fusible: set[int], values: Mapping[int, Value]) -> Value:
+def _fused(
+    w: Writer, graph: Graph, op: str, args: tuple[int, ...], fusible: set[int], values: Mapping[int, Value]
+) -> Value:
     """Return x y + b, b - x y or x y - b as a fused multiply-add. If both terms are
     products, the first one is fused.
     """
     which = 0 if args[0] in fusible else 1
     x, y = (as_real(w, values[a]) for a in graph.args[args[which]])
     other = args[1 - which]
-    b = FUNCTIONS["mul"](w, *(as_real(w, values[a]) for a in graph.args[other])) if other in fusible else as_real(w, values[other])
+    b = (
+        FUNCTIONS["mul"](w, *(as_real(w, values[a]) for a in graph.args[other]))
+        if other in fusible
+        else as_real(w, values[other])
+    )
     if op == "sub":
         x, b = (x, -b) if which == 0 else (-x, b)
     return w.fma(x, y, b)

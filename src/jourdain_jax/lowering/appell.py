@@ -42,8 +42,16 @@ class Strategy:
     @property
     def description(self) -> str:
         """Describe the strategy for the summary."""
-        way = "dependent speeds substituted before differentiation" if self.explicit else "constraints differentiated through body velocities"
-        solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
+        way = (
+            "dependent speeds substituted before differentiation"
+            if self.explicit
+            else "constraints differentiated through body velocities"
+        )
+        solved = (
+            "accelerations by determinants in normal form"
+            if self.by_determinants
+            else "accelerations by elimination"
+        )
         return f"{way}, {solved}"
 
 
@@ -67,7 +75,9 @@ class Equations:
 class AppellOnGraph:
     """Builder of the equations of one scene."""
 
-    def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference):
+    def __init__(
+        self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference
+    ):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         rows_work = not (structure.affine and structure.homogeneous)
         self.forces_work = rows_work or structure.driven or structure.varying_inertia
@@ -100,21 +110,37 @@ class AppellOnGraph:
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
         at = self.traced.at
         of_state = self._of_state(at.resets)
-        outputs = iter(self.graph.substituted([*at.slip_turns.tolist(), *at.events.tolist(), *of_state, *at.energies.tolist()], true_z))
-        turns, events, resets, (T, V) = (list(islice(outputs, n)) for n in (len(at.slip_turns), len(at.events), len(of_state), 2))
+        outputs = iter(
+            self.graph.substituted(
+                [*at.slip_turns.tolist(), *at.events.tolist(), *of_state, *at.energies.tolist()], true_z
+            )
+        )
+        turns, events, resets, (T, V) = (
+            list(islice(outputs, n)) for n in (len(at.slip_turns), len(at.events), len(of_state), 2)
+        )
         qdot = [*qdot[: len(qdot) - len(turns)], *turns]
         if not self.forces_work:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
-            power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
+            power = (
+                power
+                if equal(self.identity_probes([power]), self.identity_probes([true_power])).all()
+                else true_power
+            )
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
-        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares)
+        return Equations(
+            qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares
+        )
 
     def _of_state(self, resets: np.ndarray) -> NodeList:
         """Return the state changes at events, without dependent speeds."""
         first = len(self.traced.q)
-        return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist() if resets.size else []
+        return (
+            np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist()
+            if resets.size
+            else []
+        )
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
@@ -128,7 +154,9 @@ class AppellOnGraph:
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
         # constraints fix the others, but have derivatives with respect to them
         varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))
-        closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(varying)))
+        closure = g.substituted(
+            closure, unaffected(self.identity_probes, closure, self._at_reference(varying))
+        )
         moved = list(q)
         if closure:
             moved = projected_coordinates(g, q, [*closure, *self.traced.closures[len(at.closure) :]])
@@ -152,7 +180,8 @@ class AppellOnGraph:
         """Return the power of loads without a potential, of explicit time in potentials, of constraints that
         do work, of prescribed poses, and of changing masses.
 
-        `sum (m a - F).v + (I alpha + omega x I omega - L).omega - Q_direct.u + (mdot v.v + omega.(dI/dt omega))/2`
+        `sum (m a - F).v + (I alpha + omega x I omega - L).omega - Q_direct.u + (mdot v.v + omega.(dI/dt
+        omega))/2`
         """
         g, at = self.graph, k.at
         if not self.forces_work:
@@ -160,14 +189,22 @@ class AppellOnGraph:
         terms = [int(at.power)]
         if self.structure.varying_inertia:
             raw = [*self.traced.at.mass.tolist(), *self.traced.at.inertia.ravel().tolist()]
-            mass_rates, inertia_rates = np.split(np.array(k.rates_along_motion(raw), np.int64), [len(at.mass)])
-            for b, (rate, of_inertia) in enumerate(zip(mass_rates.tolist(), inertia_rates.reshape(-1, 3, 3).tolist(), strict=True)):
+            mass_rates, inertia_rates = np.split(
+                np.array(k.rates_along_motion(raw), np.int64), [len(at.mass)]
+            )
+            for b, (rate, of_inertia) in enumerate(
+                zip(mass_rates.tolist(), inertia_rates.reshape(-1, 3, 3).tolist(), strict=True)
+            ):
                 v, omega = at.v[b].tolist(), at.omega[b].tolist()
-                gained = g.add(g.mul(rate, g.dot(v, v)), g.dot(omega, [g.dot(row, omega) for row in of_inertia]))
+                gained = g.add(
+                    g.mul(rate, g.dot(v, v)), g.dot(omega, [g.dot(row, omega) for row in of_inertia])
+                )
                 terms.append(g.mul(g.const(0.5), gained))
         for b in range(len(at.mass)):
             a = [g.add(a0, g.dot([beta[b][i] for beta in k.beta], ydot)) for i, a0 in enumerate(k.a0[b])]
-            alpha = [g.add(a0, g.dot([gamma[b][i] for gamma in k.gamma], ydot)) for i, a0 in enumerate(k.alpha0[b])]
+            alpha = [
+                g.add(a0, g.dot([gamma[b][i] for gamma in k.gamma], ydot)) for i, a0 in enumerate(k.alpha0[b])
+            ]
             force, torque = self._inertia_resultants(at, b, a, alpha)
             for i in range(3):
                 terms.append(g.mul(g.sub(force[i], int(at.force[b][i])), int(at.v[b][i])))
@@ -175,12 +212,19 @@ class AppellOnGraph:
         u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
-    def _inertia_resultants(self, at: VelocityQuantities, b: int, a: NodeList, alpha: NodeList) -> tuple[NodeList, NodeList]:
+    def _inertia_resultants(
+        self, at: VelocityQuantities, b: int, a: NodeList, alpha: NodeList
+    ) -> tuple[NodeList, NodeList]:
         """Return `m a` and `I alpha + omega x I omega` of body b."""
         g, inertia, omega = self.graph, at.inertia[b].tolist(), at.omega[b].tolist()
         momentum = [g.dot(row, omega) for row in inertia]
-        gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
-        return [g.mul(int(at.mass[b]), x) for x in a], [g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)]
+        gyroscopic = [
+            g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2]))
+            for i in range(3)
+        ]
+        return [g.mul(int(at.mass[b]), x) for x in a], [
+            g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)
+        ]
 
     def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> NodeList:
         if by_determinants and 1 <= len(f) <= 3:
@@ -190,7 +234,9 @@ class AppellOnGraph:
                 pass
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
-    def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[NodeList, NodeList, NodeList]:
+    def _true_rates(
+        self, kinematics: "_Kinematics", forms: NormalForms
+    ) -> tuple[NodeList, NodeList, NodeList]:
         """Return dependent speeds and coordinate rates with no coordinate fixed, and new pivots."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
@@ -200,19 +246,34 @@ class AppellOnGraph:
         y = {k: u[k] for k in self.independent}
 
         def solved(columns, known):
-            right = [[g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))] for row, rest in zip(A, phi_0, strict=True)]
+            right = [
+                [g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))]
+                for row, rest in zip(A, phi_0, strict=True)
+            ]
             return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes, self.far)
 
         whole = solved(self.dependent, y)
         generic = self.identity_probes
-        same = equal(generic(kinematics.z), generic([row[0] for row in whole.solution]), pivots_ok(whole.pivots, generic))
+        same = equal(
+            generic(kinematics.z),
+            generic([row[0] for row in whole.solution]),
+            pivots_ok(whole.pivots, generic),
+        )
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
         A, phi_0 = [forms.all_simplified(row) for row in A], forms.all_simplified(phi_0)
         found = solved(left, known)
         known |= {k: row[0] for k, row in zip(left, map(forms.all_simplified, found.solution), strict=True)}
         z = [known[k] for k in self.dependent]
-        return z, forms.all_simplified(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
+        return (
+            z,
+            forms.all_simplified(
+                g.substituted(
+                    at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent}
+                )
+            ),
+            found.pivots,
+        )
 
     def _forms(self, most_terms: int) -> NormalForms:
         squares: dict[int, Polynomial] = {}
@@ -227,17 +288,30 @@ class AppellOnGraph:
         M = [[g.zero] * len(freedoms) for _ in freedoms]
         f = [g.zero] * len(freedoms)
         for i in freedoms:
-            f[i] = g.total([int(at.direct[self.independent[i]]), *(g.mul(row[i], int(at.direct[d])) for row, d in zip(k.B, self.dependent, strict=True))])
+            f[i] = g.total(
+                [
+                    int(at.direct[self.independent[i]]),
+                    *(g.mul(row[i], int(at.direct[d])) for row, d in zip(k.B, self.dependent, strict=True)),
+                ]
+            )
         for b, mass in enumerate(at.mass.tolist()):
             beta, gamma = [k.beta[i][b] for i in freedoms], [k.gamma[i][b] for i in freedoms]
-            impressed, resisting = (at.force[b].tolist(), at.torque[b].tolist()), self._inertia_resultants(at, b, k.a0[b], k.alpha0[b])
-            force, torque = ([g.sub(F, ma) for F, ma in zip(*pair, strict=True)] for pair in zip(impressed, resisting, strict=True))
+            impressed, resisting = (
+                (at.force[b].tolist(), at.torque[b].tolist()),
+                self._inertia_resultants(at, b, k.a0[b], k.alpha0[b]),
+            )
+            force, torque = (
+                [g.sub(F, ma) for F, ma in zip(*pair, strict=True)]
+                for pair in zip(impressed, resisting, strict=True)
+            )
             moving = [i for i in freedoms if any(n != g.zero for n in (*beta[i], *gamma[i]))]
             for i in moving:
                 f[i] = g.total([f[i], g.dot(beta[i], force), g.dot(gamma[i], torque)])
                 turned = [g.dot(row, gamma[i]) for row in inertia[b]]
                 for j in moving[: moving.index(i) + 1]:
-                    M[i][j] = g.total([M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)])
+                    M[i][j] = g.total(
+                        [M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)]
+                    )
         for i in freedoms:
             f[i] = forms.simplified(f[i])
             for j in range(i + 1):
@@ -248,7 +322,14 @@ class AppellOnGraph:
 class _Kinematics:
     """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates fixed."""
 
-    def __init__(self, build: AppellOnGraph, forms: NormalForms, held: dict[int, int], explicit: bool, free_z: bool = False):
+    def __init__(
+        self,
+        build: AppellOnGraph,
+        forms: NormalForms,
+        held: dict[int, int],
+        explicit: bool,
+        free_z: bool = False,
+    ):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
         self._simple = forms.all_simplified
         self.u, self.y = build.traced.u.tolist(), [int(build.traced.u[k]) for k in build.independent]
@@ -258,7 +339,12 @@ class _Kinematics:
     # Explicit: substitute the dependent speeds into the velocities, then differentiate.
 
     def _explicitly(self) -> None:
-        A = [list(row) for row in zip(*(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True)]
+        A = [
+            list(row)
+            for row in zip(
+                *(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True
+            )
+        ]
         self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
         unheld = self.known if not self.held else _Kinematics(self.build, self.forms, {}, True).known
         raw, simple = self._velocities(unheld)
@@ -276,38 +362,79 @@ class _Kinematics:
         at_fixed_speeds = self._along(simple, raw, qdot)
         value = self._parts(simple)
         rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
-        turn = lambda parts: [self._turned(R, w) for R, w in zip(rotation, parts[1], strict=True)]  # noqa: E731  to space axes
-        omega = [self._smaller(direct, turned) for direct, turned in zip([self._at(w.tolist()) for w in at.turning], turn(value), strict=True)]
-        levels = [(at.v, value[0]), (at.turning, omega), (at.orientation, [np.reshape(R, (3, 3)).tolist() for R in rotation])]
+        turn = lambda parts: [self._turned(R, w) for R, w in zip(rotation, parts[1], strict=True)]
+        omega = [
+            self._smaller(direct, turned)
+            for direct, turned in zip([self._at(w.tolist()) for w in at.turning], turn(value), strict=True)
+        ]
+        levels = [
+            (at.v, value[0]),
+            (at.turning, omega),
+            (at.orientation, [np.reshape(R, (3, 3)).tolist() for R in rotation]),
+        ]
         put = self._cut(levels)
         self._put = put
 
         # velocities are replaced in every direction, and change in few of them
-        directions: dict = {None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])}
+        directions: dict = {
+            None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])
+        }
         for k, column in enumerate(by_speed):
             parts = self._parts(column)
             direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts))])
             directions[k] = {n: rate for n, rate in direction.items() if rate != g.zero} | {self.u[k]: g.one}
-        A = [[row.get(k, g.zero) for k in range(len(self.u))] for row in directional_derivative(g, self.phi, directions)]
-        A = np.reshape(self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))).tolist()
+        A = [
+            [row.get(k, g.zero) for k in range(len(self.u))]
+            for row in directional_derivative(g, self.phi, directions)
+        ]
+        A = np.reshape(
+            self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))
+        ).tolist()
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
         self._solve(A, phi_0)
         parts = self._parts(at_fixed_speeds)
         spun = [
-            [[g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j])) for j in range(3)] for i in range(3)]
+            [
+                [
+                    g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j]))
+                    for j in range(3)
+                ]
+                for i in range(3)
+            ]
             for w, R in zip(omega, rotation, strict=True)
         ]
-        direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])])
+        direction = self._cut(
+            [(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])]
+        )
         moving = {int(n): r for n, r in zip(build.traced.q, qdot, strict=True)}
-        drift = self._at(g.substituted(derivatives(g, self.phi, moving | direction | {build.traced.t: g.one}), put))
+        drift = self._at(
+            g.substituted(derivatives(g, self.phi, moving | direction | {build.traced.t: g.one}), put)
+        )
         put_z = {} if self.free_z else self.known
-        known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
+        known = lambda nodes: self._simple(g.substituted(nodes, put_z))
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
-        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far).solution])
-        moved = [[(j, column[n]) for j, column in enumerate(by_speed[k] for k in build.dependent) if column[n] != g.zero] for n in range(len(simple))]
-        through_z = lambda z, n: g.total(g.mul(z[j], by_z) for j, by_z in moved[n])  # noqa: E731
+        zdot = self._simple(
+            [
+                row[0]
+                for row in eliminate(
+                    g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far
+                ).solution
+            ]
+        )
+        moved = [
+            [
+                (j, column[n])
+                for j, column in enumerate(by_speed[k] for k in build.dependent)
+                if column[n] != g.zero
+            ]
+            for n in range(len(simple))
+        ]
+        through_z = lambda z, n: g.total(g.mul(z[j], by_z) for j, by_z in moved[n])
         columns_of_B = list(zip(*self.B, strict=True)) if self.B else [() for _ in build.independent]
-        partial = [self._simple([g.add(d, through_z(B, n)) for n, d in enumerate(by_speed[y])]) for y, B in zip(build.independent, columns_of_B, strict=True)]
+        partial = [
+            self._simple([g.add(d, through_z(B, n)) for n, d in enumerate(by_speed[y])])
+            for y, B in zip(build.independent, columns_of_B, strict=True)
+        ]
         rates = self._simple([g.add(a, through_z(zdot, n)) for n, a in enumerate(at_fixed_speeds)])
         self._quantities()
         self._shape(known(simple), partial, rates)
@@ -315,7 +442,10 @@ class _Kinematics:
     def _solve(self, A, phi_0) -> None:
         """Solve `A_z z = -(A_y y + phi_0)` for `z = B y + b`."""
         g, build = self.graph, self.build
-        right = [[*(g.neg(row[i]) for i in build.independent), g.neg(rest)] for row, rest in zip(A, phi_0, strict=True)]
+        right = [
+            [*(g.neg(row[i]) for i in build.independent), g.neg(rest)]
+            for row, rest in zip(A, phi_0, strict=True)
+        ]
         self._A_z = [[row[d] for d in build.dependent] for row in A]
         eliminated = eliminate(g, self._A_z, right, build.probes, build.far)
         self.pivots = eliminated.pivots
@@ -354,7 +484,11 @@ class _Kinematics:
         pairs: dict[int, int] = {}
         for nodes, values in levels:
             flat = np.ravel(nodes).tolist()
-            new = [self.graph.zero] * len(flat) if values is None else np.ravel(np.array(values, np.int64)).tolist()
+            new = (
+                [self.graph.zero] * len(flat)
+                if values is None
+                else np.ravel(np.array(values, np.int64)).tolist()
+            )
             for n, v in zip(flat, new, strict=True):
                 if self.graph.op[n] == "neg":
                     n, v = self.graph.args[n][0], self.graph.neg(v)
@@ -366,10 +500,20 @@ class _Kinematics:
         """Return the rate of `nodes` along the motion; `raw`: the nodes before fixing coordinates."""
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
-        rates = derivatives(g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held})
+        rates = derivatives(
+            g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held}
+        )
         for k, by_held in enumerate(jacobian(g, raw, list(self.held)) if self.held else ()):
             slopes = self._at([by_held[n] for n in self.held if n in by_held])
-            rates[k] = g.total([rates[k], *(g.mul(moving[n], d) for n, d in zip((n for n in self.held if n in by_held), slopes, strict=True))])
+            rates[k] = g.total(
+                [
+                    rates[k],
+                    *(
+                        g.mul(moving[n], d)
+                        for n, d in zip((n for n in self.held if n in by_held), slopes, strict=True)
+                    ),
+                ]
+            )
         return self._simple(rates)
 
     def _velocities(self, replacement) -> tuple[NodeList, NodeList]:
@@ -386,7 +530,9 @@ class _Kinematics:
             flat = self._at(g.substituted(nodes.ravel().tolist(), {} if self.free_z else self.known))
             return np.array(flat, np.int64).reshape(nodes.shape)
 
-        self.at = VelocityQuantities(*(put(getattr(at, name)) for name in VelocityQuantities.__dataclass_fields__))
+        self.at = VelocityQuantities(
+            *(put(getattr(at, name)) for name in VelocityQuantities.__dataclass_fields__)
+        )
         self.qdot = self.at.qdot.tolist()
 
     def _parts(self, nodes) -> tuple[list, list]:

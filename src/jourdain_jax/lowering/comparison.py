@@ -16,7 +16,10 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure
 
 DIFFERS = "differs from the dense path"
-LIKELY = "a body, load or constraint may have a kink there, or the constraints or the remaining inertia are nearly singular"
+LIKELY = (
+    "a body, load or constraint may have a kink there, or the constraints or the remaining inertia are nearly"
+    " singular"
+)
 
 
 def rates_of(found: Equations) -> list[int]:
@@ -33,7 +36,9 @@ def agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Return whether two programs agree wherever the second is valid."""
     usable = all_finite(expected, axis=0)
     # tolerance 1e-9, relative to the size of each rate
-    return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable])))
+    return bool(
+        enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable]))
+    )
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
@@ -53,7 +58,9 @@ def enough(usable: np.ndarray) -> bool:
     return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
 
 
-def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
+def check_against_dense(
+    scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray
+) -> None:
     """Raise `NotLowered`, naming the worst rate, if the program differs at the probes from JAX's
     derivatives and a dense solution.
     """
@@ -62,10 +69,19 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
     # a parameter may have no entries
     values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]
-    parameters = jax.tree.unflatten(treedef, [x.reshape(-1 if x.size else probes.count, *np.shape(leaf)) for x, leaf in zip(values_of, leaves, strict=True)])
+    parameters = jax.tree.unflatten(
+        treedef,
+        [
+            x.reshape(-1 if x.size else probes.count, *np.shape(leaf))
+            for x, leaf in zip(values_of, leaves, strict=True)
+        ],
+    )
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
-    q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
+    q, u, inputs = (
+        np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0))
+        for p, n in zip("qui", sizes, strict=True)
+    )
     usable = all_finite(values, axis=0)
     # above 5000 operations, fewer probes are compared with the dense path
     large = builder.graph.operations(rates_of(found)) > 5000
@@ -85,5 +101,11 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}; {LIKELY}")
-    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
+    if found.events and not np.allclose(
+        probes(found.events)[:, chosen][:, usable],
+        events.T[:, usable],
+        rtol=limit,
+        atol=limit,
+        equal_nan=True,
+    ):
         raise NotLowered(f"the value of a stop event {DIFFERS}")

@@ -24,5 +24,15 @@ def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) 
     for row, nodes in zip(at.responses[1:, : len(state)].tolist(), later, strict=True):
         now = dict(zip(state, g.substituted(row, simple), strict=True))
         simple |= dict(zip(nodes, g.substituted(normal, now), strict=True))
-    for x in (at.force, at.torque, at.direct, at.power, at.events, at.resets, at.slip_turns, at.held, at.start):
+    for x in (
+        at.force,
+        at.torque,
+        at.direct,
+        at.power,
+        at.events,
+        at.resets,
+        at.slip_turns,
+        at.held,
+        at.start,
+    ):
         x[...] = np.array(g.substituted(x.ravel().tolist(), simple), np.int64).reshape(x.shape)

@@ -26,7 +26,9 @@ from jourdain_jax.structure.structure import Structure
 from jourdain_jax.structure.trace import VelocityQuantities, jaxpr_of_scene
 
 
-def dense_rates(scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+def dense_rates(
+    scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs
+) -> tuple[np.ndarray, ...]:
     """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
     states; NaN if the accelerations are not unique.
 
@@ -34,13 +36,18 @@ def dense_rates(scene: Scene, structure: Structure, independent: Indices, parame
     constraints determine the others.
     """
     closed, shape = jaxpr_of_scene(scene, structure.potentials_of_inputs)
-    numbers: VelocityQuantities = jax.tree.unflatten(jax.tree.structure(shape), range(len(jax.tree.leaves(shape))))[0]
+    numbers: VelocityQuantities = jax.tree.unflatten(
+        jax.tree.structure(shape), range(len(jax.tree.leaves(shape)))
+    )[0]
 
     def of_state(*names: str) -> Callable:
         function = jaxpr_as_fun(needed_only(closed, [getattr(numbers, name) for name in names]))
         return lambda scene, t, q, u, inputs: function(*jax.tree.leaves(scene), t, q, u, inputs)
 
-    values, level = of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events", "slip_turns"), of_state("v", "omega", "phi")
+    values, level = (
+        of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events", "slip_turns"),
+        of_state("v", "omega", "phi"),
+    )
 
     def slopes(scene, t, q, u, inputs, *along):
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
@@ -48,20 +55,36 @@ def dense_rates(scene: Scene, structure: Structure, independent: Indices, parame
     functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
     # limit on states times directions computed at once
     size = -(-len(t) // (1 + u.size // 4096))
-    found = [_rates(functions, structure, independent, *at_index(states, slice(i, i + size))) for i in range(0, len(t), size)]
+    found = [
+        _rates(functions, structure, independent, *at_index(states, slice(i, i + size)))
+        for i in range(0, len(t), size)
+    ]
     return tuple(map(np.concatenate, zip(*found, strict=True)))
 
 
-def _rates(functions: tuple[Callable, Callable], structure: Structure, independent: Indices, parameters, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+def _rates(
+    functions: tuple[Callable, Callable],
+    structure: Structure,
+    independent: Indices,
+    parameters,
+    t,
+    q,
+    u,
+    inputs,
+) -> tuple[np.ndarray, ...]:
     values, slopes = functions
     kept, (states, speeds) = list(structure.kept_rows), u.shape
     dependent = np.setdiff1d(np.arange(speeds), independent)
 
-    lanes = lambda *given: jax.tree.map(lambda x: np.repeat(x, speeds, axis=0), given)  # noqa: E731
-    parted = lambda found: jax.tree.map(lambda x: x.reshape(states, speeds, *x.shape[1:]), found)  # noqa: E731
+    lanes = lambda *given: jax.tree.map(lambda x: np.repeat(x, speeds, axis=0), given)
+    parted = lambda found: jax.tree.map(lambda x: x.reshape(states, speeds, *x.shape[1:]), found)
 
     u = np.where(np.isin(np.arange(speeds), dependent), 0.0, u)
-    none, still, each = np.zeros(states * speeds), np.zeros((states * speeds, q.shape[1])), np.tile(np.eye(speeds), (states, 1))
+    none, still, each = (
+        np.zeros(states * speeds),
+        np.zeros((states * speeds, q.shape[1])),
+        np.tile(np.eye(speeds), (states, 1)),
+    )
     (_, _, phi), found = parted(slopes(*lanes(parameters, t, q, u, inputs), none, still, each))
     beta, gamma, A = (np.moveaxis(x, 1, -1) for x in found)
     A = A[:, kept]
@@ -70,12 +93,23 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
         u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
     qdot, omega, force, torque, direct, m, I, events, turns = values(parameters, t, q, u, inputs)
     # with the same batch size, so that JAX traces this once
-    a, alpha, drift = (x[:, 0] for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[1])
-    turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
+    a, alpha, drift = (
+        x[:, 0]
+        for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[
+            1
+        ]
+    )
+    turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)
     force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + direct
-    udot = accelerations(mass_matrix(m, I, beta, gamma), f, A, drift[:, kept], structure.row_lengths[kept], structure.rank)
-    return np.append(qdot[:, : q.shape[1] - turns.shape[1]], turns, axis=1), udot[:, list(independent)], events
+    udot = accelerations(
+        mass_matrix(m, I, beta, gamma), f, A, drift[:, kept], structure.row_lengths[kept], structure.rank
+    )
+    return (
+        np.append(qdot[:, : q.shape[1] - turns.shape[1]], turns, axis=1),
+        udot[:, list(independent)],
+        events,
+    )
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
@@ -95,6 +129,10 @@ def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndar
     size, V = np.linalg.eigh(np.where(finite[:, None, None], system, 0.0))
     largest = np.argsort(-np.abs(size), axis=1)[:, : f.shape[1] + rank]
     size, V = np.take_along_axis(size, largest, 1), np.take_along_axis(V, largest[:, None], 2)
-    determined = finite & np.all(np.abs(size) > 16 * V.shape[1] * np.finfo(float).eps * np.abs(size[:, :1]), axis=1)
-    along = (V.mT @ np.where(finite[:, None], right, 0.0)[..., None])[..., 0] / np.where(determined[:, None], size, 1.0)
+    determined = finite & np.all(
+        np.abs(size) > 16 * V.shape[1] * np.finfo(float).eps * np.abs(size[:, :1]), axis=1
+    )
+    along = (V.mT @ np.where(finite[:, None], right, 0.0)[..., None])[..., 0] / np.where(
+        determined[:, None], size, 1.0
+    )
     return np.where(determined[:, None], c * (V @ along[..., None])[:, : f.shape[1], 0], np.nan)

@@ -39,11 +39,17 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     graph = probes.graph
     for name in sorted({str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}):
         inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
-    found = onto_rows(probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
+    found = onto_rows(
+        probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12
+    )
     off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also true where Gauss-Newton gave NaN
-    return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
+    return found.probes.with_inputs(
+        {name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved}
+    )
 
 
 def on_velocity_rows(probes: Probes, traced: TracedScene) -> Probes:
     """Return the probes with speeds projected onto the velocity constraints."""
-    return onto_rows(probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}).probes
+    return onto_rows(
+        probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}
+    ).probes

@@ -42,7 +42,9 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
     return found
 
 
-def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None) -> Eliminated:
+def eliminate(
+    graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None
+) -> Eliminated:
     """Solve a system. `right[row]` holds the right-hand sides of that row. With more rows than unknowns,
     the rows must be consistent.
 
@@ -58,14 +60,28 @@ def eliminate(graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[
     for pivot in reversed(order):
         rest = [
             [
-                graph.sub(b, graph.total(graph.mul(system.A[r][k], x[j]) for k, x in solution.items() if system.A[r][k] != graph.zero))
+                graph.sub(
+                    b,
+                    graph.total(
+                        graph.mul(system.A[r][k], x[j])
+                        for k, x in solution.items()
+                        if system.A[r][k] != graph.zero
+                    ),
+                )
                 for j, b in enumerate(system.right[r])
             ]
             for r in pivot.rows
         ]
         found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
-        solution |= dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True)) if found else {c: [] for c in pivot.columns}
-    return Eliminated([solution[c] for c in range(count)], [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"])
+        solution |= (
+            dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True))
+            if found
+            else {c: [] for c in pivot.columns}
+        )
+    return Eliminated(
+        [solution[c] for c in range(count)],
+        [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"],
+    )
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:

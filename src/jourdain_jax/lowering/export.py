@@ -6,8 +6,37 @@ import numpy as np
 
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
-_IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
-_IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | C.names
+_IN_C = {
+    "auto",
+    "char",
+    "const",
+    "default",
+    "do",
+    "double",
+    "enum",
+    "extern",
+    "float",
+    "goto",
+    "inline",
+    "int",
+    "long",
+    "register",
+    "restrict",
+    "short",
+}
+_IN_C |= {
+    "signed",
+    "sizeof",
+    "static",
+    "struct",
+    "switch",
+    "typedef",
+    "union",
+    "unsigned",
+    "void",
+    "volatile",
+    "case",
+} | C.names
 _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
@@ -16,18 +45,24 @@ def summary(lowered) -> str:
     and guards, parameters with units.
     """
     lines = [
-        f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} "
-        f"rates and {len(lowered.ydot)} accelerations",
+        (
+            f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for"
+            f" {len(lowered.qdot)} rates and {len(lowered.ydot)} accelerations"
+        ),
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
         f"  omitted, without influence on the accelerations: {', '.join(lowered.held) or 'nothing'}",
         *(f"  kept as a JAX call, without scalar form: {reason}" for reason in lowered.calls),
         *([f"  redundant constraints omitted: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, kept as inputs (SI units and radians): {_parameters(lowered) or 'none'}",
-        f"  computed once per motion, from parameters only: {len(lowered.fixed)} "
-            f"number{'' if len(lowered.fixed) == 1 else 's'}",
-        "  monitored pivots, which must not vanish: "
-            f"{_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
+        (
+            f"  computed once per motion, from parameters only: {len(lowered.fixed)} "
+            f"number{'' if len(lowered.fixed) == 1 else 's'}"
+        ),
+        (
+            "  monitored pivots, which must not vanish: "
+            f"{_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}"
+        ),
         f"  monitored guards, which must stay positive: {_shown(lowered, lowered.guards)}",
         f"  strategy: {lowered.way}; {lowered.seconds:.2f} s",
     ]
@@ -44,26 +79,38 @@ def _shown(lowered, nodes) -> str:
     and the number of the others.
     """
     names = identifiers(lowered)
-    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
+    written = [
+        statements(lowered.graph, [n], names, PYTHON)
+        for n in nodes
+        if len(nodes) <= 8 and not lowered.graph.calls([n])
+    ]
     short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= 60]
     more = len(nodes) - len(short)
-    return ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])]) or "none"
+    return (
+        ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])])
+        or "none"
+    )
 
 
 def _alone(graph, pivot: int) -> int:
     """Return the varying factor of a scaled pivot, or the argument of a sign."""
     args = graph.args[pivot]
-    return next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
+    return (
+        next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
+    )
 
 
 def _speeds(lowered) -> list[str]:
     if lowered.projected_u:
-        return ["  all speeds are integrated, with multipliers for the constraints: "
-            f"{', '.join(lowered.speeds)}"]
+        return [
+            f"  all speeds are integrated, with multipliers for the constraints: {', '.join(lowered.speeds)}"
+        ]
     return [
         f"  independent speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
-        "  dependent speeds, eliminated: "
-            f"{', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
+        (
+            "  dependent speeds, eliminated: "
+            f"{', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}"
+        ),
     ]
 
 
@@ -74,7 +121,11 @@ def identifiers(lowered) -> dict[int, str]:
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
         flat = np.ravel(nodes).tolist()
         named += [(n, name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)]
-    for nodes, given in ((traced.q, lowered.coordinates), (traced.u, lowered.speeds), (traced.inputs, lowered.inputs)):
+    for nodes, given in (
+        (traced.q, lowered.coordinates),
+        (traced.u, lowered.speeds),
+        (traced.inputs, lowered.inputs),
+    ):
         named += zip(nodes.tolist(), given, strict=True)
     names: dict[int, str] = {}
     taken = {"fixed", "math", "sign"}
@@ -94,12 +145,17 @@ def _identifier(name: str) -> str:
 def results(lowered) -> dict[str, int]:
     """Return name -> node of every rate."""
     rates = {f"d_{_identifier(name)}": n for name, n in zip(lowered.coordinates, lowered.qdot, strict=True)}
-    return rates | {f"d_{_identifier(lowered.speeds[i])}": n for i, n in zip(lowered.independent, lowered.ydot, strict=True)}
+    return rates | {
+        f"d_{_identifier(lowered.speeds[i])}": n
+        for i, n in zip(lowered.independent, lowered.ydot, strict=True)
+    }
 
 
 def _prefix(letter: str, names) -> str:
     """Return a prefix for numbered names that no name of the scene begins with."""
-    return _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
+    return (
+        _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
+    )
 
 
 def python_source(lowered) -> str:
@@ -111,12 +167,20 @@ def python_source(lowered) -> str:
     first, fixed = statements(lowered.graph, used, names, PYTHON, c)
     known = names | {n: f"{k}{i}" for i, n in enumerate(used)}
     second, outputs = statements(lowered.graph, list(rates.values()), known, PYTHON, s)
-    given = [lowered.traced.t, *lowered.traced.q, *(lowered.traced.u[i] for i in lowered.independent), *lowered.traced.inputs]
+    given = [
+        lowered.traced.t,
+        *lowered.traced.q,
+        *(lowered.traced.u[i] for i in lowered.independent),
+        *lowered.traced.inputs,
+    ]
     state = ", ".join(names[int(n)] for n in given)
     signed = any("sign(" in text for text in (*first, *fixed, *second, *outputs))
     signs = ["", "def sign(x):", "    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0", ""] if signed else []
-    unpack = [f"    {', '.join(f'{k}{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = "
-        "fixed"] if fixed else []
+    unpack = (
+        [f"    {', '.join(f'{k}{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = fixed"]
+        if fixed
+        else []
+    )
     return "\n".join(
         [
             "import math",
@@ -124,8 +188,10 @@ def python_source(lowered) -> str:
             *signs,
             "",
             f"def fixed({', '.join(parameters)}):",
-            f'    """What depends on the parameters of {lowered.scene_name} alone: '
-            f'{_parameters(lowered) or "none"}."""',
+            (
+                f'    """What depends on the parameters of {lowered.scene_name} alone: '
+                f'{_parameters(lowered) or "none"}."""'
+            ),
             *first,
             f"    return ({', '.join(fixed)}{',' if len(fixed) == 1 else ''})",
             "",
@@ -153,14 +219,27 @@ def c_source(lowered, name: str = "rates") -> str:
     needs the C mathematical library.
     """
     traced, rates = lowered.traced, results(lowered)
-    names = {n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given for n, given in identifiers(lowered).items()}
+    names = {
+        n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given
+        for n, given in identifiers(lowered).items()
+    }
     flat = [int(n) for nodes in traced.parameters for n in np.ravel(nodes)]
-    groups = {"parameters": flat, "coordinates": traced.q.tolist(), "speeds": [int(traced.u[k]) for k in lowered.independent]}
+    groups = {
+        "parameters": flat,
+        "coordinates": traced.q.tolist(),
+        "speeds": [int(traced.u[k]) for k in lowered.independent],
+    }
     groups["inputs"] = [int(n) for n in traced.inputs]
     lines, outputs = statements(lowered.graph, list(rates.values()), names, C, _prefix("s", names.values()))
     used = {n for n in lowered.graph.reachable(rates.values()) if n in names}
-    unused = [group for group, nodes in groups.items() if not used.intersection(nodes)] + ([] if traced.t in used else ["t"])
-    signs = ["static inline double sign(double x) { return (x > 0) - (x < 0); }", ""] if any("sign(" in text for text in (*lines, *outputs)) else []
+    unused = [group for group, nodes in groups.items() if not used.intersection(nodes)] + (
+        [] if traced.t in used else ["t"]
+    )
+    signs = (
+        ["static inline double sign(double x) { return (x > 0) - (x < 0); }", ""]
+        if any("sign(" in text for text in (*lines, *outputs))
+        else []
+    )
     listed = {group: ", ".join(names[n] for n in nodes) or "none" for group, nodes in groups.items()}
     return "\n".join(
         [
@@ -171,12 +250,22 @@ def c_source(lowered, name: str = "rates") -> str:
             f"   parameters: {_parameters(lowered) or 'none'}",
             *(f"   {group}: {listed[group]}" for group in ("coordinates", "speeds", "inputs")),
             f"   out, time derivatives: {', '.join(rates)} */",
-            f"void {name}(const double *parameters, double t, const double *coordinates, const double "
-            "*speeds, const double *inputs, double *out) {",
+            (
+                f"void {name}(const double *parameters, double t, const double *coordinates, const double "
+                "*speeds, const double *inputs, double *out) {"
+            ),
             *(f"    (void){argument};" for argument in unused),
-            *(f"    const double {names[n]} = {group}[{i}];" for group, nodes in groups.items() for i, n in enumerate(nodes) if n in used),
+            *(
+                f"    const double {names[n]} = {group}[{i}];"
+                for group, nodes in groups.items()
+                for i, n in enumerate(nodes)
+                if n in used
+            ),
             *lines,
-            *(f"    out[{i}] = {text};  /* {rate} */" for i, (rate, text) in enumerate(zip(rates, outputs, strict=True))),
+            *(
+                f"    out[{i}] = {text};  /* {rate} */"
+                for i, (rate, text) in enumerate(zip(rates, outputs, strict=True))
+            ),
             "}",
             "",
         ]
@@ -186,7 +275,9 @@ def c_source(lowered, name: str = "rates") -> str:
 def expressions(lowered) -> dict:
     """Return name -> SymPy expression of every rate, in the parameters and the state; requires SymPy."""
     rates = results(lowered)
-    return dict(zip(rates, sympy_expressions(lowered.graph, list(rates.values()), identifiers(lowered)), strict=True))
+    return dict(
+        zip(rates, sympy_expressions(lowered.graph, list(rates.values()), identifiers(lowered)), strict=True)
+    )
 
 
 def latex(lowered) -> str:
@@ -203,11 +294,20 @@ def latex(lowered) -> str:
     shown |= {int(n): _symbol(name) for n, name in zip(traced.q, lowered.coordinates, strict=True)}
     shown |= {n: rf"\dot{{{rate_of[n]}}}" for n in map(int, traced.u) if n in rate_of}
     left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
-    left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
+    left += [
+        rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}"
+        for n in (int(traced.u[i]) for i in lowered.independent)
+    ]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
     # round long fractions: 144952661367387/50000000000000, but not 9/2
-    values = [value.replace(lambda x: x.is_Rational and x.q >= 1000, lambda number: sympy.Float(number, 6)) for value in expressions(lowered).values()]
-    lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, values, strict=True)]
+    values = [
+        value.replace(lambda x: x.is_Rational and x.q >= 1000, lambda number: sympy.Float(number, 6))
+        for value in expressions(lowered).values()
+    ]
+    lines = [
+        f"{rate} &= {sympy.latex(value, symbol_names=symbols)}"
+        for rate, value in zip(left, values, strict=True)
+    ]
     return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
 
 

@@ -17,7 +17,9 @@ from jourdain_jax.scene.scene import Scene
 FEW = 6  # number of probes that suffices for most coordinates
 
 
-def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
+def _with_slopes(
+    builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray
+) -> set[int]:
     """Return the coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe.
 
     The derivative may be below the round-off of the values, as for the heading of the last of many trailers.
@@ -34,12 +36,16 @@ def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int]
     slopes = cotangents(own, outputs, weights, [variables[inputs.index(n)] for n in coordinates])
     if not taken_for_what_they_are(own, slopes):
         return set()
-    found = generic.on_graph(own, {str(own.value[n]): str(graph.value[old]) for n, old in zip(variables, inputs, strict=True)})(slopes)
+    found = generic.on_graph(
+        own, {str(own.value[n]): str(graph.value[old]) for n, old in zip(variables, inputs, strict=True)}
+    )(slopes)
     surely = np.any((np.abs(np.asarray(found)) > SURE * found.error) & np.isfinite(found) & regular, axis=1)
     return {n for n, counts in zip(coordinates, surely, strict=True) if counts}
 
 
-def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
+def ignorable(
+    scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray
+) -> tuple[int, ...]:
     """Return the coordinates (quaternions as a whole) whose values never affect the
     accelerations of the independent speeds.
     """
@@ -48,11 +54,17 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
     at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), pivots_ok(equations.pivots, generic)
+    used, here, regular = (
+        set(builder.graph.reachable(equations.ydot)),
+        generic(equations.ydot),
+        pivots_ok(equations.pivots, generic),
+    )
 
     def unchanged(group) -> bool:
         elsewhere = generic.exchanged([[f"q_{i}" for i in group]], np.arange(generic.count))
-        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
+        return bool(
+            np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere)))
+        )
 
     def surely_changed(groups) -> np.ndarray:
         """Return which groups of coordinates certainly influence the accelerations. A few probes test all
@@ -67,18 +79,24 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         before.error = here.error[:, lanes]
         sizes = np.abs(elsewhere(equations.pivots))
         # require pivots 100 times above the limit, so that they are valid whatever their typical size
-        far_from_singular = np.all(sizes > 100.0 * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
+        far_from_singular = np.all(
+            sizes > 100.0 * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0
+        )
         return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
 
     def regular_at_reference(group) -> bool:
-        values = values_at(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
+        values = values_at(
+            accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group})
+        )
         return enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
 
     groups = [*single, *attitudes]
     held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
     groups = [group for group in groups if group[0] not in held]
     left = [group for group, counts in zip(groups, surely_changed(groups), strict=True) if not counts]
-    count_little = _with_slopes(builder, equations.ydot, [q[i] for group in left if len(group) == 1 for i in group], regular)
+    count_little = _with_slopes(
+        builder, equations.ydot, [q[i] for group in left if len(group) == 1 for i in group], regular
+    )
     left = [group for group in left if q[group[0]] not in count_little]
     together = [i for group in left for i in group]
     # if all together have no effect, neither has any of them

@@ -7,7 +7,13 @@ the multipliers are not unique.
 """
 
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
-from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
+from jourdain_jax.lowering.multipliers import (
+    Accelerations,
+    Columns,
+    accelerations_by_multipliers,
+    projected_speeds,
+    with_inertia_of_rows,
+)
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.graph import Graph, NodeList
 from jourdain_jax.program.polynomial import NormalForms
@@ -30,13 +36,18 @@ class KeptRows:
         if self.by_partition:
             return "all speeds in the state, accelerations from the independent ones"
         return "constraints enforced by multipliers" + (
-            ", with inertia added along the constraints" if self.massless else "")
+            ", with inertia added along the constraints" if self.massless else ""
+        )
 
-    def accelerations(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
+    def accelerations(
+        self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms
+    ) -> Accelerations:
         """Return the accelerations under all constraints, and the pivots."""
         if self.by_partition:
             return self._accelerations_by_partition(M, f, A, drift, forms)
-        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine)
+        return accelerations_by_multipliers(
+            self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine
+        )
 
     def projected_speeds(self, M: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
         """Return the speeds projected onto `phi = 0`."""
@@ -44,7 +55,13 @@ class KeptRows:
         if not self.by_partition:
             return projected_speeds(self.graph, self._inertia(M, A), A, u, phi, forms)
         dependent, moved = self._dependent(len(u)), list(u)
-        change = eliminate(self.graph, [[row[k] for k in dependent] for row in A], [[self.graph.neg(n)] for n in phi], self.probes, self.far).solution
+        change = eliminate(
+            self.graph,
+            [[row[k] for k in dependent] for row in A],
+            [[self.graph.neg(n)] for n in phi],
+            self.probes,
+            self.far,
+        ).solution
         for k, (dz,) in zip(dependent, change, strict=True):
             moved[k] = self.graph.add(u[k], dz)
         return moved
@@ -52,9 +69,14 @@ class KeptRows:
     def _dependent(self, count: int) -> NodeList:
         return [k for k in range(count) if k not in self.independent]
 
-    def _accelerations_by_partition(self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms) -> Accelerations:
+    def _accelerations_by_partition(
+        self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms
+    ) -> Accelerations:
         graph, speeds, dependent = self.graph, range(len(f)), self._dependent(len(f))
-        right = [[*(graph.neg(row[k]) for k in self.independent), graph.neg(d)] for row, d in zip(A, drift, strict=True)]
+        right = [
+            [*(graph.neg(row[k]) for k in self.independent), graph.neg(d)]
+            for row, d in zip(A, drift, strict=True)
+        ]
         found = eliminate(graph, [[row[k] for k in dependent] for row in A], right, self.probes, self.far)
         by_speed = {k: forms.all_simplified(row) for k, row in zip(dependent, found.solution, strict=True)}
         freedoms = range(len(self.independent))
@@ -67,8 +89,12 @@ class KeptRows:
         for i in freedoms:
             for j in range(i + 1):
                 inertia[i][j] = inertia[j][i] = forms.simplified(graph.dot(C[i], moved[j]))
-        ydot = solve_symmetric(graph, inertia, [[forms.simplified(graph.dot(column, rest)) for column in C]]).solution[0]
-        return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [])
+        ydot = solve_symmetric(
+            graph, inertia, [[forms.simplified(graph.dot(column, rest)) for column in C]]
+        ).solution[0]
+        return Accelerations(
+            [graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, []
+        )
 
     def _inertia(self, M: Columns, A: Columns) -> Columns:
         return with_inertia_of_rows(self.graph, M, A, self.probes) if self.massless else M

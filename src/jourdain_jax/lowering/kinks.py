@@ -29,7 +29,11 @@ def loads_may_jump(scene: Scene) -> bool:
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
     graph, loads = traced.graph, list(_loads(scene, traced))
-    moving = [*traced.q.tolist(), *traced.u.tolist(), *(n for leaf in traced.parameters for n in leaf.ravel().tolist())]
+    moving = [
+        *traced.q.tolist(),
+        *traced.u.tolist(),
+        *(n for leaf in traced.parameters for n in leaf.ravel().tolist()),
+    ]
     numbers = [n for n in switches(graph, loads) if depend_on(graph, [n], moving)[0]]
     return bool(numbers) and bool(jumps(graph, numbers, loads, _probes(scene, traced)))
 
@@ -47,7 +51,9 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
     at = np.concatenate([np.ravel(x).astype(float) for x in (q, u, inputs)])
     # 1e-6 away from the state, relative for entries larger than one
     step = np.diag(1e-6 * np.maximum(1.0, np.abs(at)))
-    q, u, inputs = np.split(np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1)
+    q, u, inputs = np.split(
+        np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1
+    )
     beside = Probes(graph, named_values(scene, t, q, u, inputs))
     size, bent = np.nanmax(np.abs(_probes(scene, traced)(loads)), axis=1), np.zeros(len(loads), bool)
     for number, nodes in numbers.items():
@@ -60,10 +66,15 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
 def _probes(scene: Scene, traced: TracedScene) -> Probes:
     """Return the states that determined the structure of the scene, with random speeds and inputs."""
     known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
-    u, inputs = (generator.normal(size=(len(known.times), len(names))) for names in (scene.speed_names.entries, scene.inputs))
+    u, inputs = (
+        generator.normal(size=(len(known.times), len(names)))
+        for names in (scene.speed_names.entries, scene.inputs)
+    )
     return Probes(traced.graph, named_values(scene, known.times, known.coordinates, u, inputs))
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
     """Return the nodes of loads and masses -> their names."""
-    return owned(scene, **{name: getattr(traced.at, name) for name in ("force", "torque", "mass", "inertia", "direct")})
+    return owned(
+        scene, **{name: getattr(traced.at, name) for name in ("force", "torque", "mass", "inertia", "direct")}
+    )

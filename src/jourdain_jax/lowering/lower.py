@@ -54,9 +54,24 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
-    kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-    kept += (structure.varying_inertia, structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in)
-    kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
+    kept = (
+        every_speed,
+        None if every_speed else structure.independent,
+        structure.redundant_rows,
+        structure.affine,
+        structure.driven,
+    )
+    kept += (
+        structure.varying_inertia,
+        structure.homogeneous,
+        structure.potentials_of_inputs,
+        structure.may_set_in,
+    )
+    kept += (
+        (structure.dependent_rows, structure.well_conditioned and structure.independent)
+        if every_speed
+        else ()
+    )
     return _lowered(with_reference_parameters(scene), every_speed, massless, kept)
 
 
@@ -96,14 +111,18 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
         raise NotLowered(
-            f"constraints {named} are redundant at all probed states, but not provably everywhere")
+            f"constraints {named} are redundant at all probed states, but not provably everywhere"
+        )
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
         if traced.effects:
             raise Unsupported(traced.effects)
-        loops = (traced.graph.value[call].loop for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()))
+        loops = (
+            traced.graph.value[call].loop
+            for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist())
+        )
         if loop := next(filter(None, loops), None):
             # measured: a ball on a hill, whose contact point is found by Newton's method, takes four times as
             # long as with dense matrices
@@ -113,8 +132,16 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         if every_speed and len(structure.row_names) > structure.rank:
             probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
-        kept = KeptRows(traced.graph, structure, massless, probes, far) if every_speed and structure.row_names else None
-        return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()))
+        kept = (
+            KeptRows(traced.graph, structure, massless, probes, far)
+            if every_speed and structure.row_names
+            else None
+        )
+        return _best(
+            scene,
+            structure,
+            AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()),
+        )
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
@@ -142,9 +169,16 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     values = named_values(scene, t, q, u, inputs)
 
     def probes(share) -> Probes:
-        columns = [np.reshape(x + np.reshape(share, (-1, *[1] * x.ndim)) * dx, (len(t), -1)).T for x, dx in zip(given, away, strict=True)]
-        parameters = {f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)}
-        return Probes(traced.graph, values | {name: np.asarray(value, np.float64) for name, value in parameters.items()})
+        columns = [
+            np.reshape(x + np.reshape(share, (-1, *[1] * x.ndim)) * dx, (len(t), -1)).T
+            for x, dx in zip(given, away, strict=True)
+        ]
+        parameters = {
+            f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)
+        }
+        return Probes(
+            traced.graph, values | {name: np.asarray(value, np.float64) for name, value in parameters.items()}
+        )
 
     share, possible, least = np.zeros(len(t)), False, _least_moments(traced, probes(np.zeros(len(t)))) / 2
     # try shrinking shares of the parameter variation until the scene is valid
@@ -177,8 +211,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     check_against_dense(scene, structure, builder, best, expected)
     # try further strategies only below 1000 operations
     held, small = ignorable(scene, builder, best, expected), 1000
-    stages = [Stage(
-        "scalar program: structural zeros and ones removed, common subexpressions shared", fewest)]
+    stages = [
+        Stage("scalar program: structural zeros and ones removed, common subexpressions shared", fewest)
+    ]
     plainly_held = fewest
     # above 4000 operations, fixing ignorable coordinates never yields a small program
     if held and fewest < 4000:
@@ -191,23 +226,54 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors extracted", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
-    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "resets", "energies")}
+    groups = {
+        name: getattr(best, name)
+        for name in (
+            "qdot",
+            "ydot",
+            "z",
+            "pivots",
+            "directions",
+            "squares",
+            "guards",
+            "power",
+            "events",
+            "resets",
+            "energies",
+        )
+    }
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     pivots = _relative(graph, probes, [*of_rates, *best.pivots])
-    groups |= {"at_start": builder.traced.at.start.tolist(), "power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": pivots}
-    outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
+    groups |= {
+        "at_start": builder.traced.at.start.tolist(),
+        "power": [best.power],
+        "projected_q": put_q,
+        "projected_u": put_u,
+        "pivots": pivots,
+    }
+    outputs = graph.with_quotients(
+        _with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group])
+    )
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
     (power,) = nodes.pop("power")
     rates = [*nodes["qdot"], *nodes["ydot"]]
     _check_resets(scene, builder, best)
     of_contacts = builder.traced.inputs.tolist()[len(scene.inputs) - len(scene.switching.contacts) :]
-    nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes, of_contacts)
+    nodes["relations"], nodes["event_relations"] = watched = relations(
+        graph, rates, nodes["events"], probes, of_contacts
+    )
     every = [n for part in watched for n in part]
     nodes["sided"] = sided(graph, every, [*rates, *nodes["events"]], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
-    given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist(), *(n for x in own.parameters for n in x.ravel().tolist())]
+    given = [
+        own.t,
+        *own.q.tolist(),
+        *own.u.tolist(),
+        *own.inputs.tolist(),
+        *(n for x in own.parameters for n in x.ravel().tolist()),
+    ]
     # without the failed candidates
     alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
     place = places.tolist()
@@ -215,7 +281,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
     units = {f".{name}": metadata["unit"] for name, _, metadata in parameters_of(scene)}
     return Lowered(
-        traced=Variables(alone, place[own.t], places[own.q], places[own.u], places[own.inputs], [np.asarray(places[x]) for x in own.parameters]),
+        traced=Variables(
+            alone,
+            place[own.t],
+            places[own.q],
+            places[own.u],
+            places[own.inputs],
+            [np.asarray(places[x]) for x in own.parameters],
+        ),
         scene_name=type(scene).__name__,
         parameters=leaves,
         units=tuple(units.get(name, "") for name in leaves),
@@ -252,11 +325,14 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
         by_rows = builder.probes(graph.substituted(graph.substituted(found.z, after), true_z))
         if np.any(np.abs(stated - by_rows) > 1e-6 * (1 + np.abs(by_rows))):
             speeds = scene.speed_names.entries
-            free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in (builder.independent, builder.dependent))
+            free, tied = (
+                ", ".join(f"`{speeds[k]}`" for k in which)
+                for which in (builder.independent, builder.dependent)
+            )
             raise ValueError(
                 f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity "
-                    f"constraints, which determine {tied} from {free}; set all of them consistently, or "
-                    "declare the independent ones as `privileged`"
+                f"constraints, which determine {tied} from {free}; set all of them consistently, or "
+                "declare the independent ones as `privileged`"
             )
 
 
@@ -283,7 +359,10 @@ def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int
     else:
         yield Strategy(False, MOST_TERMS, held=held)
         # try the explicit strategy only up to 5000 operations
-        if plainly <= 5000 and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
+        if (
+            plainly <= 5000
+            and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly
+        ):
             yield Strategy(True, MOST_TERMS, held=held)
 
 
@@ -291,7 +370,9 @@ def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
     """Return pivots relative to their values at a probe with the same parameters. For
     constant pivots, return their signs.
     """
-    return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
+    return [
+        graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots
+    ]
 
 
 def _operands(graph: Graph, call: int) -> NodeList:
@@ -308,10 +389,15 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeLi
     same: dict[int, int] = {}
     for call in calls:
         # array operands from other calls must be identical, not only of equal shape
-        whole = tuple((graph.value[a], *(same.get(other, other) for other in graph.args[a] if graph.op[a] != "array")) for a in graph.args[call])
+        whole = tuple(
+            (graph.value[a], *(same.get(other, other) for other in graph.args[a] if graph.op[a] != "array"))
+            for a in graph.args[call]
+        )
         alike = kept.setdefault((graph.value[call], whole), [])
         given = generic(_operands(graph, call))
-        found = next((other for other in alike if np.all(equal(given, generic(_operands(graph, other))))), None)
+        found = next(
+            (other for other in alike if np.all(equal(given, generic(_operands(graph, other))))), None
+        )
         if found is None:
             alike.append(call)
         else:
@@ -339,8 +425,17 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
     """Return concrete parameters of the scene with all permitted zeros; None if there are none."""
-    may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or np.array_equal(f.default, 0)}
+    may_vanish = {
+        f.name
+        for f in fields(scene)
+        if (every and not f.metadata.get("positive"))
+        or f.metadata.get("non_negative")
+        or np.array_equal(f.default, 0)
+    }
     given, treedef = jax.tree_util.tree_flatten_with_path(scene)
     zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]
-    leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(with_reference_parameters(scene)), strict=True)]
+    leaves = [
+        np.zeros_like(y) if zero else y
+        for zero, y in zip(zeros, jax.tree.leaves(with_reference_parameters(scene)), strict=True)
+    ]
     return jax.tree.unflatten(treedef, leaves) if any(zeros) else None

@@ -104,8 +104,7 @@ class Lowered:
         return self.graph.operations([*self.qdot, *self.ydot])
 
     def summary(self) -> str:
-        """Return operations after each step, omitted parts with reasons, and the chosen independent speeds.
-        """
+        """Return operations after each step, omitted parts with reasons, and the chosen independent speeds."""
         return export.summary(self)
 
     def __str__(self) -> str:
@@ -148,21 +147,33 @@ class Lowered:
         """Return the values that depend only on parameters, for the parameters of `scene`. They
         are computed once per motion.
         """
-        place = {int(n): (k, i) for k, nodes in enumerate(self.traced.parameters) for i, n in enumerate(np.ravel(nodes))}
+        place = {
+            int(n): (k, i)
+            for k, nodes in enumerate(self.traced.parameters)
+            for i, n in enumerate(np.ravel(nodes))
+        }
         leaves = [jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(scene)]
         known: dict = {}
         for n in self.graph.reachable(self.fixed):
             args = self.graph.args[n]
-            owners = {place[a][0] for a in args if a in place} if self.graph.op[n] == "array" and all(a in place for a in args) else ()
+            owners = (
+                {place[a][0] for a in args if a in place}
+                if self.graph.op[n] == "array" and all(a in place for a in args)
+                else ()
+            )
             if len(owners) == 1:  # entries of one parameter, read in one operation
-                known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(self.graph.value[n][0])
+                known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(
+                    self.graph.value[n][0]
+                )
         for n in self.graph.needed(self.fixed, known):
             if n in place:
                 leaf, i = place[n]
                 known[n] = leaves[leaf][i]
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
-    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, PerLane | None]:
+    def rates(
+        self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False
+    ) -> tuple[tuple, tuple, PerLane | None]:
         """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`;
         NaN if a guard is not positive.
 
@@ -179,7 +190,7 @@ class Lowered:
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
         found = iter(_program_of_rates(self, with_power)(*self._known(fixed, t, q, y, inputs).values()))
-        taken = lambda nodes: tuple(itertools.islice(found, len(nodes)))  # noqa: E731
+        taken = lambda nodes: tuple(itertools.islice(found, len(nodes)))
         (first, *qdot), ydot, power = taken(self.qdot), taken(self.ydot), next(found) if with_power else None
         for guard in taken(self.guards):
             first = jnp.where(guard > 0, first, jnp.nan)
@@ -195,12 +206,16 @@ class Lowered:
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
-    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], PerLane]:
+    def speeds_and_pivot(
+        self, fixed, t, q: Sequence, y: Sequence, inputs
+    ) -> tuple[Float[Array, "speeds *lanes"], PerLane]:
         """Return all speeds and the smallest pivot, which changes sign where the elimination fails.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        return self.all_speeds(fixed, t, q, y, inputs), smallest_pivot(self.values(self.pivots, fixed, t, q, y, inputs))
+        return self.all_speeds(fixed, t, q, y, inputs), smallest_pivot(
+            self.values(self.pivots, fixed, t, q, y, inputs)
+        )
 
     def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
         """Return all speeds, integrated and dependent. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
@@ -223,13 +238,19 @@ class Lowered:
         real, y = jnp.result_type(*q), tuple(y)
 
         def step(nodes, q, y):
-            return tuple(jnp.broadcast_to(jnp.asarray(x, real), jnp.shape(q[0])) for x in run(self.graph, nodes, self._known(fixed, t, q, y, inputs)))
+            return tuple(
+                jnp.broadcast_to(jnp.asarray(x, real), jnp.shape(q[0]))
+                for x in run(self.graph, nodes, self._known(fixed, t, q, y, inputs))
+            )
 
         # two steps: the deviation after an integration step is small, and its square is round-off
         q = jax.lax.scan(lambda q, _: (step(self.projected_q, q, y), None), tuple(q), length=2)[0]
         if not self.projected_u:
             return q, y
-        return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0]
+        return (
+            q,
+            jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0],
+        )
 
     def watched(self, has_events: bool) -> Nodes:
         """Return the numbers whose signs are monitored during every step: numbers of the rates and, with
@@ -237,10 +258,16 @@ class Lowered:
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
 
-    def values(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
+    def values(
+        self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs
+    ) -> Float[Array, "nodes *lanes"]:
         """Return values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
-        return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
+        return (
+            jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out])
+            if nodes
+            else jnp.zeros((0, *like.shape), like.dtype)
+        )
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, PerLane]:
         def lanes_last(n, x):
@@ -255,14 +282,18 @@ class Lowered:
         """Return the reason for each JAX call in the rates and stop events: a part of a load
         or event without scalar form.
         """
-        return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
+        return tuple(
+            self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events])
+        )
 
 
 @functools.lru_cache(maxsize=64)
 def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple]:
     outputs = [*program.qdot, *program.ydot, *([program.power] if with_power else []), *program.guards]
     monitored = *program.pivots, *program.directions, *program.squares
-    return differentiable(program.graph, outputs, program.variables, like=len(program.fixed) + 1, monitored=monitored)
+    return differentiable(
+        program.graph, outputs, program.variables, like=len(program.fixed) + 1, monitored=monitored
+    )
 
 
 def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane:

@@ -44,7 +44,15 @@ class Accelerations(NamedTuple):
 
 
 def accelerations_by_multipliers(
-    graph: Graph, M: Columns, f: NodeList, A: Columns, drift: NodeList, probes: Probes, forms: NormalForms, *, affine: bool
+    graph: Graph,
+    M: Columns,
+    f: NodeList,
+    A: Columns,
+    drift: NodeList,
+    probes: Probes,
+    forms: NormalForms,
+    *,
+    affine: bool,
 ) -> Accelerations:
     """Return the accelerations under all constraints. `probes` give the typical sizes of entries; `affine`:
     whether constraints are affine in the speeds.
@@ -62,16 +70,25 @@ def accelerations_by_multipliers(
     multipliers = solved.solution[0]
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
-    sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
+    sines = [
+        graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left
+    ]
     # relative sine or length below which round-off decides how a motion continues,
     # and the program is not valid
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
     if affine:
-        return Accelerations(udot, sines, margins, squares=[n for (_, pivot), size in zip(left, sizes, strict=True) for n in (pivot, size)])
+        return Accelerations(
+            udot,
+            sines,
+            margins,
+            squares=[n for (_, pivot), size in zip(left, sizes, strict=True) for n in (pivot, size)],
+        )
     signs = [[margin, *[graph.zero] * (len(f) - 1)] for margin in margins]
-    return Accelerations(udot, sines, [], [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)])
+    return Accelerations(
+        udot, sines, [], [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)]
+    )
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
@@ -97,7 +114,9 @@ def projected_coordinates(graph: Graph, q: NodeList, closure: NodeList) -> NodeL
     return _less(graph, q, G, correction)
 
 
-def projected_speeds(graph: Graph, M: Columns, A: Columns, u: NodeList, phi: NodeList, forms: NormalForms) -> NodeList:
+def projected_speeds(
+    graph: Graph, M: Columns, A: Columns, u: NodeList, phi: NodeList, forms: NormalForms
+) -> NodeList:
     """Return the speeds projected onto `phi = 0` in the metric of M."""
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]

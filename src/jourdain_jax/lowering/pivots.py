@@ -54,7 +54,14 @@ class Pivots:
     domain; `far`: with angles over full turns.
     """
 
-    def __init__(self, graph: Graph, A: Sequence[Sequence[int]], right: Sequence[Sequence[int]], probes: Probes, far: Callable[[], Probes] | None):
+    def __init__(
+        self,
+        graph: Graph,
+        A: Sequence[Sequence[int]],
+        right: Sequence[Sequence[int]],
+        probes: Probes,
+        far: Callable[[], Probes] | None,
+    ):
         # at most 32 terms of a determinant in normal form
         self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, 32, sign=probes.sign)
         self.A, self.right = [list(row) for row in A], [list(row) for row in right]
@@ -85,7 +92,10 @@ class Pivots:
                 for k in self._in_row(r):
                     A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
                 self._changed(other)
-                self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
+                self.right[other] = [
+                    graph.sub(a, graph.mul(factor, b))
+                    for a, b in zip(self.right[other], self.right[r], strict=True)
+                ]
 
     def _changed(self, *rows: int) -> None:
         """Clear cached results of these rows, or of all rows."""
@@ -121,7 +131,9 @@ class Pivots:
         if pair is not None:
             return pair
         good.sort(key=cost)
-        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._regular_everywhere((r, c))), None)
+        serving = next(
+            ((r, c) for r, c, entry in good if entry.fixed or self._regular_everywhere((r, c))), None
+        )
         if serving is not None:
             return self._single(*serving)
         r, c, _ = good[0] if good else max(judged, key=lambda place: place[2].worst)
@@ -132,19 +144,33 @@ class Pivots:
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
-            ratio = _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count)) if columns else np.empty((0, 1))
+            ratio = (
+                _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
+                if columns
+                else np.empty((0, 1))
+            )
             worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)  # at any probe
-            self._judged[row] = {c: _Entry(w, bool(w > 0) and self._is_fixed(n)) for c, n, w in zip(columns, nodes, worst, strict=True)}
+            self._judged[row] = {
+                c: _Entry(w, bool(w > 0) and self._is_fixed(n))
+                for c, n, w in zip(columns, nodes, worst, strict=True)
+            }
         return self._judged[row]
 
     def _is_fixed(self, node: int) -> bool:
         """Return whether a node depends only on parameters and has a constant sign."""
         graph = self.graph
-        return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
+        return not graph.varies[node] and (
+            graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node]))
+        )
 
     def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
         entry = self.A[row][column]
-        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if monitored is None else monitored)
+        return Pivot(
+            (row,),
+            (column,),
+            ((self.graph.div(self.graph.one, entry),),),
+            entry if monitored is None else monitored,
+        )
 
     # judgement at probes in the domain, and with angles over full turns where the system itself is regular
 
@@ -173,7 +199,9 @@ class Pivots:
         """
         if self._kept_regular is None:
             count = len(self._given[0])
-            A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
+            A = np.moveaxis(
+                self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0
+            )
             finite = all_finite(A, axis=(1, 2))
             A = np.where(finite[:, None, None], A, 0.0)
             lengths = np.linalg.norm(A, axis=2, keepdims=True)
@@ -230,14 +258,18 @@ class Pivots:
             return None
         _, r, s, c, d, determinant = min(found)
         over = [graph.div(n, determinant) for n in (A[s][d], A[r][d], A[s][c], A[r][c])]
-        return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
+        return Pivot(
+            (r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant
+        )
 
     def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
         """Return a b - c d if it depends only on parameters and is not small; otherwise None."""
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
-        regular = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
+        regular = not graph.varies[determinant] and np.all(
+            np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0)
+        )
         return determinant if regular else None
 
     # combined rows
@@ -253,7 +285,10 @@ class Pivots:
             if len(users) < 2:
                 continue
             weights = self._weights(users)
-            terms = [graph.mul(graph.const(w), graph.mul(A[r][c], A[r][c])) for r, w in zip(users, weights, strict=True)]
+            terms = [
+                graph.mul(graph.const(w), graph.mul(A[r][c], A[r][c]))
+                for r, w in zip(users, weights, strict=True)
+            ]
             squares = self.forms.simplified(graph.total(terms))
             size = sum(w * self._size(r) ** 2 for r, w in zip(users, weights, strict=True))
             with np.errstate(all="ignore"):
@@ -263,7 +298,9 @@ class Pivots:
         if not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular]):
             return self._single(*single)
         *_, c, users, weights, squares = min(found)
-        combined = self._turned if len(users) == 2 and len(self.rows) <= len(self.columns) else self._orthogonal
+        combined = (
+            self._turned if len(users) == 2 and len(self.rows) <= len(self.columns) else self._orthogonal
+        )
         return combined(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
@@ -289,7 +326,9 @@ class Pivots:
         )
         for row in (A, self.right):
             pairs = list(zip(row[r], row[s], strict=True))
-            row[r] = [self.forms.simplified(graph.add(graph.mul(first, x), graph.mul(second, y))) for x, y in pairs]
+            row[r] = [
+                self.forms.simplified(graph.add(graph.mul(first, x), graph.mul(second, y))) for x, y in pairs
+            ]
             row[s] = [self.forms.simplified(graph.sub(graph.mul(b, x), graph.mul(a, y))) for x, y in pairs]
         A[r][c], A[s][c] = squares, graph.zero
         self._changed()
@@ -302,16 +341,24 @@ class Pivots:
         graph, A = self.graph, self.A
         new = len(A)
         over = graph.div(graph.one, squares)
-        entries = [(r, graph.mul(graph.const(w), A[r][c]), A[r][c]) for r, w in zip(users, weights, strict=True)]
+        entries = [
+            (r, graph.mul(graph.const(w), A[r][c]), A[r][c]) for r, w in zip(users, weights, strict=True)
+        ]
         self._sizes[new] = sum(np.abs(self._at([wa])[0]) * self._size(r) for r, wa, _ in entries)
         for row in (A, self.right):
-            made = [self.forms.simplified(graph.total(graph.mul(wa, row[r][k]) for r, wa, _ in entries)) for k in range(len(row[users[0]]))]
+            made = [
+                self.forms.simplified(graph.total(graph.mul(wa, row[r][k]) for r, wa, _ in entries))
+                for k in range(len(row[users[0]]))
+            ]
             row.append(made)
         for r, _, a in entries:
             factor = graph.mul(a, over)
             self._sizes[r] = self._size(r) + np.abs(self._at([factor])[0]) * self._sizes[new]
             for row in (A, self.right):
-                row[r] = [self.forms.simplified(graph.sub(x, graph.mul(factor, p))) for x, p in zip(row[r], row[new], strict=True)]
+                row[r] = [
+                    self.forms.simplified(graph.sub(x, graph.mul(factor, p)))
+                    for x, p in zip(row[r], row[new], strict=True)
+                ]
             A[r][c] = graph.zero
         A[new][c] = squares
         self._changed()
@@ -335,7 +382,11 @@ def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.nda
 
 def turns(graph: Graph, node: int) -> bool:
     """Return whether a node is the sine or cosine of a parameter, which may be any angle."""
-    return graph.op[node] in ("sin", "cos") and graph.op[graph.args[node][0]] == "input" and not graph.varies[node]
+    return (
+        graph.op[node] in ("sin", "cos")
+        and graph.op[graph.args[node][0]] == "input"
+        and not graph.varies[node]
+    )
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:

@@ -79,8 +79,14 @@ def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
 def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
     if node not in known:
         op, args = graph.operation(node)
-        squared = op in ("sqrt", "abs", "exp", "cosh") or (op == "mul" and args[0] == args[1]) or (op == "const" and graph.value[node] >= 0)
-        known[node] = squared or (op in ("add", "mul", "div") and all(_is_never_negative(graph, a, known) for a in args))
+        squared = (
+            op in ("sqrt", "abs", "exp", "cosh")
+            or (op == "mul" and args[0] == args[1])
+            or (op == "const" and graph.value[node] >= 0)
+        )
+        known[node] = squared or (
+            op in ("add", "mul", "div") and all(_is_never_negative(graph, a, known) for a in args)
+        )
     return known[node]
 
 
@@ -104,11 +110,16 @@ def where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
     """Return the outputs for a positive and for a negative number of these relations (from `switches`)."""
     outputs = list(outputs)
-    above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
+    above, below = (
+        graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes})
+        for side in (1, -1)
+    )
     return above, below
 
 
-def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]) -> tuple[Indices, Indices]:
+def relations(
+    graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]
+) -> tuple[Indices, Indices]:
     """Return the numbers whose signs are monitored, in two parts: those in the rates,
     and those only in stop events.
 
@@ -190,7 +201,10 @@ def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int],
     count = min(len(positive), len(negative), 6)  # number of zeros
     if not count:
         return
-    a, b = ({name: np.broadcast_to(x, probes.count)[k[:count]] for name, x in probes.inputs.items()} for k in (positive, negative))
+    a, b = (
+        {name: np.broadcast_to(x, probes.count)[k[:count]] for name, x in probes.inputs.items()}
+        for k in (positive, negative)
+    )
 
     def at(share) -> dict[str, np.ndarray]:
         return {name: a[name] + share * (b[name] - a[name]) for name in a}

@@ -8,8 +8,8 @@ side of a relation the state is.
     c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
 
 No branch changes within a step: the event search ends the step where x vanishes, and the derivative jumps
-there as at any event (`integrate/loop/transitions.py`). Modelica treats relations the same way. If a branch is
-undefined beyond x = 0, as with `sqrt`, its relation has only the event.
+there as at any event (`integrate/loop/transitions.py`). Modelica treats relations the same way. If a branch
+is undefined beyond x = 0, as with `sqrt`, its relation has only the event.
 """
 
 from dataclasses import replace
@@ -35,7 +35,9 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     sides = [graph.input(f"side {k}", True) for k in range(len(numbers))]
     relations: dict[int, tuple[int, int, int]] = {}
     decided = switches(old, [*program.qdot, *program.ydot, *(program.events if has_events else ())])
-    first = {number: [pair for pair in nodes if old.op[pair[0]] in WHOLE][:1] for number, nodes in decided.items()}
+    first = {
+        number: [pair for pair in nodes if old.op[pair[0]] in WHOLE][:1] for number, nodes in decided.items()
+    }
     wholes = [bool(first.get(number)) for number in numbers]
     for number, side in zip(numbers, sides, strict=True):
         if number in program.sided:
@@ -50,7 +52,10 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     new = graph.copied([program.power, *numbers, *(n for part in nodes.values() for n in part)], old, new)
     copied: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
     copied |= dict.fromkeys(("relations", "event_relations", "jumps"), ())
-    x = [_counted(graph, old, first[n][0], new) if whole else new[n] for n, whole in zip(numbers, wholes, strict=True)]
+    x = [
+        _counted(graph, old, first[n][0], new) if whole else new[n]
+        for n, whole in zip(numbers, wholes, strict=True)
+    ]
     inputs = np.array([*(new[n] for n in program.traced.inputs.tolist()), *sides], np.int64)
     parts = program.traced.q, program.traced.u
     # no dependent speeds
@@ -92,7 +97,13 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         inputs=(*program.inputs, *(f"side {k}" for k in range(len(sides)))),
         fixed=tuple(new[n] for n in program.fixed),
         power=new[program.power],
-        **copied | {"events": (*events, *falls), "resets": tuple(resets), "stops": (*stops, *[False] * len(sides)), "z": ()},
+        **copied
+        | {
+            "events": (*events, *falls),
+            "resets": tuple(resets),
+            "stops": (*stops, *[False] * len(sides)),
+            "z": (),
+        },
         sides=tuple(wholes),
     )
 
@@ -117,8 +128,7 @@ def _odd(graph: Graph, n: int) -> int:
 
 
 def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, number: int, whole: bool) -> int:
-    """Return the value of a relation on this side of its number or, `turned` by -1, of the negative number.
-    """
+    """Return the value of a relation on this side of its number or, `turned` by -1, of the negative number."""
     at_rest = graph.call("eq", side, graph.zero)
     if op in WHOLE:
         n = _whole(graph, side)

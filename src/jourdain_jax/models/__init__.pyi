@@ -7,7 +7,12 @@ from .pendulums import DoublePendulumAngles, DoublePendulumRods, PendulumChain, 
 from .registry import MODELS, model
 from .rolling_solids import BallOnTurntable, Rattleback
 from .turning_bodies import FreeRigidBody, Suslov
-from .two_wheel_axle import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
+from .two_wheel_axle import (
+    TwoWheelAxleCoordinates,
+    TwoWheelAxleFree,
+    TwoWheelAxleQuasi,
+    TwoWheelAxleRedundant,
+)
 from .whipple_bicycle import WhippleBicycle
 
 __all__ = [

@@ -33,7 +33,10 @@ class Skate(Scene):
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y heading")
-    conventions = "x down the slope, y across it, z along its normal; heading from x towards y; the blade is along body x."
+    conventions = (
+        "x down the slope, y across it, z along its normal; heading from x towards y; the blade is along"
+        " body x."
+    )
     example = {"heading_rate": 1.3}
     example_span = 10.0
 
@@ -53,7 +56,10 @@ class Skate(Scene):
     def invariants(self, motion):
         turn = motion.u.heading_rate
         push = self.gravity * jnp.sin(self.slope)
-        return {"turn rate": turn, "speed and heading": _forward(motion) * turn - push * jnp.sin(motion.q.heading)}
+        return {
+            "turn rate": turn,
+            "speed and heading": _forward(motion) * turn - push * jnp.sin(motion.q.heading),
+        }
 
 
 class ChaplyginSleigh(Scene):
@@ -72,8 +78,9 @@ class ChaplyginSleigh(Scene):
 
     mass: Parameter = parameter(1.3, unit="kg", positive=True)
     inertia: Parameter = parameter(0.4, unit="kg m^2", positive=True, about="I, about the mass centre")
-    offset: Parameter = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative "
-        "behind it")
+    offset: Parameter = parameter(
+        0.25, unit="m", about="a, of the mass centre ahead of the blade; negative behind it"
+    )
 
     coordinates = coordinates("x y heading")
     conventions = "z up; heading from x towards y; the blade is along body x; x, y of the mass centre."
@@ -91,7 +98,13 @@ class ChaplyginSleigh(Scene):
         feet = [jnp.array([0.3, y, z]) for y, z in ((0.2, 0.0), (0.2, 0.1), (-0.2, 0.1), (-0.2, 0.0))]
         corners = [feet[0], feet[1], self._blade() + above, feet[2], feet[3]]
         blade = Visual.box((0.14, 0.006, 0.1), at=self._blade() + 0.5 * above, colour="#8a8a86")
-        return {"sleigh": [Visual.line(*corners, radius=0.014), blade, Visual.ball(0.035, at=above, colour="#444444")]}
+        return {
+            "sleigh": [
+                Visual.line(*corners, radius=0.014),
+                blade,
+                Visual.ball(0.035, at=above, colour="#444444"),
+            ]
+        }
 
     def invariants(self, motion):
         turn = motion.u.heading_rate
@@ -137,10 +150,12 @@ class Snakeboard(Scene):
     """
 
     mass: Parameter = parameter(6.0, unit="kg", positive=True, about="of everything")
-    half_length: Parameter = parameter(0.2, unit="m", positive=True, about="l, from the middle to a wheel "
-        "pair")
-    board_inertia: Parameter = parameter(0.1, unit="kg m^2", positive=True, about="J, with the masses of "
-        "rotor and wheels")
+    half_length: Parameter = parameter(
+        0.2, unit="m", positive=True, about="l, from the middle to a wheel pair"
+    )
+    board_inertia: Parameter = parameter(
+        0.1, unit="kg m^2", positive=True, about="J, with the masses of rotor and wheels"
+    )
     rotor_inertia: Parameter = parameter(0.05, unit="kg m^2", positive=True, about="Jr")
     wheel_inertia: Parameter = parameter(0.002, unit="kg m^2", positive=True, about="Jw, of one wheel pair")
 
@@ -163,13 +178,23 @@ class Snakeboard(Scene):
 
     def visuals(self, pose):
         l = self.half_length
-        deck, rotor = (Visual.box(l * jnp.array(sides), at=l * jnp.array([0.0, 0.0, z])) for sides, z in (((2.6, 0.3, 0.08), 0.42), ((1.3, 0.14, 0.1), 0.6)))
+        deck, rotor = (
+            Visual.box(l * jnp.array(sides), at=l * jnp.array([0.0, 0.0, z]))
+            for sides, z in (((2.6, 0.3, 0.08), 0.42), ((1.3, 0.14, 0.1), 0.6))
+        )
         ends = [l * jnp.array([0.0, y, 0.16]) for y in (-0.4, 0.4)]
-        trucks = [Visual.line(*ends, radius=0.05 * l), *(Visual.wheel(0.16 * l, 0.1 * l, at=end) for end in ends)]
+        trucks = [
+            Visual.line(*ends, radius=0.05 * l),
+            *(Visual.wheel(0.16 * l, 0.1 * l, at=end) for end in ends),
+        ]
         return {"board": deck, "rotor": rotor, "front": trucks, "back": trucks}
 
     def loads(self, motion):
-        return (generalized_force(motion, rotor_rate=motion.inputs.rotor_torque, steer_rate=motion.inputs.steer_torque),)
+        return (
+            generalized_force(
+                motion, rotor_rate=motion.inputs.rotor_torque, steer_rate=motion.inputs.steer_torque
+            ),
+        )
 
     def velocity_constraints(self, motion):
         return {"front wheels": _edge(motion["front"]), "back wheels": _edge(motion["back"])}
@@ -204,7 +229,9 @@ class TrailerChain(Scene):
 
     inputs = inputs("drive turn")
     privileged = ("forward0", "turn0")
-    conventions = "z up; headings from x towards y; x, y of the axle; hitch of a trailer on the axle of the body ahead."
+    conventions = (
+        "z up; headings from x towards y; x, y of the axle; hitch of a trailer on the axle of the body ahead."
+    )
 
     def __check_init__(self):
         checked_whole(self.trailers, "`trailers` of `TrailerChain`", 0, expected=">= 0")
@@ -237,18 +264,31 @@ class TrailerChain(Scene):
         headings, lengths = jnp.asarray(headings), self._per_trailer(self.length)
         x = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.cos(headings[1:]))])
         y = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.sin(headings[1:]))])
-        values = {f"{name}{i}": given[i] for name, given in (("x", x), ("y", y), ("heading", headings)) for i in range(self.trailers + 1)}
+        values = {
+            f"{name}{i}": given[i]
+            for name, given in (("x", x), ("y", y), ("heading", headings))
+            for i in range(self.trailers + 1)
+        }
         return values | {"forward0": jnp.asarray(forward), "turn0": jnp.asarray(turn)}
 
     def bodies(self, t, q):
         masses = jnp.append(self.car_mass, self._per_trailer(self.trailer_mass))
         moments = jnp.append(self.car_inertia, self._per_trailer(self.trailer_inertia))
-        return {_name(i): _level(mass, moments[i], q[f"x{i}"], q[f"y{i}"], rot_z(q[f"heading{i}"])) for i, mass in enumerate(masses)}
+        return {
+            _name(i): _level(mass, moments[i], q[f"x{i}"], q[f"y{i}"], rot_z(q[f"heading{i}"]))
+            for i, mass in enumerate(masses)
+        }
 
     def visuals(self, pose):
-        cart = [Visual.box((0.36, 0.26, 0.14), at=(0.0, 0.0, 0.17)), *(Visual.wheel(0.1, 0.05, at=(0.0, side, 0.1)) for side in (-0.18, 0.18))]
+        cart = [
+            Visual.box((0.36, 0.26, 0.14), at=(0.0, 0.0, 0.17)),
+            *(Visual.wheel(0.1, 0.05, at=(0.0, side, 0.1)) for side in (-0.18, 0.18)),
+        ]
         axle, ahead = jnp.array([0.0, 0.0, 0.1]), jnp.array([1.0, 0.0, 0.0])
-        tongues = [Visual.line(axle, axle + length * ahead, radius=0.015, colour="#8a8a86") for length in self._per_trailer(self.length)]
+        tongues = [
+            Visual.line(axle, axle + length * ahead, radius=0.015, colour="#8a8a86")
+            for length in self._per_trailer(self.length)
+        ]
         return {"car": cart} | {_name(i): [*cart, tongue] for i, tongue in enumerate(tongues, 1)}
 
     def coordinate_rates(self, t, q, u):

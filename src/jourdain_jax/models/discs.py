@@ -14,7 +14,8 @@ from jourdain_jax.scene.parameter_fields import parameter
 
 
 class VerticalDisc(Heavy):
-    """An upright disc that rolls and turns on a level plane: both rates are constant, the path is a circle or a straight line.
+    """An upright disc that rolls and turns on a level plane: both rates are constant, the path is a circle or
+    a straight line.
 
         xdot = R cos(heading) rolldot,   ydot = R sin(heading) rolldot
 
@@ -64,7 +65,11 @@ class _ThinDisc(Heavy):
     example_span = 10.0
 
     def _disc(self, centre, orientation) -> dict[str, RigidBody]:
-        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=orientation)}
+        return {
+            "disc": RigidBody.thin_disc(
+                self.mass, self.radius, axis="y", position=centre, orientation=orientation
+            )
+        }
 
 
 class TiltingDisc(_ThinDisc):
@@ -80,7 +85,10 @@ class TiltingDisc(_ThinDisc):
 
     coordinates = coordinates("x y yaw lean spin")
     domain = {"lean": (-1.2, 1.2)}
-    conventions = "z up; upright at lean = 0, heading along x at yaw = 0; axle along body y; positive spin rolls forward."
+    conventions = (
+        "z up; upright at lean = 0, heading along x at yaw = 0; axle along body y; positive spin rolls"
+        " forward."
+    )
     example = {"lean": 0.3, "yaw_rate": 0.5, "lean_rate": 0.2, "spin_rate": -3.0}
 
     def bodies(self, t, q):
@@ -113,7 +121,9 @@ class TiltingDiscQuaternion(_ThinDisc):
 
     coordinates = coordinates("x y z", quaternion("attitude"))
     domain = {"z": (0.05, 0.5), **{f"attitude_omega_{axis}": (-3.0, 3.0) for axis in "xyz"}}
-    conventions = "z up; x, y, z of the centre; upright and heading along x at identity attitude; axle along body y."
+    conventions = (
+        "z up; x, y, z of the centre; upright and heading along x at identity attitude; axle along body y."
+    )
     example = {
         "y": -0.5 * math.sin(_TILTED["lean"]),
         "attitude_w": math.cos(_TILTED["lean"] / 2),

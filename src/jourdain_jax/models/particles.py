@@ -53,7 +53,10 @@ class RosenbergParticle(_OnSheets):
         return self._with_plane(jnp.stack([-pose.q.y, 0.0 * pose.q.y, 1.0 + 0.0 * pose.q.y]))
 
     def invariants(self, motion):
-        return {"y rate": motion.u.y_rate, "speed in the sheet": motion.u.x_rate * jnp.sqrt(1 + motion.q.y**2)}
+        return {
+            "y rate": motion.u.y_rate,
+            "speed in the sheet": motion.u.x_rate * jnp.sqrt(1 + motion.q.y**2),
+        }
 
 
 class HeisenbergParticle(_OnSheets):
@@ -118,4 +121,8 @@ class IsokineticParticle(Heavy):
 
     def invariants(self, motion):
         # x = (c^2/g) gd(tau) and theta = -gd(tau)
-        return {"x and direction": self.gravity * motion.q.x + self.speed**2 * jnp.arctan2(motion.u.z_rate, motion.u.x_rate)}
+        return {
+            "x and direction": (
+                self.gravity * motion.q.x + self.speed**2 * jnp.arctan2(motion.u.z_rate, motion.u.x_rate)
+            )
+        }

@@ -28,7 +28,11 @@ class _DoublePendulum(Heavy):
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     def visuals(self, pose):
-        return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
+        return {
+            "": Visual.line(
+                jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1
+            )
+        }
 
 
 class DoublePendulumAngles(_DoublePendulum):
@@ -51,7 +55,10 @@ class DoublePendulumAngles(_DoublePendulum):
 
     def bodies(self, t, q):
         first = self.length1 * _along(q.theta1)
-        return {"first": Particle(self.mass1, first), "second": Particle(self.mass2, first + self.length2 * _along(q.theta2))}
+        return {
+            "first": Particle(self.mass1, first),
+            "second": Particle(self.mass2, first + self.length2 * _along(q.theta2)),
+        }
 
 
 def _along(angle) -> Vector3:
@@ -74,14 +81,26 @@ class DoublePendulumRods(_DoublePendulum):
     coordinates = coordinates("x1 z1 x2 z2")
     domain = {"x2": (-1.5, 1.5), "z2": (-1.5, 1.5)}
     conventions = "x horizontal, z up; pivot at the origin."
-    example = {"x1": 0.6, "z1": -0.8, "x2": 0.6, "z2": -1.6, "x1_rate": 0.4, "z1_rate": 0.3, "x2_rate": 0.4, "z2_rate": 0.3}
+    example = {
+        "x1": 0.6,
+        "z1": -0.8,
+        "x2": 0.6,
+        "z2": -1.6,
+        "x1_rate": 0.4,
+        "z1_rate": 0.3,
+        "x2_rate": 0.4,
+        "z2_rate": 0.3,
+    }
 
     def bodies(self, t, q):
         return _in_plane(self, q)
 
     def geometric_constraints(self, pose):
         first, second = pose["first"].position, pose["second"].position
-        return {"upper rod": rod(jnp.zeros(3), first, self.length1), "lower rod": rod(first, second, self.length2)}
+        return {
+            "upper rod": rod(jnp.zeros(3), first, self.length1),
+            "lower rod": rod(first, second, self.length2),
+        }
 
 
 def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Particle]:
@@ -136,7 +155,12 @@ class SpringAndRod(Scene):
 
     def visuals(self, pose):
         first, second = pose["first"].position, pose["second"].position
-        return {"": [Visual.coil(jnp.zeros(3), first, 0.06 * self.rod_length), Visual.line(first, second, radius=0.02 * self.rod_length)]}
+        return {
+            "": [
+                Visual.coil(jnp.zeros(3), first, 0.06 * self.rod_length),
+                Visual.line(first, second, radius=0.02 * self.rod_length),
+            ]
+        }
 
 
 class PendulumChain(Heavy):

@@ -8,7 +8,12 @@ from jourdain_jax.scene.names import Labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
 PLACES = {  # module -> names of its models; modules are imported on first use
-    "two_wheel_axle": ("two-wheel-axle-free", "two-wheel-axle-coordinates", "two-wheel-axle-quasi", "two-wheel-axle-redundant"),
+    "two_wheel_axle": (
+        "two-wheel-axle-free",
+        "two-wheel-axle-coordinates",
+        "two-wheel-axle-quasi",
+        "two-wheel-axle-redundant",
+    ),
     "blades": ("skate", "chaplygin-sleigh", "snakeboard", "trailer-chain"),
     "discs": ("vertical-disc", "tilting-disc", "tilting-disc-quaternion"),
     "particles": ("rosenberg-particle", "heisenberg-particle", "isokinetic-particle"),
@@ -17,7 +22,11 @@ PLACES = {  # module -> names of its models; modules are imported on first use
     "whipple_bicycle": ("whipple-bicycle",),
     "pendulums": ("double-pendulum-rods", "double-pendulum-angles", "spring-and-rod", "pendulum-chain"),
 }
-CLASSES = {"".join(map(str.capitalize, name.split("-"))): module for module, names in PLACES.items() for name in names}
+CLASSES = {
+    "".join(map(str.capitalize, name.split("-"))): module
+    for module, names in PLACES.items()
+    for name in names
+}
 _CLASS_OF = dict(zip((name for names in PLACES.values() for name in names), CLASSES, strict=True))
 
 
@@ -58,4 +67,8 @@ def known_model(name: str) -> type[Scene]:
 
 def counts_of(kind: type[Scene]) -> Labels:
     """Return names of the integers that determine the structure of a scene, such as a number of links."""
-    return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))
+    return tuple(
+        field.name
+        for field in fields(kind)
+        if field.metadata.get("static") and isinstance(field.default, int)
+    )

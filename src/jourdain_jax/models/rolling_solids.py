@@ -34,8 +34,9 @@ class BallOnTurntable(Heavy):
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
     radius: Parameter = parameter(0.05, unit="m", positive=True)
     inertia_ratio: Parameter = parameter(0.4, positive=True, about="kappa = I/(m r^2): 2/5 solid, 2/3 hollow")
-    turn_rate: Parameter = parameter(2.0, unit="rad/s", about="Om, of the table about its normal through the "
-        "origin")
+    turn_rate: Parameter = parameter(
+        2.0, unit="rad/s", about="Om, of the table about its normal through the origin"
+    )
     tilt: Parameter = parameter(0.0, unit="rad", about="of the table, down along x")
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
@@ -43,7 +44,10 @@ class BallOnTurntable(Heavy):
     speeds = speeds("x_rate y_rate roll_x roll_y spin")
     privileged = ("x_rate", "y_rate", "spin")
     domain = dict.fromkeys(("roll_x", "roll_y", "spin"), (-10.0, 10.0))
-    conventions = "z up; x, y along the table (x downhill when tilt > 0, y level), which turns anticlockwise about its normal."
+    conventions = (
+        "z up; x, y along the table (x downhill when tilt > 0, y level), which turns anticlockwise about its"
+        " normal."
+    )
     example = {"x": 0.2, "x_rate": 0.1, "y_rate": 0.3, "spin": 1.0}
     example_span = 10.0
 
@@ -51,7 +55,11 @@ class BallOnTurntable(Heavy):
         x_axis, y_axis, normal = self._axes()
         centre = q.x * x_axis + q.y * y_axis + self.radius * normal
         turned = quaternion_to_matrix(q.attitude)
-        return {"ball": RigidBody.ball(self.mass, self.radius, position=centre, orientation=turned, factor=self.inertia_ratio)}
+        return {
+            "ball": RigidBody.ball(
+                self.mass, self.radius, position=centre, orientation=turned, factor=self.inertia_ratio
+            )
+        }
 
     def coordinate_rates(self, t, q, u):
         omega = jnp.stack([u.roll_x, u.roll_y, u.spin]) @ self._axes()  # space components
@@ -66,7 +74,11 @@ class BallOnTurntable(Heavy):
     def visuals(self, pose):
         axes, width = self._axes().T, 0.2 * self.radius
         turned = axes @ rot_z(self.turn_rate * pose.t)
-        return {"": Visual.wheel(12 * self.radius, width, axis="z", at=-width / 2 * axes[:, 2], turn=turned, colour="#b9b2a4")}
+        return {
+            "": Visual.wheel(
+                12 * self.radius, width, axis="z", at=-width / 2 * axes[:, 2], turn=turned, colour="#b9b2a4"
+            )
+        }
 
     def invariants(self, motion):
         q, u = motion.q, motion.u
@@ -159,4 +171,6 @@ class Rattleback(Heavy):
 
     def _inertia(self) -> Matrix3:
         o = jnp.zeros_like(self.A)
-        return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])
+        return jnp.stack(
+            [jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])]
+        )

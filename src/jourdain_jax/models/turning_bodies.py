@@ -29,13 +29,20 @@ class FreeRigidBody(Scene):
     i3: Parameter = parameter(2.5, unit="kg m^2", positive=True)
 
     coordinates = coordinates("x y z", quaternion("attitude"))
-    conventions = "Right-handed inertial axes; attitude takes body to space; i1, i2, i3 about body x, y, z through the mass centre."
+    conventions = (
+        "Right-handed inertial axes; attitude takes body to space; i1, i2, i3 about body x, y, z through the"
+        " mass centre."
+    )
     example = {"attitude_omega_x": 0.9, "attitude_omega_y": 0.4, "attitude_omega_z": -0.7}
     example_span = 20.0
 
     def bodies(self, t, q):
         moments = jnp.stack([self.i1, self.i2, self.i3])
-        return {"body": RigidBody(self.mass, moments, jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude))}
+        return {
+            "body": RigidBody(
+                self.mass, moments, jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude)
+            )
+        }
 
     def invariants(self, motion):
         body = motion["body"]
@@ -66,7 +73,10 @@ class Suslov(Scene):
 
     coordinates = coordinates(quaternion("attitude"))
     privileged = ("attitude_omega_x", "attitude_omega_y")
-    conventions = "Fixed point at the origin; attitude takes body to space; i13 is the entry of the matrix, minus the integral of x z."
+    conventions = (
+        "Fixed point at the origin; attitude takes body to space; i13 is the entry of the matrix, minus the"
+        " integral of x z."
+    )
     example = {"attitude_omega_x": 0.6, "attitude_omega_y": 0.8}
     example_span = 10.0
 
@@ -75,7 +85,9 @@ class Suslov(Scene):
         inertia = [[self.i11, o, self.i13], [o, self.i22, o], [self.i13, o, self.i33]]
         attitude = quaternion_to_matrix(q.attitude)
         mass = 1.0 + o  # irrelevant: the mass centre is fixed
-        return {"body": RigidBody(mass, jnp.stack([jnp.stack(row) for row in inertia]), jnp.zeros(3), attitude)}
+        return {
+            "body": RigidBody(mass, jnp.stack([jnp.stack(row) for row in inertia]), jnp.zeros(3), attitude)
+        }
 
     def velocity_constraints(self, motion):
         return {"no turn about axis 3": motion["body"].angular_velocity_body[2]}

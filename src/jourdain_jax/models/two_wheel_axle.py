@@ -32,10 +32,12 @@ class _TwoWheelAxle(Scene):
 
     radius: Parameter = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
     length: Parameter = parameter(0.8, unit="m", positive=True, about="l, of the axle")
-    mass: Parameter = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its "
-        "centre")
-    rim_mass: Parameter = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 "
-        "and m'a^2/2")
+    mass: Parameter = parameter(
+        1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre"
+    )
+    rim_mass: Parameter = parameter(
+        0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2"
+    )
     slope: Parameter = parameter(0.2, unit="rad", about="alpha, of the incline")
     gravity: Parameter = parameter(9.81, unit="m/s^2")
 
@@ -67,7 +69,10 @@ class _TwoWheelAxle(Scene):
         """Return the rolling contacts of both wheels. Each wheel carries its own weight, since the axle
         transmits no load.
         """
-        return {wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,)) for wheel in ("wheel1", "wheel2")}
+        return {
+            wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,))
+            for wheel in ("wheel1", "wheel2")
+        }
 
     def _axle_row(self, psi1_rate, psi2_rate, phi_rate):
         # (61): a psidot_2 = a psidot_1 - l phidot
@@ -99,7 +104,11 @@ class _FreeWheels(_TwoWheelAxle):
         }
 
     def geometric_constraints(self, pose):
-        return {"wheel1 upright": pose.q.theta1, "wheel2 upright": pose.q.theta2, "one heading": pose.q.phi1 - pose.q.phi2}
+        return {
+            "wheel1 upright": pose.q.theta1,
+            "wheel2 upright": pose.q.theta2,
+            "one heading": pose.q.phi1 - pose.q.phi2,
+        }
 
     def contacts(self, pose):
         return self._rolling(pose, "row")

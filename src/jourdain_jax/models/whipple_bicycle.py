@@ -37,8 +37,9 @@ class WhippleBicycle(Scene):
 
     x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
 
-    Inputs, both positive to the right (N m): `lean_torque` from outside on the rear frame about the level line through the rear
-    contact; `steer_torque` on the front frame about the steer axis, with its reaction on the rear frame.
+    Inputs, both positive to the right (N m): `lean_torque` from outside on the rear frame about the level
+    line through the rear contact; `steer_torque` on the front frame about the steer axis, with its reaction
+    on the rear frame.
     """
 
     w: Parameter = parameter(1.02, unit="m", positive=True, about="wheelbase")
@@ -111,8 +112,10 @@ class WhippleBicycle(Scene):
             check_name(name, names, f"unknown bicycle parameter `{name}`")
         missing = [name for name in names if name not in values]
         if missing:
-            raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; "
-                f"give all {len(names)}")
+            raise ValueError(
+                f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; "
+                f"give all {len(names)}"
+            )
         return cls(**values)
 
     def upright(self, speed) -> dict[str, Scalar]:
@@ -126,7 +129,8 @@ class WhippleBicycle(Scene):
         contact = jnp.stack([q.x, q.y, 0.0 * q.x])
         wheel_plane = rot_z(q.yaw) @ rot_x(q.lean)
         rear = wheel_plane @ rot_y(q.pitch)
-        # about the steer axis (sin lam, 0, -cos lam) by +steer: about its opposite, the z axis tilted back, by -steer
+        # about the steer axis (sin lam, 0, -cos lam) by +steer: about its opposite, the z axis tilted back,
+        # by -steer
         front = rear @ rot_y(-self.lam) @ rot_z(-q.steer) @ rot_y(self.lam)
         rear_centre = contact + self.rR * wheel_plane[:, 2]
         # intersection of the axis and the ground when upright
@@ -135,29 +139,56 @@ class WhippleBicycle(Scene):
         frame_centre = rear_centre + rear @ _vector(self.xB, self.zB + self.rR)
         fork_centre = on_steer_axis + front @ _vector(self.xH - self.w - self.c, self.zH)
         return {
-            "rear wheel": _wheel(self.mR, self.rR, self.IRxx, self.IRyy, rear_centre, rear @ rot_y(q.rear_spin)),
-            "rear frame": RigidBody(self.mB, _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz), frame_centre, rear),
-            "front frame": RigidBody(self.mH, _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz), fork_centre, front),
-            "front wheel": _wheel(self.mF, self.rF, self.IFxx, self.IFyy, front_centre, front @ rot_y(q.front_spin)),
+            "rear wheel": _wheel(
+                self.mR, self.rR, self.IRxx, self.IRyy, rear_centre, rear @ rot_y(q.rear_spin)
+            ),
+            "rear frame": RigidBody(
+                self.mB, _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz), frame_centre, rear
+            ),
+            "front frame": RigidBody(
+                self.mH, _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz), fork_centre, front
+            ),
+            "front wheel": _wheel(
+                self.mF, self.rF, self.IFxx, self.IFyy, front_centre, front @ rot_y(q.front_spin)
+            ),
         }
 
     def visuals(self, pose):
         """Return shapes: bars from the hubs to the steer axis for frame and fork; the rider's mass centre as
         a ball.
         """
-        on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)  # noqa: E731, points of the plane of symmetry in the source's axes
-        head, top, hub, saddle = on_axis(-2.1 * self.rF), on_axis(-2.6 * self.rF), (0.0, -self.rR), (0.26 * self.w, -2.5 * self.rR)
+        on_axis = lambda z: (
+            self.w + self.c + z * jnp.tan(self.lam),
+            z,
+        )
+        head, top, hub, saddle = (
+            on_axis(-2.1 * self.rF),
+            on_axis(-2.6 * self.rF),
+            (0.0, -self.rR),
+            (0.26 * self.w, -2.5 * self.rR),
+        )
         crank = (0.42 * self.w, -0.85 * self.rR)
-        bars = {"rear frame": (self.xB, self.zB, (hub, crank, head, saddle, crank)), "front frame": (self.xH, self.zH, ((self.w, -self.rF), head, top))}
-        lines = {name: [Visual.line(*(_vector(px - x, pz - z) for px, pz in points), radius=0.045 * self.rR)] for name, (x, z, points) in bars.items()}
-        wheels = {name: Visual.wheel(radius, 0.12 * radius) for name, radius in (("rear wheel", self.rR), ("front wheel", self.rF))}
+        bars = {
+            "rear frame": (self.xB, self.zB, (hub, crank, head, saddle, crank)),
+            "front frame": (self.xH, self.zH, ((self.w, -self.rF), head, top)),
+        }
+        lines = {
+            name: [Visual.line(*(_vector(px - x, pz - z) for px, pz in points), radius=0.045 * self.rR)]
+            for name, (x, z, points) in bars.items()
+        }
+        wheels = {
+            name: Visual.wheel(radius, 0.12 * radius)
+            for name, radius in (("rear wheel", self.rR), ("front wheel", self.rF))
+        }
         grip = _vector(top[0] - self.xH, top[1] - self.zH)
         lines["front frame"].append(Visual.cylinder(0.045 * self.rR, 0.44 * self.w, axis="y", at=grip))
         lines["rear frame"].append(Visual.ball(0.2 * self.rR, opacity=0.6))
         return lines | wheels
 
     def loads(self, motion):
-        torques = generalized_force(motion, lean_rate=motion.inputs.lean_torque, steer_rate=motion.inputs.steer_torque)
+        torques = generalized_force(
+            motion, lean_rate=motion.inputs.lean_torque, steer_rate=motion.inputs.steer_torque
+        )
         return gravity(motion, self.g), torques
 
     def contacts(self, pose):
@@ -185,8 +216,7 @@ class WhippleBicycle(Scene):
 
 
 def _vector(x, z) -> Vector3:
-    """Return components (x, 0, -z), in the engine's axes, of a vector in the plane of symmetry with z down.
-    """
+    """Return components (x, 0, -z), in the engine's axes, of a vector in the plane of symmetry with z down."""
     x, z = jnp.asarray(x), jnp.asarray(z)
     return jnp.stack([x, jnp.zeros_like(x), -z])
 
@@ -200,4 +230,6 @@ def _inertia(xx, yy, zz, xz) -> Matrix3:
 
 
 def _wheel(mass, radius, diametral, axial, centre, orientation) -> RigidBody:
-    return RigidBody.thin_disc(mass, radius, axis="y", position=centre, orientation=orientation, axial=axial, diametral=diametral)
+    return RigidBody.thin_disc(
+        mass, radius, axis="y", position=centre, orientation=orientation, axial=axial, diametral=diametral
+    )

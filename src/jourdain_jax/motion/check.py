@@ -1,9 +1,9 @@
 """Likely mistakes of a scene, in one table: computable, but hardly intended.
 
-    smoothness        poses, constraints and coordinate rates that jump or have kinks on lines through states of the domain
-    grounds           behaviour of contact grounds against their description
-    bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all conditions checked at the start of a motion
-    scalar program    its rates and slopes against JAX's
+smoothness        poses, constraints and coordinate rates that jump or have kinks on lines through states of the domain
+grounds           behaviour of contact grounds against their description
+bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all conditions checked at the start of a motion
+scalar program    its rates and slopes against JAX's
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,7 @@ from jourdain_jax.structure.structure import structure_whatever_its_faults
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes, none if plausible. `print` shows a table.
-    """
+    """Findings of `check`: subject -> sentences on likely mistakes, none if plausible. `print` shows a table."""
 
     scene: str
     found: dict[str, tuple[str, ...]]
@@ -33,8 +32,9 @@ class Checked(Printed):
 
     def _text(self) -> str:
         rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
-        return "\n".join([
-            f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
+        return "\n".join(
+            [f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows]
+        )
 
 
 @shown_from_users_lines
@@ -62,7 +62,9 @@ def _checked(scene: Scene, every_speed: bool | None) -> Checked:
         "smoothness": known.kinks,
         "grounds": known.odd_grounds,
         "bodies": known.faults or known.odd_bodies,
-        "scalar program": (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else (),
+        "scalar program": (
+            (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else ()
+        ),
     }
     return Checked(type(scene).__name__, found)
 

@@ -40,7 +40,9 @@ class _Rates(eqx.Module):
 
     def __call__(self, t, y, args) -> tuple:
         q, u = y
-        found = self.field.rates(Instant(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t)))
+        found = self.field.rates(
+            Instant(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t))
+        )
         return found.q, found.v
 
 
@@ -88,15 +90,27 @@ class Diffrax(eqx.Module, Integrator):
         return "the solver is a diffrax solver"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        forward, reverse = (partial(self._solved, adjoint) for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()))
+        forward, reverse = (
+            partial(self._solved, adjoint)
+            for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint())
+        )
         return (forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE))(setup, begun)
 
     def _solved(self, adjoint: diffrax.AbstractAdjoint, setup: Setup, begun: Begun) -> Solved:
         origin, knots = begun.args[4], setup.knots
         t0, t1, ts = setup.t0 - origin, setup.t1 - origin, setup.ts - origin
         rtol, atol = setup.tolerances
-        control = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
-        control = diffrax.ClipStepSizeController(control, step_ts=ts, jump_ts=None if knots is None else knots)
+        control = diffrax.PIDController(
+            rtol=rtol,
+            atol=atol,
+            norm=integrands.state_norm,
+            dtmin=setup.shortest,
+            dtmax=setup.longest,
+            force_dtmin=False,
+        )
+        control = diffrax.ClipStepSizeController(
+            control, step_ts=ts, jump_ts=None if knots is None else knots
+        )
         # flip: values fall, which is not looked for; in lanes without an event it would be an error
         search = optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0), flip=True)
         event = diffrax.Event(_lowest, search, direction=False)
@@ -133,8 +147,13 @@ class Diffrax(eqx.Module, Integrator):
             event_index = jnp.where(code == result_codes.EVENT, first, event_index)
             over = _over_at_start(begun, t0, t1)
             happened = jnp.any(over)
-            t_end, y_end = jax.tree.map(lambda first, last: jnp.where(happened, first, last), (t0, begun.y0), (t_end, y_end))
-            reached, code = reached & (~happened | (found_ts == t0)), jnp.where(happened, result_codes.EVENT, code)
+            t_end, y_end = jax.tree.map(
+                lambda first, last: jnp.where(happened, first, last), (t0, begun.y0), (t_end, y_end)
+            )
+            reached, code = (
+                reached & (~happened | (found_ts == t0)),
+                jnp.where(happened, result_codes.EVENT, code),
+            )
             event_index = jnp.where(happened, jnp.argmax(over).astype(jnp.int32), event_index)
         return Solved(
             ts=found_ts,
@@ -163,10 +182,13 @@ def check(setup: Setup) -> None:
     if setup.field.with_work:
         raise ValueError(
             f"solver=diffrax.{solver}() cannot integrate the work of loads of `{name}` that have no "
-                "potential; pass work=False or omit `solver`"
+            "potential; pass work=False or omit `solver`"
         )
     if reason_against_watching(setup):
-        text = f"diffrax.{solver} may step over jumps and kinks in loads or events of `{name}`; omit `solver` to end steps there"
+        text = (
+            f"diffrax.{solver} may step over jumps and kinks in loads or events of `{name}`; omit `solver` to"
+            " end steps there"
+        )
         warn(text)
 
 
@@ -176,10 +198,12 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
     """
 
     def moved(h):
-        ahead = lambda y, h, f: jax.tree.map(lambda y, f: y + h * f, y, f)  # noqa: E731
+        ahead = lambda y, h, f: jax.tree.map(lambda y, f: y + h * f, y, f)
         y = begun.y0
         for t in (t0, t0 + h):
-            middle = integrands.rates(t + h / 2, ahead(y, h / 2, integrands.rates(t, y, begun.args)), begun.args)
+            middle = integrands.rates(
+                t + h / 2, ahead(y, h / 2, integrands.rates(t, y, begun.args)), begun.args
+            )
             y = ahead(y, h, middle)
         return integrands.events(t0 + 2 * h, y, begun.args)
 

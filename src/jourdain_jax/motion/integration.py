@@ -26,7 +26,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, at_index, eps_of, in_default_precision
+from jourdain_jax.calculus.reals import (
+    RUN_SELDOM,
+    Count,
+    Flag,
+    Scalar,
+    at_index,
+    eps_of,
+    in_default_precision,
+)
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
@@ -143,7 +151,10 @@ def _in_contact(setup: Setup) -> Setup:
     residual = jnp.maximum(start.residual, jax.lax.stop_gradient(below[0]))
     modes = tuple(Mode(jax.lax.stop_gradient(number)) for number in numbers)
     channels = setup.inputs.channels[: len(setup.inputs.channels) - count]
-    return setup._replace(start=eqx.tree_at(lambda s: (s.q, s.u, s.residual), start, (q, u, residual)), inputs=Inputs((*channels, *modes)))
+    return setup._replace(
+        start=eqx.tree_at(lambda s: (s.q, s.u, s.residual), start, (q, u, residual)),
+        inputs=Inputs((*channels, *modes)),
+    )
 
 
 def _begin(setup: Setup) -> Begun:
@@ -172,16 +183,31 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
 
     def saved_state(tau, y, valid):
         # unreached times may hold any value: compute at the end state, then mark as NaN
-        tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
+        tau, y = (
+            jnp.where(valid, tau, solved.t_end),
+            jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end),
+        )
         free, y = y, integrands.project(tau, y, args) if puts_back else y
         _, at = integrands.at_time(tau, y, args)
         u, pivot = field.speeds_and_pivot(at)
         work = None if y.work is None else y.work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (at.t, y), _step_errors(setup, free, y) if puts_back else None
+        return (
+            jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)),
+            pivot,
+            (at.t, y),
+            _step_errors(setup, free, y) if puts_back else None,
+        )
 
     # append start and end to the saved states, so that this is compiled once
-    start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
-    all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
+    start_and_end = (
+        (jnp.zeros_like(solved.t_end), begun.y0, begun.timely),
+        (solved.t_end, solved.y_end, begun.timely),
+    )
+    all_states = jax.tree.map(
+        lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]),
+        (solved.ts, solved.ys, valid),
+        *start_and_end,
+    )
     found, pivots, states, moved_by = jax.vmap(saved_state)(*all_states)
     found = jax.tree.map(lambda x: jnp.where(begun.right, x, jnp.nan), found)
     # Negative if A_z was singular along the motion; fmin ignores NaN, which marks a lost end. The
@@ -194,7 +220,11 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
     drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
     code = solved.code
-    for found_out, cause in ((drifted, result_codes.OFF_CONSTRAINTS), (lost, result_codes.ENERGY_LOST), (violated, result_codes.CONTRADICTORY_ROWS)):
+    for found_out, cause in (
+        (drifted, result_codes.OFF_CONSTRAINTS),
+        (lost, result_codes.ENERGY_LOST),
+        (violated, result_codes.CONTRADICTORY_ROWS),
+    ):
         code = jnp.where((code <= result_codes.EVENT) & found_out, cause, code)
     unwatched = reason_against_watching(setup)
     result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
@@ -233,8 +263,11 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         inputs=in_phases(given.inputs, transitions, solved.passed.modes, direction),
         phases=_phases(given.inputs, passed, solved.passed, integrator.event_names, given.scene.modes),
         state_form=field.name,
-        reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to "
-            "machine code",
+        reduction=(
+            field.reduction_name
+            if setup.reason_against_machine_code
+            else f"{field.reduction_name} to machine code"
+        ),
         solver=integrator.name,
         projected=field.projects,
         unwatched=unwatched,
@@ -242,7 +275,9 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     )
 
 
-def _phases(inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, names: tuple[str, ...], named: Modes) -> Phases:
+def _phases(
+    inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, names: tuple[str, ...], named: Modes
+) -> Phases:
     """Return the phases of a motion, which events at the times `ts` end."""
     there = jnp.isfinite(ts)
     first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
@@ -250,7 +285,10 @@ def _phases(inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, nam
     return Phases(
         ts,
         jnp.where(there, passed.events, -1),
-        jnp.concatenate([jnp.stack(first)[:, None] if first else jnp.zeros((0, 1)), jnp.where(there, modes, jnp.nan)], axis=1),
+        jnp.concatenate(
+            [jnp.stack(first)[:, None] if first else jnp.zeros((0, 1)), jnp.where(there, modes, jnp.nan)],
+            axis=1,
+        ),
         jnp.where(there, passed.lost, 0.0),
         names,
         named,
@@ -261,7 +299,9 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
     """Return the distance by which a projection moved a state from `free` to `y`, in tolerances of a step."""
     rtol, atol = setup.tolerances
     parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
+    return jnp.max(
+        jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts])
+    )
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
@@ -279,7 +319,9 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     else:
         nowhere = jnp.full(len(program.others), jnp.nan)
         right = value_kernels.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
-    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
+    return right, eqx.tree_at(
+        lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u))
+    )
 
 
 def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
@@ -290,9 +332,13 @@ def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     # a pivot that changed sign or is this small means that independent speeds no longer determine the others
     code = jnp.where(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION, code)
     code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, result_codes.INCONSISTENT_START)
-    code = jnp.where((code == result_codes.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED, code)
+    code = jnp.where(
+        (code == result_codes.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED, code
+    )
     # if no step succeeds, however short, the accelerations themselves are at fault
-    code = jnp.where((code == result_codes.STEP_TOO_SMALL) & (solved.accepted == 0), result_codes.NOT_FINITE, code)
+    code = jnp.where(
+        (code == result_codes.STEP_TOO_SMALL) & (solved.accepted == 0), result_codes.NOT_FINITE, code
+    )
     code = jnp.where(finite(start.q, start.u), code, result_codes.BAD_START)
     code = jnp.where(begun.timely, code, result_codes.BAD_TIMES)
     return jnp.where(begun.right, code, result_codes.BAD_PARAMETER).astype(jnp.int32)
@@ -307,7 +353,11 @@ def conserves(setup: Setup) -> bool:
     False if work is integrated, because it may be a small difference of large powers whose errors
     step-size control does not bound.
     """
-    return setup.field.conserves and all(setup.field.stops) and not isinstance(setup.integrator.solver, FixedStepMethod)
+    return (
+        setup.field.conserves
+        and all(setup.field.stops)
+        and not isinstance(setup.integrator.solver, FixedStepMethod)
+    )
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
@@ -318,7 +368,7 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
     rtol, atol = setup.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
     every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
-    at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))  # noqa: E731
+    at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))
     # loads of dense matrices may be callbacks without batching
     found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
     return found.reshape(2, -1, 2)
@@ -330,13 +380,20 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
     T, V = at.T
     E, error = T + V, jnp.sum(jnp.abs(off - at) + eps_of(at) * jnp.abs(at), axis=1)
     most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # ignores NaN
-    return most[4] + most[5] > jnp.fmax(diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
+    return most[4] + most[5] > jnp.fmax(
+        diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3]
+    )
 
 
-def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
+def rows_violated(
+    setup: Setup,
+    t: Float[Array, "times"],
+    q: Float[Array, "times coordinates"],
+    u: Float[Array, "times speeds"],
+) -> Flag:
     """Return whether some constraint is violated at some of these states, ignoring unreached ones (NaN).
 
-        |phi| > 1 % of max over time of (|phi - A u| + |A| |u|)
+    |phi| > 1 % of max over time of (|phi - A u| + |A| |u|)
     """
     scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
 

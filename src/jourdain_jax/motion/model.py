@@ -13,12 +13,23 @@ from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
-from jourdain_jax.equations.scene_parts import names_of_events, names_of_invariants, names_of_position_rows, stops
+from jourdain_jax.equations.scene_parts import (
+    names_of_events,
+    names_of_invariants,
+    names_of_position_rows,
+    stops,
+)
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
 from jourdain_jax.integrate.loop import native_motion
 from jourdain_jax.integrate.state_projection import Usual, usual_sizes
 from jourdain_jax.integrate.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
-from jourdain_jax.integrate.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
+from jourdain_jax.integrate.vector_fields.field import (
+    ByProgram,
+    Formulation,
+    VectorField,
+    as_formulation,
+    reason_for_matrices,
+)
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered
@@ -33,7 +44,14 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.probes import coordinates_on_rows
 from jourdain_jax.structure.row_program import row_program
-from jourdain_jax.structure.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
+from jourdain_jax.structure.structure import (
+    WELL_CONDITIONED,
+    Reference,
+    Structure,
+    structure_of,
+    structure_whatever_its_faults,
+    trust,
+)
 
 _BACKENDS = ("auto", "native", "xla", "dense")
 
@@ -90,7 +108,11 @@ class Model(BuiltFor, Printed):
 
     def inputs(self, given) -> Inputs:
         """Return inputs given by name; the default is cached."""
-        return self.once("inputs at rest", lambda: as_inputs(self.scene, None)) if given is None else as_inputs(self.scene, given)
+        return (
+            self.once("inputs at rest", lambda: as_inputs(self.scene, None))
+            if given is None
+            else as_inputs(self.scene, given)
+        )
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
         """Return the result of `make` for these parameters, computed once per case."""
@@ -110,14 +132,28 @@ class Model(BuiltFor, Printed):
     def rows(self) -> Rows:
         """Return the constraints of the scene: names, rank, redundant ones."""
         known = self.structure
-        return Rows(known.row_names, known.rank, known.redundant_rows, known.may_set_in, known.rank_losses, known.affine, known.homogeneous)
+        return Rows(
+            known.row_names,
+            known.rank,
+            known.redundant_rows,
+            known.may_set_in,
+            known.rank_losses,
+            known.affine,
+            known.homogeneous,
+        )
 
     @property
     def freedoms(self) -> Freedoms:
         """Return the independent speeds."""
         known, names = self.structure, self.scene.speed_names.entries
         dependent = tuple(name for i, name in enumerate(names) if i not in known.independent)
-        return Freedoms(tuple(names[i] for i in known.independent), dependent, known.chosen_by_user, known.worst_pivot, known.typical_pivot)
+        return Freedoms(
+            tuple(names[i] for i in known.independent),
+            dependent,
+            known.chosen_by_user,
+            known.worst_pivot,
+            known.typical_pivot,
+        )
 
     @property
     def dependence(self) -> Dependence:
@@ -129,7 +165,9 @@ class Model(BuiltFor, Printed):
     def conserved(self) -> Conserved:
         """Return the conserved quantities of a motion."""
         held = () if self.program is None else self.program.held
-        return Conserved(not needs_work(self.reference.scene, self.structure), held, names_of_invariants(self.scene))
+        return Conserved(
+            not needs_work(self.reference.scene, self.structure), held, names_of_invariants(self.scene)
+        )
 
     @property
     def program(self) -> Lowered | None:
@@ -158,7 +196,11 @@ class Model(BuiltFor, Printed):
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as requested'}"
-        reason = "as requested" if self.backend == "xla" else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
+        reason = (
+            "as requested"
+            if self.backend == "xla"
+            else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
+        )
         return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 
     @property
@@ -166,18 +208,24 @@ class Model(BuiltFor, Printed):
         """Return sentences on points to check."""
         said, rows = [], self.rows
         if rows.rank_losses:
-            said.append(f"constraints lose rank at {len(rows.rank_losses)} of the probed configurations, "
-                f"first at {rows.rank_losses[0]}")
+            said.append(
+                f"constraints lose rank at {len(rows.rank_losses)} of the probed configurations, "
+                f"first at {rows.rank_losses[0]}"
+            )
         if rows.may_set_in:
-            said.append(f"constraints {', '.join(rows.may_set_in)} are redundant at all probed states, but "
-                "may become independent elsewhere")
+            said.append(
+                f"constraints {', '.join(rows.may_set_in)} are redundant at all probed states, but "
+                "may become independent elsewhere"
+            )
         if self.structure.chosen_by_user and self.state == "full":
-            said.append("the scene's privileged speeds do not determine the others everywhere in its domain, "
-                "so all speeds are integrated")
+            said.append(
+                "the scene's privileged speeds do not determine the others everywhere in its domain, "
+                "so all speeds are integrated"
+            )
         if self.structure.decisions != _decisions_where_traced(self.reference.scene):
             said.append(
                 "class defaults, which replace parameters traced by JAX, would lead to other choices; under "
-                    "`jit` and derivatives use `model.replace(...)`, which keeps the choices of this model"
+                "`jit` and derivatives use `model.replace(...)`, which keeps the choices of this model"
             )
         return tuple(said)
 
@@ -189,20 +237,35 @@ class Model(BuiltFor, Printed):
         scene, formulation = self.reference.scene, self.formulation
         if formulation.reduction is not None or formulation.baumgarte is not None:
             raise ValueError(
-                "a model with its own reduction or stabilisation cannot be saved; build it again instead")
-        how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
+                "a model with its own reduction or stabilisation cannot be saved; build it again instead"
+            )
+        how = {
+            "state": formulation.state,
+            "projects": formulation.projects,
+            "backend": self.backend,
+            "memory": self.memory,
+        }
         every = self.state == "full"
-        found: dict[Hashable, Any] = {("_structure",): self.structure, ("_lowered", every or not self.structure.row_names): lowered(scene, every)}
+        found: dict[Hashable, Any] = {
+            ("_structure",): self.structure,
+            ("_lowered", every or not self.structure.row_names): lowered(scene, every),
+        }
         found |= {("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
-        model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
+        model_file.write(
+            path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)}
+        )
 
     def __reduce__(self):
         return build, (self.scene, self.formulation, self.backend, self.memory)
 
     def _text(self) -> str:
-        listed = lambda names: ", ".join(names) or "none"  # noqa: E731
+        listed = lambda names: ", ".join(names) or "none"
         freedoms, program, rows = self.freedoms, self.program, self.rows
-        pivots = f"pivot at least {freedoms.worst_pivot:.2g}, typically {freedoms.typical_pivot:.2g}" if freedoms.dependent else "no rows"
+        pivots = (
+            f"pivot at least {freedoms.worst_pivot:.2g}, typically {freedoms.typical_pivot:.2g}"
+            if freedoms.dependent
+            else "no rows"
+        )
         facts = {
             "rows": f"{listed(rows.names)}; rank {rows.rank}",
             "redundant rows": listed(rows.redundant),
@@ -211,12 +274,22 @@ class Model(BuiltFor, Printed):
             "depends on time": listed(self.dependence.on_time),
             "energy": "conserved" if self.conserved.energy else "work is integrated along with the motion",
             "ignorable": listed(self.conserved.ignorable),
-            "scalar program": f"none: {self.not_lowered}" if program is None else f"{program.operations} operations, {program.way}",
+            "scalar program": (
+                f"none: {self.not_lowered}"
+                if program is None
+                else f"{program.operations} operations, {program.way}"
+            ),
             "integrated by": self.way,
             "events": listed(self.events),
         }
         warned = [f"  WARNING           {text}" for text in self.warnings]
-        return "\n".join([f"Model of {type(self.scene).__name__}", *(f"  {name:18s}{text}" for name, text in facts.items()), *warned])
+        return "\n".join(
+            [
+                f"Model of {type(self.scene).__name__}",
+                *(f"  {name:18s}{text}" for name, text in facts.items()),
+                *warned,
+            ]
+        )
 
     def _why_state(self) -> str:
         known = self.structure
@@ -224,7 +297,11 @@ class Model(BuiltFor, Printed):
             return "as requested"
         if self.state == "minimal":
             return "independent speeds determine the others over the domain"
-        return "independent speeds do not determine the others over the whole domain" if known.affine else "constraints are nonlinear in the speeds"
+        return (
+            "independent speeds do not determine the others over the whole domain"
+            if known.affine
+            else "constraints are nonlinear in the speeds"
+        )
 
 
 def _decisions_where_traced(scene: Scene) -> tuple:
@@ -242,7 +319,14 @@ def _flattened(model: Model) -> tuple[tuple, tuple]:
 def _unflattened(static: tuple, children: tuple) -> Model:
     model = object.__new__(Model)  # JAX may pass placeholders instead of numbers
     (scene, arrays), (formulation, backend, decided, memory) = children, static
-    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, memory=memory, made=None)
+    vars(model).update(
+        scene=scene,
+        formulation=eqx.combine(arrays, formulation),
+        backend=backend,
+        decided=decided,
+        memory=memory,
+        made=None,
+    )
     return model
 
 
@@ -250,7 +334,12 @@ jax.tree_util.register_pytree_node(Model, _flattened, _unflattened)
 
 
 @shown_from_users_lines
-def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto", memory: int | float | str | None = None) -> Model:
+def build(
+    scene: Scene | BuiltFor,
+    formulation: Formulation | None = None,
+    backend: str = "auto",
+    memory: int | float | str | None = None,
+) -> Model:
     """Decide once how motions of a scene are integrated: rank, redundant constraints, independent speeds,
     time dependence, conserved quantities, the state, the scalar program, the backend.
 
@@ -272,7 +361,9 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     model = modelled(scene, formulation, backend)
     model.usual(False), model.usual(True), model.way
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
-    settled = Model(scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory))
+    settled = Model(
+        scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory)
+    )
     modelled(settled).made.update(model.made)
     if backend != "dense" and formulation.reduction is None:  # dense matrices need no program to compare
         warn_of_mistakes(settled.reference.scene, settled.state == "full")
@@ -322,21 +413,32 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
     scene, formulation, structure = model.scene, model.formulation, structure_of(model.scene)
     state, reduction = formulation.state, formulation.reduction
     _check(scene, structure, state, model.backend)
-    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state and not scene.switching.contacts)
+    minimal = state == "minimal" or (
+        state == "auto" and structure.has_minimal_state and not scene.switching.contacts
+    )
     independent = structure.independent if minimal else None
     inputs_in_rows = structure.rows_of_inputs and not constant
     conserves = not needs_work(scene, structure)
     with_work = work and not conserves
     program = _program(scene, minimal, model.backend, formulation, reason_for_matrices(structure, constant))
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
-    reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
+    reduction = as_reduction(
+        scene, _default_reduction(structure, independent, program) if reduction is None else reduction
+    )
     common: dict[str, Any] = {
         "independent": independent,
         "reduction": reduction,
         "with_work": with_work,
         "conserves": conserves,
-        "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions or scene.switching.contacts),
-        "projects_speeds": formulation.projects and not minimal and bool(structure.row_names or scene.switching.contacts),
+        "projects_positions": (
+            formulation.projects
+            and bool(
+                names_of_position_rows(scene) or scene.coordinates.quaternions or scene.switching.contacts
+            )
+        ),
+        "projects_speeds": (
+            formulation.projects and not minimal and bool(structure.row_names or scene.switching.contacts)
+        ),
         "rows_may_contradict": (minimal or formulation.projects) and structure.rows_may_contradict,
         "of_inputs": structure.potentials_of_inputs,
         "event_names": names_of_events(scene),
@@ -345,7 +447,12 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
     if program is not None:
         return ByProgram(**common, program=program, affine=structure.affine)
     nonlinear = () if structure.affine or structure.dependent_rows else structure.kept_rows
-    common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "nonlinear_rows": nonlinear}
+    common |= {
+        "stabilisation": formulation.baumgarte,
+        "usual": usual_lengths(scene),
+        "inputs_in_rows": inputs_in_rows,
+        "nonlinear_rows": nonlinear,
+    }
     common["cutoff"] = cutoff
     if minimal:
         return MinimalByMatrices(**common, rows=structure.kept_rows)
@@ -356,7 +463,9 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
     return FullByMatrices(**common, undecided=undecided(real_type()) / known if branches else None)
 
 
-def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
+def _program(
+    scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str
+) -> Lowered | None:
     """Return the scalar program, or None for dense matrices; ValueError if the backend requires a program."""
     reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
@@ -368,19 +477,26 @@ def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation
         return program
     if backend != "auto":
         why = reason or f"it has no scalar program ({program})"
-        raise ValueError(f"backend={backend!r} cannot integrate `{type(scene).__name__}`: {why}; use backend='auto' or 'dense'")
+        raise ValueError(
+            f"backend={backend!r} cannot integrate `{type(scene).__name__}`: {why}; use backend='auto' or"
+            " 'dense'"
+        )
     return None
 
 
 def _check(scene: Scene, structure: Structure, state, backend) -> None:
     check_name(backend, _BACKENDS, f"unknown backend `{backend}`")
     if state == "minimal" and not structure.affine:
-        raise ValueError(f"constraints of `{type(scene).__name__}` are nonlinear in the speeds, so there is "
-            "no minimal state; use jj.Formulation('full')")
+        raise ValueError(
+            f"constraints of `{type(scene).__name__}` are nonlinear in the speeds, so there is "
+            "no minimal state; use jj.Formulation('full')"
+        )
     if state == "minimal" and structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise ValueError(f"constraints {named} of `{type(scene).__name__}` may become independent during a "
-            "motion; use jj.Formulation('full')")
+        raise ValueError(
+            f"constraints {named} of `{type(scene).__name__}` may become independent during a "
+            "motion; use jj.Formulation('full')"
+        )
 
 
 def _cutoff(structure: Structure) -> float | None:
@@ -388,7 +504,9 @@ def _cutoff(structure: Structure) -> float | None:
     return passing_cutoff(real_type()) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
-def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
+def _default_reduction(
+    structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None
+) -> Reduction:
     """Return the default reduction: independent speeds for the minimal state; for the full state the
     reduction of the lowered program, or else the null space by QR.
     """

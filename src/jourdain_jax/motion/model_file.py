@@ -36,8 +36,10 @@ def write(path: FilePath, scene: Scene, how: dict, found: Mapping[Hashable, Any]
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
     except TypeError as error:
-        raise ValueError(f"`{type(scene).__name__}` has parts kept as JAX calls, so its model cannot be "
-            f"saved ({error}); build it again instead") from None
+        raise ValueError(
+            f"`{type(scene).__name__}` has parts kept as JAX calls, so its model cannot be "
+            f"saved ({error}); build it again instead"
+        ) from None
     write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
 
 
@@ -48,15 +50,26 @@ def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
     head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
     if stated != expected:
-        other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)
-        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in "
-            f"{other}; build and save it again")
+        other = ", ".join(
+            name
+            for name, value in expected.items()
+            if not isinstance(stated, dict) or stated.get(name) != value
+        )
+        raise ValueError(
+            f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in "
+            f"{other}; build and save it again"
+        )
     how, found = _decoded(json.loads(content))
     return found, how
 
 
 def _about(scene: Scene, content: bytes) -> dict:
-    versions = {"format": 3, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
+    versions = {
+        "format": 3,
+        "version": version_of("jourdain-jax"),
+        "jax": jax.__version__,
+        "precision": bool(jax.config.jax_enable_x64),
+    }
     return versions | {"scene": digest((type(scene), scene)), "sha256": hashlib.sha256(content).hexdigest()}
 
 

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, checked_whole, described, known_numbers
+from jourdain_jax.calculus.reals import (
+    Number,
+    Numbers,
+    checked_unless_traced,
+    checked_whole,
+    described,
+    known_numbers,
+)
 from jourdain_jax.integrate.explicit_steps import Method, Taylor, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.scene.arguments import BuiltFor
@@ -39,8 +46,8 @@ class Options:
       motion, but not those at which it continues. `work`: integrate the work of loads without a potential.
     - `max_transitions`: maximum number of events at which a motion continues (`jj.Event`).
     - `retry`: repeat a motion whose independent speeds became invalid (with the full state), or that is stiff
-      (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report it. Inside
-      your own `jit` or `vmap`, or if False, the result code stays.
+      (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report it.
+      Inside your own `jit` or `vmap`, or if False, the result code stays.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
@@ -106,7 +113,10 @@ OPTION_NAMES = tuple(OptionFields.__annotations__)
 def _register(kind: type[Options]) -> None:
     """Register a class of options as a pytree whose leaves may be any object."""
     names = [field.name for field in fields(kind)]
-    leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
+    leaves, static = (
+        [name for name in names if name not in _STATIC],
+        [name for name in names if name in _STATIC],
+    )
 
     def unflattened(known: tuple, values) -> Options:
         options = object.__new__(kind)
@@ -124,19 +134,28 @@ _register(AllOptions)
 _DEFAULT = AllOptions()
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
 GONE = {  # removed options -> replacements
-    "adjoint": "all motions have derivatives in forward and in reverse mode; for a "
-        f"diffrax adjoint {_BY_DIFFRAX}",
-    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers have their own, as in "
-        "solver=jj.ImplicitMidpoint(step=0.01)",
+    "adjoint": (
+        f"all motions have derivatives in forward and in reverse mode; for a diffrax adjoint {_BY_DIFFRAX}"
+    ),
+    "dt0": (
+        "the first step is 1e-4 of the span; structure-preserving solvers have their own, as in "
+        "solver=jj.ImplicitMidpoint(step=0.01)"
+    ),
     "memory": "a model has its own; pass it to `jj.build`",
     "saveat": f"pass times to save as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
-    "stepsize_controller": "pass `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); "
-        f"for another control {_BY_DIFFRAX}",
+    "stepsize_controller": (
+        "pass `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); "
+        f"for another control {_BY_DIFFRAX}"
+    ),
 }
 
 
 def as_options(
-    options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None, scene=None
+    options: Options | None,
+    by_name: Mapping[str, Any],
+    function: str = "simulate",
+    refused: Mapping[str, str] | None = None,
+    scene=None,
 ) -> AllOptions:
     """Return the options of a call of `function`: the fields of the object, overridden by options by name.
 
@@ -144,7 +163,11 @@ def as_options(
     supplies formulation, backend and memory. Raises TypeError for these and for unknown names,
     ValueError for wrong values.
     """
-    of_model = {name: getattr(scene, name) for name in ("formulation", "backend", "memory")} if isinstance(scene, BuiltFor) else {}
+    of_model = (
+        {name: getattr(scene, name) for name in ("formulation", "backend", "memory")}
+        if isinstance(scene, BuiltFor)
+        else {}
+    )
     if not (by_name or of_model) and (options is None or type(options) is AllOptions):
         return _DEFAULT if options is None else options
     if options is not None and not isinstance(options, Options):
@@ -158,7 +181,8 @@ def as_options(
         if name not in OPTION_NAMES:
             known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refusals]
             raise TypeError(
-                f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
+                f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}"
+            )
     found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
@@ -168,10 +192,13 @@ def bytes_of(memory: Any) -> int:
     """Return the bytes for `memory`: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB"
     (2^20). Raises ValueError for anything else.
     """
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
+    found = re.fullmatch(
+        r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower()
+    )
     if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
-        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a "
-            "text such as '2GB' or '500MB'")
+        raise ValueError(
+            f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'"
+        )
     return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
@@ -182,10 +209,18 @@ def alongside(options: AllOptions) -> AllOptions:
 
 def stated(options: AllOptions) -> dict[str, Any]:
     """Return the options that differ from the defaults, by name."""
-    return {name: value for name, value in vars(options).items() if value is not getattr(_DEFAULT, name) and value != getattr(_DEFAULT, name)}
+    return {
+        name: value
+        for name, value in vars(options).items()
+        if value is not getattr(_DEFAULT, name) and value != getattr(_DEFAULT, name)
+    }
 
 
-_POSITIVE = lambda x: (x > 0) & (x < np.inf), "a positive finite number; pass a tolerance such as 1e-8", "pass one number, such as 1e-8"
+_POSITIVE = (
+    lambda x: (x > 0) & (x < np.inf),
+    "a positive finite number; pass a tolerance such as 1e-8",
+    "pass one number, such as 1e-8",
+)
 _NUMBERS = {  # condition, expected value, and advice
     "rtol": _POSITIVE,
     "atol": _POSITIVE,
@@ -209,15 +244,25 @@ def _check(options: AllOptions) -> None:
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    checked_whole(options.max_steps, "`max_steps`", 1,
-        expected="of at least 1; pass the number of steps after which to stop")
-    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; pass the number "
-        "of events after which to stop")
+    checked_whole(
+        options.max_steps,
+        "`max_steps`",
+        1,
+        expected="of at least 1; pass the number of steps after which to stop",
+    )
+    checked_whole(
+        options.max_transitions,
+        "`max_transitions`",
+        1,
+        expected="of at least 1; pass the number of events after which to stop",
+    )
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):
-        raise ValueError(f"`solver` is {described(solver)}, expected a solver object; write "
-            f"`{_meant(solver) or 'diffrax.Dopri8()'}`")
+        raise ValueError(
+            f"`solver` is {described(solver)}, expected a solver object; write "
+            f"`{_meant(solver) or 'diffrax.Dopri8()'}`"
+        )
 
 
 def _meant(value) -> str:
@@ -227,6 +272,12 @@ def _meant(value) -> str:
         return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
     if not isinstance(value, str):
         return ""
-    members = {name.lower(): name for name in dir(diffrax) if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)}
-    near = difflib.get_close_matches(value.lower(), [name for name in members if not name.startswith("abstract")], n=1, cutoff=0.5)
+    members = {
+        name.lower(): name
+        for name in dir(diffrax)
+        if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)
+    }
+    near = difflib.get_close_matches(
+        value.lower(), [name for name in members if not name.startswith("abstract")], n=1, cutoff=0.5
+    )
     return f"diffrax.{members[near[0]]}()" if near else ""

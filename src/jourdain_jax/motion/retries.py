@@ -38,9 +38,13 @@ OUT_OF_STEPS = (result_codes.MAX_STEPS, result_codes.SHRANK)
 RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")
 
 
-def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
-    """Return the motion, repeated until a retry succeeds or none is left; unchanged if its result is traced.
-    """
+def retried(
+    run: Callable[[AllOptions], tuple[Setup, Trajectory]],
+    setup: Setup,
+    motion: Trajectory,
+    options: AllOptions,
+) -> Trajectory:
+    """Return the motion, repeated until a retry succeeds or none is left; unchanged if its result is traced."""
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -48,7 +52,12 @@ def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup,
 
 
 def lanes_retried(
-    run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
+    run: Callable[[AllOptions, np.ndarray], Trajectory],
+    form: Callable[[AllOptions], VectorField],
+    lanes: Trajectory,
+    begun,
+    options: AllOptions,
+    chunk: int,
 ):
     """Repeat failed samples by the rule for single motions. Return all samples, and for each kind of retry
     the `RERUN_FIELDS` of its samples.
@@ -65,14 +74,23 @@ def lanes_retried(
                 size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))
                 index = chosen[np.minimum(np.arange(first, first + size), len(chosen) - 1)]
                 new = run(changed, index)
-                lanes, reruns[way] = _replaced(lanes, _marked(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
+                lanes, reruns[way] = (
+                    _replaced(lanes, _marked(new, way), index),
+                    tuple(getattr(new, name) for name in RERUN_FIELDS),
+                )
     return lanes, tuple(sorted(reruns.items()))
 
 
-def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
+def _next_retries(
+    form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions
+) -> Int[np.ndarray, "lanes"]:
     """Return the next retry of each sample, including all earlier changes of its run; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
-    found, codes, fallback = np.full(lanes.result.shape, result_codes.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
+    found, codes, fallback = (
+        np.full(lanes.result.shape, result_codes.AS_ASKED),
+        np.asarray(lanes.result),
+        np.asarray(lanes.fallback),
+    )
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
@@ -114,7 +132,12 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
     if retries & result_codes.FULL_STATE:
         # dense matrices support no Taylor series
         solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver
-        options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
+        options = replace(
+            options,
+            formulation=replace(as_formulation(options.formulation), state="full"),
+            backend="dense",
+            solver=solver,
+        )
     if retries & result_codes.IMPLICIT:
         # an implicit step costs tens of explicit ones, so allow a tenth of their number
         options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
@@ -128,13 +151,20 @@ def _marked(motion: Trajectory, retries: int) -> Trajectory:
     code = motion.result
     if retries & result_codes.IMPLICIT:
         code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), result_codes.STIFF, code).astype(code.dtype)
-    return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
+    return eqx.tree_at(
+        lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries))
+    )
 
 
 def lost_codes(field: VectorField) -> tuple[int, ...]:
     """Return the result codes after which another form of the state may succeed."""
     guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
-    by_guards = result_codes.STEP_TOO_SMALL, result_codes.NOT_FINITE, result_codes.UNSOLVED_STEP, result_codes.UNRESOLVED
+    by_guards = (
+        result_codes.STEP_TOO_SMALL,
+        result_codes.NOT_FINITE,
+        result_codes.UNSOLVED_STEP,
+        result_codes.UNRESOLVED,
+    )
     return result_codes.SINGULAR_PARTITION, *(by_guards if guarded else ())
 
 

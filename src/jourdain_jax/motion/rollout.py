@@ -16,7 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from jourdain_jax.calculus.reals import at_index, checked_real, checked_whole, described, is_traced, known_numbers, real_type, static, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import (
+    at_index,
+    checked_real,
+    checked_whole,
+    described,
+    is_traced,
+    known_numbers,
+    real_type,
+    static,
+    with_nan_as_a_mark,
+)
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.explicit_steps import Taylor
 from jourdain_jax.integrate.inputs import as_inputs, check_inputs_in_rows, for_programs
@@ -59,7 +69,9 @@ class Rollout(Printed, eqx.Module):
     def lane(self, index: int) -> Trajectory:
         """Return the motion of sample `index` as a `Trajectory`; IndexError if there is none."""
         if not -len(self) <= index < len(self):
-            raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
+            raise IndexError(
+                f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}"
+            )
         lane = at_index(self.lanes, index)
         for way, how in self.reruns:
             if np.any(known_numbers(lane.fallback) == way):
@@ -93,10 +105,14 @@ class Rollout(Printed, eqx.Module):
         samples with different saved times.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
-            raise ValueError("lanes have different saved times, so there are no common quantiles; pass one "
-                "start time for all, or one `ts`")
-        values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`",
-            advice="pass numbers from 0 to 1"))
+            raise ValueError(
+                "lanes have different saved times, so there are no common quantiles; pass one "
+                "start time for all, or one `ts`"
+            )
+        values, quantiles = (
+            np.asarray(self[name]),
+            np.asarray(checked_real(levels, "`levels`", advice="pass numbers from 0 to 1")),
+        )
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
         out = np.full((len(levels), *values.shape[1:]), np.nan)
@@ -131,15 +147,23 @@ class Rollout(Printed, eqx.Module):
             named = ""
             if code == result_codes.EVENT:
                 events = np.asarray(self.lanes.event)[lanes]
-                named = " " + ", ".join(f"`{self.lanes.event_names[i]}` "
-                    f"{int(np.sum(events == i))}" for i in np.unique(events))
+                named = " " + ", ".join(
+                    f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events)
+                )
             elif code != result_codes.SUCCESS:
                 faults = dict.fromkeys(name for i in lanes[:10] for name in self.lane(int(i)).faults)
-                named = f" ({', '.join(faults)})" * bool(faults) + ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+                named = (
+                    f" ({', '.join(faults)})" * bool(faults)
+                    + ": lanes "
+                    + ", ".join(map(str, lanes[:10]))
+                    + (" ..." if lanes.size > 10 else "")
+                )
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
-            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and "
-                "were run with the full state")
+            lines.append(
+                f"  {len(self.continued)} left the domain of their privileged speeds and "
+                "were run with the full state"
+            )
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & result_codes.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
@@ -189,16 +213,31 @@ def rollout(
     model, scene = modelled(scene, options.formulation, options.backend), as_scene(scene)
     starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
-        if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
-            raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": '
-                'jnp.linspace(0.0, 1.0, 8)}')
-    advice = "pass an array with one entry per lane; to vary a field that is a module, use `equinox.filter_vmap` of `simulate`"
-    parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
+        if (
+            given is not None
+            and not isinstance(given, Mapping)
+            and not (what == "starts" and isinstance(given, State))
+        ):
+            raise ValueError(
+                f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": '
+                "jnp.linspace(0.0, 1.0, 8)}"
+            )
+    advice = (
+        "pass an array with one entry per lane; to vary a field that is a module, use `equinox.filter_vmap`"
+        " of `simulate`"
+    )
+    parameters = {
+        name: checked_real(value, f"parameter `{name}`", advice=advice)
+        for name, value in (parameters or {}).items()
+    }
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, span["ts"], options.memory or MEMORY)
     span["inputs"] = as_inputs(scene, span["inputs"])
     _check_times_of_lanes(scene, starts, span)
-    times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(real_type()) for name in ("t0", "t1", "ts")}
+    times = {
+        name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(real_type())
+        for name in ("t0", "t1", "ts")
+    }
 
     reference = Reference(model.reference.scene, parameters)
 
@@ -207,7 +246,9 @@ def rollout(
         return program(reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
 
     def form(options: AllOptions) -> VectorField:
-        return modelled(model, options.formulation, options.backend).field(span["inputs"].constant, bool(options.work))
+        return modelled(model, options.formulation, options.backend).field(
+            span["inputs"].constant, bool(options.work)
+        )
 
     if is_traced((scene, fixed, varied, parameters, span, options)):
         lanes = run(options, varied, parameters)  # differentiated or batched: one piece, no host loop
@@ -227,7 +268,10 @@ def rollout(
         pieces.append(jax.block_until_ready(piece) if chunk == count else jax.tree.map(np.asarray, piece))
         bar.update(min(chunk, count - first))
     bar.close()
-    lanes, reruns = pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces), ()
+    lanes, reruns = (
+        pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces),
+        (),
+    )
     if options.retry:
         own_times = isinstance(varied, State) and span["t0"] is None
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
@@ -250,10 +294,14 @@ def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
     check_inputs_in_rows(scene, span["inputs"], t0, t1)
 
 
-def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
+def _lanes_in_lockstep(
+    reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters
+) -> Trajectory:
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
-        return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **span, options=options)
+        return set_up(
+            own, varied if isinstance(varied, State) else {**fixed, **varied}, **span, options=options
+        )
 
     with reference.stands_in():
         return integrate_lanes(lane, (varied, parameters))
@@ -274,16 +322,22 @@ def _lanes(scene: Scene, starts, parameters: dict):
     """Return shared start values, varying ones, and the size of the batch."""
     known = [name for name, _, _ in parameters_of(scene)]
     check_names(parameters, known, f"scene `{type(scene).__name__}` has no parameter `{{}}`")
-    lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
+    lengths = {
+        f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()
+    }
     if isinstance(starts, State):
         many = starts.q.shape[:1] if starts.q.ndim == 2 else ()
         # a state made directly has one guess for all samples
         fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
-        arrays = {name: checked_real(value, f"start `{name}`").astype(real_type()) for name, value in starts.items()}
+        arrays = {
+            name: checked_real(value, f"start `{name}`").astype(real_type()) for name, value in starts.items()
+        }
         # quaternions and their rates
-        groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}
+        groups = {
+            group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups
+        }
         fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
         varied = {name: value for name, value in arrays.items() if name not in fixed}
         lengths |= {f"start `{name}`": value.shape[0] for name, value in varied.items()}
@@ -294,14 +348,20 @@ def _common_length(lengths: dict) -> int:
     for what, length in lengths.items():
         if length is None:
             raise ValueError(
-                f"{what} has no axis of lanes; pass an array with one entry per lane, or set it on the scene")
+                f"{what} has no axis of lanes; pass an array with one entry per lane, or set it on the scene"
+            )
     counts = set(lengths.values())
     if len(counts) > 1:
-        raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) +
-            "; pass arrays of one length")
+        raise ValueError(
+            "lanes differ in number: "
+            + ", ".join(f"{what} has {length}" for what, length in lengths.items())
+            + "; pass arrays of one length"
+        )
     if not counts or counts == {0}:
-        raise ValueError("no lanes: pass at least one start value or parameter as an array with one entry "
-            "per lane, or use `simulate` for one motion")
+        raise ValueError(
+            "no lanes: pass at least one start value or parameter as an array with one entry "
+            "per lane, or use `simulate` for one motion"
+        )
     return counts.pop()
 
 

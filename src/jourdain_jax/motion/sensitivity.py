@@ -46,8 +46,8 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
     if error > 0.05:
         text = (
             f"the motion amplifies errors {amplification:.1e} times: with rtol = {rtol:g} and {steps} steps, "
-                f"its derivative may have a relative error of {error:.0e}; tighten `rtol` and `atol` (in "
-                "float64), or shorten the span"
+            f"its derivative may have a relative error of {error:.0e}; tighten `rtol` and `atol` (in "
+            "float64), or shorten the span"
         )
         warnings.warn(text, SensitivityWarning, stacklevel=3)
 
@@ -69,24 +69,44 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
     def weighed(values, cotangents) -> float:
         """Return `sum |g| (atol + rtol |y|)`, ignoring values that are not finite."""
-        return float(sum(np.sum(np.nan_to_num(np.abs(g) * (atol + rtol * np.abs(y)), posinf=0.0)) for y, g in zip(values, cotangents, strict=True)))
+        return float(
+            sum(
+                np.sum(np.nan_to_num(np.abs(g) * (atol + rtol * np.abs(y)), posinf=0.0))
+                for y, g in zip(values, cotangents, strict=True)
+            )
+        )
 
     def start_varies(tangents):
         begun[:] = tangents
 
     def ends_vary(tangents):
         (q, u, q_end, u_end), middle = seen[:-1], len(seen[0]) // 2
-        tops = [np.max(np.nan_to_num(np.abs(np.concatenate([x, last[None]]))), axis=0) for x, last in ((q, q_end), (u, u_end))]
+        tops = [
+            np.max(np.nan_to_num(np.abs(np.concatenate([x, last[None]]))), axis=0)
+            for x, last in ((q, q_end), (u, u_end))
+        ]
 
         def sizes(tangents):
-            return np.maximum(*(np.max(np.abs(d) / (atol + rtol * top), axis=1, initial=0.0) for d, top in zip(tangents, tops, strict=True)))
+            return np.maximum(
+                *(
+                    np.max(np.abs(d) / (atol + rtol * top), axis=1, initial=0.0)
+                    for d, top in zip(tangents, tops, strict=True)
+                )
+            )
 
         ended = sizes(tangents[2:])
         first = sizes(begun) if begun else np.zeros_like(ended)  # zero if nothing varies the start
         half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
         with np.errstate(divide="ignore", invalid="ignore"):
-            from_start, from_middle = np.where(first > 0, ended / first, np.inf), np.where(half > 0, (ended / half) ** 2, 0.0)
-        grown = np.where(first > 0, from_start, 0.0) if varies == ("start",) else np.minimum(from_start, from_middle)
+            from_start, from_middle = (
+                np.where(first > 0, ended / first, np.inf),
+                np.where(half > 0, (ended / half) ** 2, 0.0),
+            )
+        grown = (
+            np.where(first > 0, from_start, 0.0)
+            if varies == ("start",)
+            else np.minimum(from_start, from_middle)
+        )
         _judge(float(np.max(grown)), rtol, steps)
 
     def start_is_asked(cotangents):  # called last in reverse mode
@@ -104,7 +124,9 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     steps = int(seen[-1])
     if {"scene", "start", "inputs", "t0"}.intersection(varies):
         warn_of_jumps(setup.field, motion, "scene" in varies)
-    parts = tap_cotangents(tap_tangents(parts, ends_vary), lambda cotangents: looked_at.append(weighed(seen[:-1], cotangents)))
+    parts = tap_cotangents(
+        tap_tangents(parts, ends_vary), lambda cotangents: looked_at.append(weighed(seen[:-1], cotangents))
+    )
     return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)
 
 
@@ -120,8 +142,8 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
             f"a motion of `{type(motions.scene).__name__}` {met} a jump of its loads (`<`, `where`, `sign`, "
-                "`floor`, ...); its derivatives omit the shift of the jump's time. Smooth the load, as by "
-                "`jnp.tanh`, or end the motion there by an event and start another"
+            "`floor`, ...); its derivatives omit the shift of the jump's time. Smooth the load, as by "
+            "`jnp.tanh`, or end the motion there by an event and start another"
         )
         warn(text, SensitivityWarning)
 
@@ -129,4 +151,8 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
 def numbers_where_known(values):
     """Return the values as numbers if they are differentiated outside `jit`; None if they are traced."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
-    return None if is_traced(bare) else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)
+    return (
+        None
+        if is_traced(bare)
+        else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)
+    )

@@ -14,7 +14,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
-from jourdain_jax.calculus.reals import Number, Numbers, all_finite, as_array, described, is_traced, known_numbers, nan_is_a_mark, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import (
+    Number,
+    Numbers,
+    all_finite,
+    as_array,
+    described,
+    is_traced,
+    known_numbers,
+    nan_is_a_mark,
+    nothing_is_traced,
+    real_type,
+)
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.explicit_steps import DOPRI8, TSIT5, Method, Taylor, diffrax, order_for
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
@@ -29,7 +40,15 @@ from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.start import named_start
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, vector_of_times, warn
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    as_coordinates,
+    as_speeds,
+    one_time,
+    shown_from_users_lines,
+    vector_of_times,
+    warn,
+)
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import is_judged
 
@@ -58,7 +77,8 @@ def simulate(
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for
       the scene's example.
     - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the
-      scene's `example_span` after t0); `ts`: times to save (default: 201 even ones), at each of which a step ends.
+      scene's `example_span` after t0); `ts`: times to save (default: 201 even ones), at each of which a step
+      ends.
     - `inputs`: name -> number, function of time, or `Sampled`.
     - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as
       `rtol=1e-10`, which take precedence, and two further settings:
@@ -97,7 +117,9 @@ def simulate(
         model = modelled(scene, options.formulation, options.backend)
         with model.standing_in:
             setup = _set_up(model, start, t0, t1, ts, inputs, options)
-            return setup, _integrated(setup) if nothing_is_traced() else warn_if_ill_conditioned(setup, _integrated)
+            return setup, (
+                _integrated(setup) if nothing_is_traced() else warn_if_ill_conditioned(setup, _integrated)
+            )
 
     setup, motion = run(options)
     return retried(run, setup, motion, options) if options.retry else motion
@@ -114,7 +136,17 @@ def _integrated(setup: Setup) -> Trajectory:
     return motion if np.all(known_numbers(motion.result) <= result_codes.EVENT) else integrate(setup)
 
 
-def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
+def set_up(
+    scene: Scene | BuiltFor,
+    start=None,
+    *,
+    t0=None,
+    t1=None,
+    ts=None,
+    inputs=None,
+    options: Options | None = None,
+    **by_name,
+) -> Setup:
     """Return the setup that `simulate` integrates for its arguments."""
     options = as_options(options, by_name, scene=None if type(options) is AllOptions else scene)
     return _set_up(modelled(scene, options.formulation, options.backend), start, t0, t1, ts, inputs, options)
@@ -124,24 +156,40 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     scene, max_step, (solver, order) = model.scene, options.max_step, solver_of(options)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
-            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`; set its step with "
-                f"jj.{solver.name}(step=...)")
+            raise ValueError(
+                f"`max_step` cannot be combined with `{solver.name}`; set its step with "
+                f"jj.{solver.name}(step=...)"
+            )
         max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
     constant = inputs.constant
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
-        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, which cannot run back in "
-            f"time from t0 = {t0} to t1 = {t1} s; pass t1 > t0")
+        raise ValueError(
+            f"`{type(scene).__name__}` has contacts with friction, which cannot run back in "
+            f"time from t0 = {t0} to t1 = {t1} s; pass t1 > t0"
+        )
     start, usual = _start(model, start, t0, inputs)
     field, dtype = model.field(constant, bool(options.work)), start.q.dtype
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
     if not constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
     events = field.event_names if options.events or not all(field.stops) else ()
-    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": events, "alongside": options.alongside}
-    own = own_steps(solver, **static, native=native, order=order, memory=options.memory or MEMORY, most=options.max_transitions, stopping=options.events)
+    static: dict[str, Any] = {
+        "max_steps": options.max_steps,
+        "event_names": events,
+        "alongside": options.alongside,
+    }
+    own = own_steps(
+        solver,
+        **static,
+        native=native,
+        order=order,
+        memory=options.memory or MEMORY,
+        most=options.max_transitions,
+        stopping=options.events,
+    )
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
     # as arrays, so that another tolerance needs no other program
     tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))
@@ -154,8 +202,9 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
-        asked, advice = ("backend='native'",
-            "use backend='auto', the fastest possible") if order is None else _BY_SERIES
+        asked, advice = (
+            ("backend='native'", "use backend='auto', the fastest possible") if order is None else _BY_SERIES
+        )
         raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
 
@@ -182,13 +231,16 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
     """
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
-        warn(f"rtol = {rtol} is too small for float32; set jax.config.update('jax_enable_x64', True), or "
-            "raise rtol and atol to 1e-5")
+        warn(
+            f"rtol = {rtol} is too small for float32; set jax.config.update('jax_enable_x64', True), or "
+            "raise rtol and atol to 1e-5"
+        )
     if isinstance(solver, Taylor):
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):
         raise ValueError(
-            "`rtol` is traced, but decides the default solver; pass a `solver` too, such as diffrax.Dopri8()")
+            "`rtol` is traced, but decides the default solver; pass a `solver` too, such as diffrax.Dopri8()"
+        )
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
@@ -212,15 +264,19 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
             f"example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
     model = modelled(model)
-    return named_start(model, model.scene.example if given is None else given, one_time(0.0) if t0 is None else t0, inputs)
+    return named_start(
+        model, model.scene.example if given is None else given, one_time(0.0) if t0 is None else t0, inputs
+    )
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):
     """Return t0, the saved times, and t1. Raises ValueError if concrete values are inconsistent."""
     from_state = isinstance(start, State)
     if from_state and start.q.ndim != 1:
-        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or "
-            "`jax.vmap` for many starts")
+        raise ValueError(
+            f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or "
+            "`jax.vmap` for many starts"
+        )
     ts = None if ts is None else saved_times(ts)
     t0, t1 = one_time(t0, "t0"), one_time(t1, "t1")
     if t0 is None:
@@ -229,13 +285,17 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         t1 = as_array(t0 + scene.example_span if ts is None else ts[-1], t0.dtype)
     ends = known_numbers((t0, t1)).tolist()
     if ends and not 0 < abs(ends[1] - ends[0]) < np.inf:
-        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; pass a "
-            "finite `t1` different from `t0`")
+        raise ValueError(
+            f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; pass a "
+            "finite `t1` different from `t0`"
+        )
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # in NumPy if concrete, without compilation
     elif not known_numbers(times_fit(ts, t0, t1)).all():
-        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
-            f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose it")
+        raise ValueError(
+            f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
+            f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose it"
+        )
     return t0, ts, t1
 
 
@@ -246,6 +306,8 @@ def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
     ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))
     if not ((steps > 0).all() or (steps < 0).all()) or not all_finite(known_numbers(ts)):
-        raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); "
-            "sort it and drop repeated times")
+        raise ValueError(
+            "`ts` must be finite and strictly increasing (or decreasing, for reversed time); "
+            "sort it and drop repeated times"
+        )
     return ts

@@ -1,6 +1,6 @@
 """Consistent starts: a guess of q and u projected onto the constraints, and the size of the change.
 
-    g(t, q) = 0,  phi(t, q, u) = 0
+g(t, q) = 0,  phi(t, q, u) = 0
 """
 
 from collections.abc import Callable, Mapping
@@ -30,11 +30,28 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
 from jourdain_jax.integrate.inputs import inputs_at
-from jourdain_jax.integrate.state_projection import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
+from jourdain_jax.integrate.state_projection import (
+    OFF,
+    Guess,
+    State,
+    contradiction,
+    free_entries,
+    left_of,
+    may_contradict,
+    put_onto_constraints,
+)
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time, shown_from_users_lines
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    as_coordinates,
+    as_input_vector,
+    as_scene,
+    as_speeds,
+    one_time,
+    shown_from_users_lines,
+)
 from jourdain_jax.scene.names import Labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.sampling import guesses_of
@@ -43,7 +60,9 @@ from jourdain_jax.structure.structure import structure_of
 _NOTHING: Mapping = MappingProxyType({})
 
 
-def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: Labels = ()) -> State:
+def consistent(
+    scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: Labels = ()
+) -> State:
     """Return the state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds
     M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
@@ -83,7 +102,11 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
 
 def _as_input_vector(scene: Scene, inputs, dtype):
     """Return the input vector; a NumPy vector is returned without tracing."""
-    return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
+    return (
+        inputs
+        if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),)
+        else as_input_vector(scene, inputs, dtype)
+    )
 
 
 # one program for every choice of held variables
@@ -92,7 +115,15 @@ _uncompiled_projection = eval_numpy(put_onto_constraints)
 
 
 @shown_from_users_lines
-def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: Number = 0.0, inputs: Any = None, **values: Any) -> State:
+def start(
+    scene: Scene | BuiltFor,
+    given: Any = None,
+    *,
+    near: Any = None,
+    t0: Number = 0.0,
+    inputs: Any = None,
+    **values: Any,
+) -> State:
     """Return a consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`,
     or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
@@ -119,13 +150,17 @@ def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: N
     """
     model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, "
-            "lean=0.3)`, or a dictionary of them")
+        raise ValueError(
+            f"`start` was given {described(given)}, expected named values: `jj.start(scene, "
+            "lean=0.3)`, or a dictionary of them"
+        )
     check_kind(near, Mapping | None, "`near`", 'a dictionary of coordinates: near={"z": -0.4}')
     t = one_time(t0)
     _check_finite("t0", t)
     with model.standing_in:
-        return named_start(model, {**(given or {}), **values}, t, inputs_at(model.inputs(inputs), t), near=near or {})
+        return named_start(
+            model, {**(given or {}), **values}, t, inputs_at(model.inputs(inputs), t), near=near or {}
+        )
 
 
 def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NOTHING) -> State:
@@ -139,8 +174,10 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
         given = vectors_named(scene, values)[2]
         for name in near:
             if name not in scene.coordinate_names:
-                raise ValueError(f"`near` names `{name}`, which is not a coordinate; "
-                    f"{nearest(name, scene.coordinate_names.entries)}")
+                raise ValueError(
+                    f"`near` names `{name}`, which is not a coordinate; "
+                    f"{nearest(name, scene.coordinate_names.entries)}"
+                )
     inputs = _as_input_vector(scene, inputs, q.dtype)
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
     guess = Guess(q, u, *held)
@@ -163,7 +200,9 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
 
 def _check_finite(name: str, value) -> None:
     if not all_finite(known_numbers(value)):
-        raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
+        raise ValueError(
+            f"start value `{name}` is {value}, expected a finite number; check where it was computed"
+        )
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
@@ -213,17 +252,20 @@ def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> 
         name, found = scene.coordinate_names.entries[k], float(state.q[k])
         raise ValueError(
             f"no start of `{who}` has `{name}` in its `domain`, {scene.domain[name]}, with the given values "
-                f"held ({held}); the nearest has {found:.6g}. Change the values or the `domain`, or pass "
-                f'near={{"{name}": {found:.2g}}} to search outside'
+            f"held ({held}); the nearest has {found:.6g}. Change the values or the `domain`, or pass "
+            f'near={{"{name}": {found:.2g}}} to search outside'
         )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
     names += [f"norm of quaternion {k + 1}" for k in range(len(g) - len(names))] + list(names_of_rows(scene))
     worst = int(np.argmax(np.concatenate([g, phi])))
-    within = any(bounded and name in scene.domain for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True))
+    within = any(
+        bounded and name in scene.domain
+        for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True)
+    )
     elsewhere = ", pass some as guesses by `near=` to search outside the `domain`" if within else ""
     raise ValueError(
         f"the start of `{who}` violates constraint `{names[worst]}`: residual "
-            f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}). Give fewer "
-            f"values{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
+        f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}). Give fewer "
+        f"values{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )

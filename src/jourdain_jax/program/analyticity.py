@@ -18,7 +18,9 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
     return _with(graph, outputs, lambda n: graph.op[n] in kinds and graph.varies[n])
 
 
-def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
+def decided_by(
+    graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]
+) -> bool:
     """Return whether any operation of these kinds in the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
     decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]

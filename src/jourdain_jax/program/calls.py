@@ -61,12 +61,18 @@ class Call:
 
         def columns(*operands):
             def along(k, i):
-                directions = [np.zeros(x.shape, x.dtype if np.issubdtype(x.dtype, np.floating) else jax.dtypes.float0) for x in avals]
+                directions = [
+                    np.zeros(x.shape, x.dtype if np.issubdtype(x.dtype, np.floating) else jax.dtypes.float0)
+                    for x in avals
+                ]
                 directions[k].flat[i] = 1
                 return jax.jvp(function, operands, tuple(directions))[1]
 
             found = zip(*(along(k, i) for k, i in places), strict=True)
-            return [jnp.stack(dx) if np.issubdtype(a.dtype, np.floating) else jnp.zeros(0) for dx, a in zip(found, self.closed.out_avals, strict=True)]
+            return [
+                jnp.stack(dx) if np.issubdtype(a.dtype, np.floating) else jnp.zeros(0)
+                for dx, a in zip(found, self.closed.out_avals, strict=True)
+            ]
 
         try:
             closed = jax.make_jaxpr(columns)(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
@@ -82,7 +88,10 @@ class Call:
         operands = [jnp.asarray(x, a.dtype) for x, a in zip(operands, avals, strict=True)]
         lanes = jnp.broadcast_shapes(*(x.shape[a.ndim :] for x, a in zip(operands, avals, strict=True)))
         axes = tuple(None if x.ndim == a.ndim else -1 for x, a in zip(operands, avals, strict=True))
-        operands = [x if axis is None else jnp.broadcast_to(x, (*a.shape, *lanes)) for x, a, axis in zip(operands, avals, axes, strict=True)]
+        operands = [
+            x if axis is None else jnp.broadcast_to(x, (*a.shape, *lanes))
+            for x, a, axis in zip(operands, avals, axes, strict=True)
+        ]
         for _ in lanes:
             function = jax.vmap(function, in_axes=axes, out_axes=-1)
         try:
@@ -90,9 +99,13 @@ class Call:
         except NotImplementedError as error:
             if not lanes or "vmap" not in str(error):
                 raise
-            raise NotImplementedError("a callback in a load or stop event does not support batches: "
-                f"{str(error).splitlines()[0]}") from None
-        return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
+            raise NotImplementedError(
+                f"a callback in a load or stop event does not support batches: {str(error).splitlines()[0]}"
+            ) from None
+        return tuple(
+            jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x
+            for x in found
+        )
 
 
 def _array(shape_and_type, *entries):
@@ -111,7 +124,12 @@ def _entry(index, x):
     return jax.lax.index_in_dim(x.reshape(-1, *x.shape[dimensions:]), number, keepdims=False)
 
 
-EMITTED: dict[str, Callable] = {"array": _array, "opaque": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
+EMITTED: dict[str, Callable] = {
+    "array": _array,
+    "opaque": lambda call, *operands: call.results(*operands),
+    "output": _output,
+    "entry": _entry,
+}
 
 
 AT_PROBES: dict[str, Callable] = {
@@ -148,10 +166,17 @@ def description(x) -> Hashable:
 
 def _of_jaxpr(x) -> Hashable:
     number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
-    atom = lambda v: description(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
+    atom = lambda v: description(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]
     lines: list = [tuple(v.aval for v in number)]
     for equation in x.eqns:
         inputs = tuple(map(atom, equation.invars))
         number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-        lines.append((equation.primitive, inputs, description(equation.params), tuple(v.aval for v in equation.outvars)))
+        lines.append(
+            (
+                equation.primitive,
+                inputs,
+                description(equation.params),
+                tuple(v.aval for v in equation.outvars),
+            )
+        )
     return *lines, tuple(map(atom, x.outvars))

@@ -36,7 +36,9 @@ def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> 
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
 
-def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
+def directional_derivative(
+    graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]
+) -> list[dict[int, int]]:
     """Return the derivatives of each output along the directions in which it changes, in one sweep;
     `directions[k][n]` is dn/ds in direction k.
 
@@ -53,12 +55,17 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
         if node not in tangents:
             of_args = [tangents[a] for a in graph.args[node]]
             moving = dict.fromkeys(k for tangent in of_args for k in tangent)
-            found = {k: _derivative(graph, node, [tangent.get(k, graph.zero) for tangent in of_args]) for k in moving}
+            found = {
+                k: _derivative(graph, node, [tangent.get(k, graph.zero) for tangent in of_args])
+                for k in moving
+            }
             tangents[node] = {k: rate for k, rate in found.items() if rate != graph.zero}
     return [tangents[n] for n in outputs]
 
 
-def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> NodeList:
+def cotangents(
+    graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]
+) -> NodeList:
     """Return sum_i w_i d output_i/d variable for each variable (an independent node), in one reverse sweep.
 
     A branch that is not taken contributes zero, even if its derivative is NaN.
@@ -97,7 +104,11 @@ def _part(graph: Graph, node: int, i: int, weight: int) -> int:
         share = graph.div(weight, args[1])
         return graph.neg(graph.mul(share, node)) if i else share
     if op == "select":
-        return graph.zero if i == 0 else graph.call("select", args[0], *((weight, graph.zero) if i == 1 else (graph.zero, weight)))
+        return (
+            graph.zero
+            if i == 0
+            else graph.call("select", args[0], *((weight, graph.zero) if i == 1 else (graph.zero, weight)))
+        )
     slope = _derivative(graph, node, [graph.one if k == i else graph.zero for k in range(len(args))])
     return graph.mul(weight, slope)
 
@@ -115,8 +126,7 @@ def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> li
 
 
 def _derivative(graph: Graph, node: int, dots: list):
-    """Return the rate of a node from the rates of its arguments. The rate of an array or a call is a tuple.
-    """
+    """Return the rate of a node from the rates of its arguments. The rate of an array or a call is a tuple."""
     op, args = graph.operation(node)
     if all(d == graph.zero for d in dots):
         return graph.zero
@@ -138,7 +148,9 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
     operands, call = graph.args[node], graph.value[node]
     entries = [graph.entries_of(a) for a in operands]
     numbers = [np.issubdtype(graph.value[a][-1], np.floating) for a in operands]
-    rates = [[graph.zero] * len(xs) if dot == graph.zero else dot for xs, dot in zip(entries, dots, strict=True)]
+    rates = [
+        [graph.zero] * len(xs) if dot == graph.zero else dot for xs, dot in zip(entries, dots, strict=True)
+    ]
     moves = tuple(
         tuple(number and (graph.varies[x] or dx != graph.zero) for x, dx in zip(xs, dxs, strict=True))
         for xs, dxs, number in zip(entries, rates, numbers, strict=True)
@@ -156,7 +168,9 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
     return tuple(found)
 
 
-def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
+def differentiable(
+    graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()
+) -> Callable[..., tuple]:
     """Return a JAX function of the values of `variables`, on which all outputs must depend. It returns the
     `outputs` in the shape and precision of variable `like`, then the nodes `monitored`, without derivatives.
     """
@@ -167,7 +181,10 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     entries = _entries(graph, outputs, variables)
 
     def values_of(nodes, values) -> tuple:
-        shape, real = jnp.broadcast_shapes(*(jnp.shape(values[i]) for i in scalars)), jnp.result_type(values[like])
+        shape, real = (
+            jnp.broadcast_shapes(*(jnp.shape(values[i]) for i in scalars)),
+            jnp.result_type(values[like]),
+        )
         found = run(graph, nodes, dict(zip(variables, values, strict=True)))
         return tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found)
 
@@ -197,7 +214,9 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     return own
 
 
-def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, NodeList, NodeList]:
+def on_its_own(
+    graph: Graph, outputs: Sequence[int], variables: Sequence[int]
+) -> tuple[Graph, NodeList, NodeList]:
     """Return the outputs on a new graph with the variables as inputs, so that no simplification uses their
     definitions.
     """
@@ -207,9 +226,10 @@ def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -
     return own, [new[n] for n in outputs], inputs
 
 
-def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
-    """Return row, column and node of each structurally nonzero entry, or None if JAX's derivative is better.
-    """
+def _entries(
+    graph: Graph, outputs: Sequence[int], variables: Sequence[int]
+) -> list[tuple[int, int, int]] | None:
+    """Return row, column and node of each structurally nonzero entry, or None if JAX's derivative is better."""
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None
@@ -222,4 +242,8 @@ def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> 
         return None
     entries = [(i, j, rows[i][n]) for j, n in enumerate(variables) for i in range(len(rows)) if n in rows[i]]
     # values and Jacobian may take at most 8 times the operations of the values
-    return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= 8 * max(operations, 10) else None
+    return (
+        entries
+        if graph.operations([*outputs, *(node for *_, node in entries)]) <= 8 * max(operations, 10)
+        else None
+    )

@@ -24,7 +24,10 @@ def eval_numpy(f: Callable) -> Callable:
 
     @lru_cache(maxsize=32)
     def program(treedef, rest, x64):
-        return uncompiled_lanes(lambda numbers, *lane: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest)), *lane), shared=1)
+        return uncompiled_lanes(
+            lambda numbers, *lane: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest)), *lane),
+            shared=1,
+        )
 
     @wraps(f)
     def run(*arguments, lanes=()):
@@ -76,13 +79,22 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes, first: int = 0, count: int = 0):
-        arrays = _arrays([((count,) * (i >= first and count > 0) + shape, dtype) for i, (shape, dtype) in enumerate(shapes)])
+        arrays = _arrays(
+            [
+                ((count,) * (i >= first and count > 0) + shape, dtype)
+                for i, (shape, dtype) in enumerate(shapes)
+            ]
+        )
 
         def one(*leaves):
             return f(*jax.tree.unflatten(treedef, leaves))
 
         def of_all(*leaves):
-            return jax.vmap(one, [None if i < first else 0 for i in range(len(leaves))])(*leaves) if count else one(*leaves)
+            return (
+                jax.vmap(one, [None if i < first else 0 for i in range(len(leaves))])(*leaves)
+                if count
+                else one(*leaves)
+            )
 
         def one_by_one(*leaves):  # for callbacks that take one sample at a time
             return jax.lax.map(lambda lane: one(*leaves[:first], *lane), leaves[first:])
@@ -99,7 +111,11 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
         first = len(jax.tree.leaves(arguments[:shared]))
         arrays = [np.asarray(x) for x in leaves]
         shapes = tuple((x.shape[i >= first :], x.dtype) for i, x in enumerate(arrays))
-        closed, structure = traced(treedef, shapes, first, len(arrays[first])) if first < len(arrays) else traced(treedef, shapes)
+        closed, structure = (
+            traced(treedef, shapes, first, len(arrays[first]))
+            if first < len(arrays)
+            else traced(treedef, shapes)
+        )
         with np.errstate(all="ignore"):
             return jax.tree.unflatten(structure, evaluated(closed, arrays, applied))
 

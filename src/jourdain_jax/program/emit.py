@@ -41,14 +41,20 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
     values |= {n: graph.value[n] for n in needed if graph.is_const(n)}
     order = _deepest_first(graph, outputs, values, depth)
     parts = [order[k : k + PIECE] for k in range(0, len(order), PIECE)]
-    last_use = {a: k for k, part in enumerate(parts) for n in part for a in graph.args[n]} | dict.fromkeys(outputs, len(parts))
+    last_use = {a: k for k, part in enumerate(parts) for n in part for a in graph.args[n]} | dict.fromkeys(
+        outputs, len(parts)
+    )
     for k, part in enumerate(parts):
         _run_in_a_row(graph, part, values)
-        values |= _fused_by_shape([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
+        values |= _fused_by_shape(
+            [n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values
+        )
     return [values[n] for n in outputs]
 
 
-def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> NodeList:
+def _deepest_first(
+    graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]
+) -> NodeList:
     """Return the needed nodes, each soon after its arguments, with the longest chains first. Sums then grow
     term by term, and few values pass between pieces.
     """
@@ -93,7 +99,11 @@ def _fused_by_shape(nodes: NodeList, values: Mapping[int, jax.Array]) -> dict[in
     for n in nodes:
         if jnp.issubdtype(jnp.result_type(values[n]), jnp.floating) and isinstance(values[n], jax.Array):
             alike.setdefault((values[n].shape, values[n].dtype), []).append(n)
-    return {n: x for group in alike.values() for n, x in zip(group, fused(tuple(values[n] for n in group)), strict=True)}
+    return {
+        n: x
+        for group in alike.values()
+        for n, x in zip(group, fused(tuple(values[n] for n in group)), strict=True)
+    }
 
 
 FUNCTIONS: dict[str, Callable] = {name: operation.in_jax for name, operation in TABLE.items()}

@@ -20,7 +20,13 @@ class Probes:
         arrays: Mapping[str, Callable] = AT_PROBES,
         constant: Callable = float,
     ):
-        self.graph, self.inputs, self._functions, self._of_arrays, self._constant = graph, dict(inputs), functions, arrays, constant
+        self.graph, self.inputs, self._functions, self._of_arrays, self._constant = (
+            graph,
+            dict(inputs),
+            functions,
+            arrays,
+            constant,
+        )
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         self._row: dict[int, int] = {}  # row of the table, by node
         self._table = np.empty((256, self.count))
@@ -35,7 +41,9 @@ class Probes:
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
         """Return probes with some inputs changed."""
-        return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant)
+        return Probes(
+            self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant
+        )
 
     def sign(self, node: int) -> int:
         """Return 1 or -1 if the node has this sign at every probe, otherwise 0."""
@@ -53,7 +61,13 @@ class Probes:
             return graph.one
         k = known[np.argsort(size[known])[known.size // 2]]
         varying = [n for n in graph.reachable([node]) if graph.op[n] == "input" and graph.varies[n]]
-        return graph.substituted([node], {n: graph.const(float(np.broadcast_to(self.inputs[str(graph.value[n])], self.count)[k])) for n in varying})[0]
+        return graph.substituted(
+            [node],
+            {
+                n: graph.const(float(np.broadcast_to(self.inputs[str(graph.value[n])], self.count)[k]))
+                for n in varying
+            },
+        )[0]
 
     def _compute(self, nodes) -> None:
         graph, row = self.graph, self._row
@@ -70,7 +84,9 @@ class Probes:
                 if op in functions:
                     table[place] = functions[op](*[table[row[a]] for a in graph.args[node]])
                 elif op in ARRAYS:
-                    args = [self._arrays[a] if graph.op[a] in ARRAYS else table[row[a]] for a in graph.args[node]]
+                    args = [
+                        self._arrays[a] if graph.op[a] in ARRAYS else table[row[a]] for a in graph.args[node]
+                    ]
                     self._arrays[node] = self._of_arrays[op](graph.value[node], *args)
                 elif op == "entry":
                     table[place] = self._of_arrays[op](graph.value[node], self._arrays[graph.args[node][0]])

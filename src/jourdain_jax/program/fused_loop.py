@@ -35,7 +35,9 @@ def _batched(values, axes):
     # values shared by all samples stay without a batch axis, because a derivative rule must not add one that
     # the values lack
     alike = fused(tuple(x for x, axis in zip(values, axes, strict=True) if axis is None))
-    lanes = fused(tuple(jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True) if axis is not None))
+    lanes = fused(
+        tuple(jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True) if axis is not None)
+    )
     found = {None: iter(alike), 0: iter(lanes)}
     new_axes = [None if axis is None else 0 for axis in axes]
     return [next(found[axis]) for axis in new_axes], new_axes

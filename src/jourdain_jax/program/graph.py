@@ -205,7 +205,11 @@ class Graph:
     def div(self, a: int, b: int) -> int:
         """a / b"""
         if self.op[b] == "const" and self.value[b] != 0:
-            return self.mul(a, self.const(1 / self.value[b])) if self.op[a] != "const" else self.const(self.value[a] / self.value[b])
+            return (
+                self.mul(a, self.const(1 / self.value[b]))
+                if self.op[a] != "const"
+                else self.const(self.value[a] / self.value[b])
+            )
         if a == self.zero:
             return a
         if self.op[a] == "neg":
@@ -256,7 +260,11 @@ class Graph:
         """Combine scalars into an array, or return the existing array of exactly these entries."""
         entries = tuple(entries)
         whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
-        if whole is not None and self.value[whole][1:] == (shape, dtype) and entries == tuple(self.entries(whole).ravel().tolist()):
+        if (
+            whole is not None
+            and self.value[whole][1:] == (shape, dtype)
+            and entries == tuple(self.entries(whole).ravel().tolist())
+        ):
             return whole
         return self._node("array", entries, (shape, dtype))
 
@@ -271,7 +279,9 @@ class Graph:
     def entries(self, output: int) -> np.ndarray:
         """Return the entries of a result of a call."""
         _, shape, _ = self.value[output]
-        return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
+        return np.array(
+            [self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64
+        ).reshape(shape)
 
     def entries_of(self, array: int) -> NodeList:
         """Return the entries of an array or of a result of a call."""
@@ -289,7 +299,11 @@ class Graph:
         """Copy nodes from another graph; return old -> new node, including the `known` ones."""
         nodes, new = list(nodes), dict(known)
         for node in of.needed(nodes, new):
-            new[node] = self.const(of.value[node]) if of.is_const(node) else self.again(node, [new[a] for a in of.args[node]], of)
+            new[node] = (
+                self.const(of.value[node])
+                if of.is_const(node)
+                else self.again(node, [new[a] for a in of.args[node]], of)
+            )
         return new
 
     def calls(self, nodes: Iterable[int]) -> NodeList:
@@ -344,7 +358,9 @@ class Graph:
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
         """Return the numeric nodes that depend only on parameters and are used by varying nodes."""
         outputs = list(outputs)
-        found = {a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]} | set(outputs)
+        found = {
+            a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]
+        } | set(outputs)
         return tuple(sorted(n for n in found if not (self.varies[n] or self.is_const(n) or self.is_truth(n))))
 
     def is_truth(self, node: int) -> bool:
@@ -363,7 +379,9 @@ class Graph:
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
-                new[node] = self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
+                new[node] = (
+                    self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
+                )
         return [new[n] for n in outputs]
 
     def _divides_once(self, node: int, uses: dict[int, int], outputs: NodeList) -> bool:

@@ -45,12 +45,25 @@ class Bounded(np.ndarray):
 class IdentityProbes:
     """Values of the nodes of a graph at generic inputs, with round-off bounds."""
 
-    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float], radix: np.ndarray | None = None):
+    def __init__(
+        self,
+        graph: Graph,
+        inputs: Mapping[str, np.ndarray],
+        errors: Mapping[str, np.ndarray | float],
+        radix: np.ndarray | None = None,
+    ):
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
-        both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
+        both = {
+            name: np.concatenate(
+                [np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]
+            )
+            for name, x in inputs.items()
+        }
         # random radix in place of 2^DIGITS
-        self._radix = radix = np.random.default_rng(4).uniform(1.5, 3.0, self.count) if radix is None else radix
+        self._radix = radix = (
+            np.random.default_rng(4).uniform(1.5, 3.0, self.count) if radix is None else radix
+        )
         # bounds follow the values in one array, like further probes
         self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
 
@@ -61,7 +74,9 @@ class IdentityProbes:
         found.error = np.where(np.isfinite(values), np.where(np.isnan(errors), np.inf, errors), 0.0)
         return found
 
-    def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
+    def with_inputs(
+        self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT
+    ) -> Self:
         """Return probes with some inputs and their round-off bounds replaced."""
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
@@ -85,7 +100,12 @@ class IdentityProbes:
             return np.concatenate([(np.roll(x, 1) if name in group else x)[at] for group in groups])
 
         inputs = {name: in_turn(name, x) for name, x in self.inputs.items()}
-        return type(self)(self.graph, inputs, {name: in_turn(name, x) for name, x in self._errors.items()}, np.tile(self._radix[at], len(groups)))
+        return type(self)(
+            self.graph,
+            inputs,
+            {name: in_turn(name, x) for name, x in self._errors.items()},
+            np.tile(self._radix[at], len(groups)),
+        )
 
 
 def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
@@ -130,11 +150,18 @@ def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: n
     """Return whether the vectors `a`, shape (probes, entries), are linear combinations of the `rows`, shape
     (probes, rows, entries), at all meaningful probes.
     """
-    said = np.isfinite(a).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=(1, 2))
+    said = (
+        np.isfinite(a).all(axis=1)
+        & np.isfinite(error).all(axis=1)
+        & np.isfinite(rows).all(axis=(1, 2))
+        & np.isfinite(errors).all(axis=(1, 2))
+    )
     for v, e, B, E in zip(a[said], error[said], rows[said], errors[said], strict=True):
         x = np.linalg.lstsq(B.T, v, rcond=None)[0]
         size = np.linalg.norm(v) + np.abs(x) @ np.linalg.norm(B, axis=1)
-        if np.linalg.norm(v - x @ B) > SURE * (np.linalg.norm(e) + np.abs(x) @ np.linalg.norm(E, axis=1) + B.size * EPS * size):
+        if np.linalg.norm(v - x @ B) > SURE * (
+            np.linalg.norm(e) + np.abs(x) @ np.linalg.norm(E, axis=1) + B.size * EPS * size
+        ):
             return False
     return int(np.count_nonzero(said)) >= FEWEST
 
@@ -153,12 +180,22 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
         # a mode is always an integer
         if name in unchanged or (name.startswith("i") and np.ptp(value) > 0 and not np.any(value % 1.0)):
             return value
-        return generator.uniform(0.5, 1.5, count) if name.startswith("p") else scale * generator.normal(size=count)
+        return (
+            generator.uniform(0.5, 1.5, count)
+            if name.startswith("p")
+            else scale * generator.normal(size=count)
+        )
 
-    return IdentityProbes(probes.graph, {name: drawn(name, value) for name, value in probes.inputs.items()}, dict.fromkeys(unchanged, 4 * EPS))
+    return IdentityProbes(
+        probes.graph,
+        {name: drawn(name, value) for name, value in probes.inputs.items()},
+        dict.fromkeys(unchanged, 4 * EPS),
+    )
 
 
-def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
+def on_rows(
+    probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]
+) -> IdentityProbes:
     """Return `probes` with `coordinates` (names of inputs -> nodes) projected onto rows = 0 by Gauss-Newton
     from `near`. Probes without convergence become meaningless.
 
@@ -166,17 +203,23 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     """
     if not taken_for_what_they_are(probes.graph, rows):
         return probes
-    begun = probes.with_inputs({name: near.inputs[name] for name in coordinates}, dict.fromkeys(coordinates, 0.0))
+    begun = probes.with_inputs(
+        {name: near.inputs[name] for name in coordinates}, dict.fromkeys(coordinates, 0.0)
+    )
     found = onto_rows(begun, rows, coordinates, most=30, longest=1.0)
     if not found.moved:
         return probes
     values, J = found.probes(rows), np.asarray(found.probes(found.slopes)).T
     q = np.stack([found.probes.inputs[name] for name in found.moved])
     off = np.abs(np.asarray(values))
-    errors = np.einsum("pqr,rp->qp", np.abs(pseudo_inverses(found.pattern.dense(J))), off + values.error) + EPS * np.abs(q)
+    errors = np.einsum(
+        "pqr,rp->qp", np.abs(pseudo_inverses(found.pattern.dense(J))), off + values.error
+    ) + EPS * np.abs(q)
     # rows may deviate by 1,000 round-off bounds
     errors[:, ~np.all(off <= 1e3 * values.error, axis=0)] = np.inf
-    return probes.with_inputs(dict(zip(found.moved, q, strict=True)), dict(zip(found.moved, errors, strict=True)))
+    return probes.with_inputs(
+        dict(zip(found.moved, q, strict=True)), dict(zip(found.moved, errors, strict=True))
+    )
 
 
 def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
@@ -196,7 +239,9 @@ def _generic(name: str) -> Callable:
     def function(*operands):
         weights = np.random.default_rng(zlib.crc32(name.encode())).uniform(0.3, 1.7, (2, len(operands)))
         half = len(operands[0]) // 2
-        (phase, e), (rest, _) = (halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights)
+        (phase, e), (rest, _) = (
+            halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights
+        )
         # weights differ at most sixfold, so this bounds the round-off of both sums
         size = sum(np.abs(x[:half]) for x in operands)
         return with_bound(np.sin(phase + 0.4) + 0.3 * rest, 3.0 * e + 2.0 * len(operands) * EPS * size)

@@ -41,7 +41,12 @@ Value: TypeAlias = Nodes | np.ndarray
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     """Return the outputs of a closed jaxpr at the given arguments."""
-    return evaluated(closed, arguments, lambda equation, inputs: apply(graph, equation, inputs), lambda x, aval: np.asarray(x))
+    return evaluated(
+        closed,
+        arguments,
+        lambda equation, inputs: apply(graph, equation, inputs),
+        lambda x, aval: np.asarray(x),
+    )
 
 
 def effects_of(jaxpr) -> str:
@@ -49,7 +54,11 @@ def effects_of(jaxpr) -> str:
     for equation in jaxpr.eqns:
         if equation.effects:
             inner = called(equation.primitive.name, equation.params)
-            return f"the operation `{equation.primitive.name}`, which has effects," if inner is None else effects_of(inner.jaxpr)
+            return (
+                f"the operation `{equation.primitive.name}`, which has effects,"
+                if inner is None
+                else effects_of(inner.jaxpr)
+            )
     return ""
 
 
@@ -67,7 +76,11 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
     """Return the results of one equation."""
     name = equation.primitive.name
     refuse(equation)
-    if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
+    if (
+        graph.keeps_rules
+        and (rule := own_rule(name, equation.params))
+        and any(isinstance(x, Nodes) for x in inputs)
+    ):
         raise Unsupported(rule)
     inner = called(name, equation.params)
     if inner is not None:
@@ -87,7 +100,9 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
     if symbolic and name in _MOVES:
         return [Nodes(ids) for ids in _moved(graph, name, equation, inputs)]
     if not symbolic:
-        return applied(equation, [np.asarray(x, v.aval.dtype) for x, v in zip(inputs, equation.invars, strict=True)])
+        return applied(
+            equation, [np.asarray(x, v.aval.dtype) for x, v in zip(inputs, equation.invars, strict=True)]
+        )
     if out.dtype.kind in "iu" and name in _NOT_OF_INTEGERS:
         raise Unsupported("an integer that depends on the state")
     if _is_rounded(out.dtype):
@@ -116,8 +131,10 @@ def refuse(equation) -> None:
     """Raise ValueError if a scene cannot contain this equation."""
     kinds = [v.aval.dtype for v in (*equation.invars, *equation.outvars)]
     if any(not isinstance(kind, np.dtype) and jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
-        raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
-            "them outside and pass them as parameters or inputs")
+        raise ValueError(
+            f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
+            "them outside and pass them as parameters or inputs"
+        )
 
 
 def own_rule(name: str, params) -> str:
@@ -185,7 +202,20 @@ def _scatter_add(graph, inputs, params):
 
 # Operands that hold entries; the others are indices.
 _MOVES: dict[str, Callable[[int], Collection[int]]] = {
-    **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "dynamic_slice", "split"), lambda n: (0,)),
+    **dict.fromkeys(
+        (
+            "broadcast_in_dim",
+            "reshape",
+            "squeeze",
+            "expand_dims",
+            "transpose",
+            "rev",
+            "slice",
+            "dynamic_slice",
+            "split",
+        ),
+        lambda n: (0,),
+    ),
     **dict.fromkeys(("gather", "copy", "copy_p", "stop_gradient", "unstack"), lambda n: (0,)),
     **dict.fromkeys(("concatenate", "stack", "optimization_barrier"), range),
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
@@ -219,7 +249,11 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
         return Nodes(ids)
     if kinds[1] not in ("f", "b") and kinds[0] != "b":
         raise Unsupported("an integer that depends on the state")
-    one = (lambda n: graph.call("select", n, graph.zero, graph.one)) if old.kind == "b" else (lambda n: graph.call("ne", n, graph.zero))
+    one = (
+        (lambda n: graph.call("select", n, graph.zero, graph.one))
+        if old.kind == "b"
+        else (lambda n: graph.call("ne", n, graph.zero))
+    )
     return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
 
 

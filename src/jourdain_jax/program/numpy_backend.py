@@ -52,12 +52,19 @@ def _scan(equation, inputs) -> list[np.ndarray]:
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
         result = evaluated(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)], applied)
         before_last, before, carry = before, carry, result[:carried]
-        if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
+        if (
+            not xs
+            and not outs
+            and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0))
+        ):
             return carry  # a fixed point or a cycle of two: further iterations change nothing
         for out, y in zip(outs, result[carried:], strict=True):
             out.append(y)
     avals = [v.aval for v in params["jaxpr"].jaxpr.outvars[carried:]]
-    stacked = [np.stack(out[::-1] if params["reverse"] else out) if out else np.zeros((0, *a.shape), a.dtype) for out, a in zip(outs, avals, strict=True)]
+    stacked = [
+        np.stack(out[::-1] if params["reverse"] else out) if out else np.zeros((0, *a.shape), a.dtype)
+        for out, a in zip(outs, avals, strict=True)
+    ]
     return [*carry, *stacked]
 
 
@@ -74,14 +81,28 @@ def _while(equation, inputs) -> list[np.ndarray]:
         if not np.any(going):
             return carry
         new = evaluated(params["body_jaxpr"], [*of_body, *carry], applied)
-        carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
+        carry = (
+            new
+            if going.ndim == 0
+            else [
+                np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o)
+                for n, o in zip(new, carry, strict=True)
+            ]
+        )
     if np.all(going):
         raise ValueError(
             f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; check its "
-                "condition or bound it, such as `lambda state: (state[0] < 50) & ...`"
+            "condition or bound it, such as `lambda state: (state[0] < 50) & ...`"
         )
     # some samples have ended; the results of the others are unknown, so NaN
-    return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]
+    return [
+        (
+            np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype)
+            if x.dtype.kind == "f"
+            else x
+        )
+        for x in carry
+    ]
 
 
 def _where(equation) -> str:
@@ -89,7 +110,10 @@ def _where(equation) -> str:
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         if not any(part in frame.file_name for part in _NOT_THE_USERS):
-            return f"`{frame.function_name.rpartition('.')[2]}` (line {frame.line_num} of {os.path.basename(frame.file_name)})"
+            return (
+                f"`{frame.function_name.rpartition('.')[2]}` (line {frame.line_num} of"
+                f" {os.path.basename(frame.file_name)})"
+            )
     return "a function of the scene"
 
 
@@ -101,13 +125,17 @@ def _linear_solve(equation, inputs) -> list[np.ndarray]:
 
 def _linear_map(equation, inputs) -> list[np.ndarray]:
     count = equation.params["count"]
-    return evaluated(jax.make_jaxpr(equation.params["linear"].apply)(inputs[:count], inputs[count:]), inputs, applied)
+    return evaluated(
+        jax.make_jaxpr(equation.params["linear"].apply)(inputs[:count], inputs[count:]), inputs, applied
+    )
 
 
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
     "while": _while,
-    "cond": lambda equation, inputs: evaluated(equation.params["branches"][int(inputs[0])], inputs[1:], applied),
+    "cond": lambda equation, inputs: evaluated(
+        equation.params["branches"][int(inputs[0])], inputs[1:], applied
+    ),
     "jourdain_linear_map": _linear_map,
     "custom_lin": lambda equation, inputs: inputs,
     "custom_linear_solve": _linear_solve,
@@ -152,8 +180,12 @@ def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
-    left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
-    right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
+    left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(
+        *batch, int(np.prod([a.shape[i] for i in free_a])), contracted
+    )
+    right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(
+        *batch, contracted, int(np.prod([b.shape[i] for i in free_b]))
+    )
     return left, right
 
 
@@ -172,7 +204,9 @@ def _slice(equation, x):
 
 def _select(equation, which, *cases):
     which = which.reshape((*which.shape, *(1,) * (cases[0].ndim - which.ndim)))
-    return np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
+    return (
+        np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
+    )
 
 
 def _window(x, starts, sizes) -> tuple[slice, ...]:
@@ -184,7 +218,9 @@ def _window(x, starts, sizes) -> tuple[slice, ...]:
 def _pad(equation, x, fill):
     out = np.full(equation.outvars[0].aval.shape, fill)
     places, kept = [], []
-    for (low, _, interior), size, total in zip(equation.params["padding_config"], x.shape, out.shape, strict=True):
+    for (low, _, interior), size, total in zip(
+        equation.params["padding_config"], x.shape, out.shape, strict=True
+    ):
         at = low + (interior + 1) * np.arange(size)
         kept.append((at >= 0) & (at < total))
         places.append(at[kept[-1]])
@@ -194,7 +230,11 @@ def _pad(equation, x, fill):
 
 def _svd(equation, A):
     good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
-    found = np.linalg.svd(np.where(good, A, 0.0), full_matrices=equation.params["full_matrices"], compute_uv=equation.params["compute_uv"])
+    found = np.linalg.svd(
+        np.where(good, A, 0.0),
+        full_matrices=equation.params["full_matrices"],
+        compute_uv=equation.params["compute_uv"],
+    )
     found = [found[1], found[0], found[2]] if equation.params["compute_uv"] else [found]
     return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
 
@@ -216,7 +256,11 @@ def _triangular_solve(equation, A, b):
         A = np.where(np.eye(A.shape[-1], dtype=bool), np.ones((), A.dtype), A)
     singular = np.any(np.diagonal(A, axis1=-2, axis2=-1) == 0, axis=-1)[..., None, None]
     safe = np.where(singular, np.eye(A.shape[-1]), A)
-    x = np.linalg.solve(safe, b) if p["left_side"] else np.swapaxes(np.linalg.solve(np.swapaxes(safe, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
+    x = (
+        np.linalg.solve(safe, b)
+        if p["left_side"]
+        else np.swapaxes(np.linalg.solve(np.swapaxes(safe, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
+    )
     return np.where(singular, np.nan, x)
 
 
@@ -231,7 +275,10 @@ def _lu(equation, A):
     for k in range(swaps.shape[1]):
         swaps[:, k] = best = k + np.argmax(np.abs(LU[:, k:, k]), axis=1)
         for exchanged in (LU, order):
-            exchanged[every, k], exchanged[every, best] = exchanged[every, best].copy(), exchanged[every, k].copy()
+            exchanged[every, k], exchanged[every, best] = (
+                exchanged[every, best].copy(),
+                exchanged[every, k].copy(),
+            )
         pivot = LU[:, k, k, None]
         LU[:, k + 1 :, k] /= np.where(pivot == 0, 1, pivot)
         LU[:, k + 1 :, k + 1 :] -= LU[:, k + 1 :, k, None] * LU[:, k, None, k + 1 :]
@@ -240,7 +287,10 @@ def _lu(equation, A):
 
 def _platform(equation):
     """Return the index of the CPU implementation, or of the one for all platforms."""
-    return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
+    return np.asarray(
+        next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names),
+        np.int32,
+    )
 
 
 def _iota(equation, *dynamic):
@@ -252,7 +302,9 @@ def _iota(equation, *dynamic):
 def _reduced(function: Callable, of_nothing=None) -> Callable:
     def reduced(equation, x):
         start = {} if of_nothing is None or x.dtype.kind != "f" else {"initial": of_nothing}
-        return np.asarray(function(x, axis=tuple(equation.params["axes"]), **start), equation.outvars[0].aval.dtype)
+        return np.asarray(
+            function(x, axis=tuple(equation.params["axes"]), **start), equation.outvars[0].aval.dtype
+        )
 
     return reduced
 
@@ -262,8 +314,8 @@ def _reshaped(equation, x, *dynamic):
 
 
 def places(shape: Sequence[int], indices: np.ndarray, sizes: Sequence[int], axes, lanes, mode) -> np.ndarray:
-    """Return the flat places, in an array of this shape, of the windows of these sizes that begin at `indices`
-    along `axes`; -1 for a window beyond the array, unless the mode moves it inside.
+    """Return the flat places, in an array of this shape, of the windows of these sizes that begin at
+    `indices` along `axes`; -1 for a window beyond the array, unless the mode moves it inside.
 
     `lanes`: pairs of an axis of the array and the axis of the indices that it goes along with. Axes of the
     indices come first, those of windows last.
@@ -289,7 +341,9 @@ def gathered(params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
     found = places(x.shape, indices, params["slice_sizes"], n.start_index_map, lanes, params["mode"])
     if np.any(found < 0):
         return None
-    found = np.squeeze(found, tuple(count + axis for axis in (*n.collapsed_slice_dims, *n.operand_batching_dims)))
+    found = np.squeeze(
+        found, tuple(count + axis for axis in (*n.collapsed_slice_dims, *n.operand_batching_dims))
+    )
     return np.ravel(x)[np.moveaxis(found, range(count, found.ndim), n.offset_dims)]
 
 
@@ -306,7 +360,9 @@ RULES: dict[str, Callable] = {
     "slice": _slice,
     "round": _round,
     "select_n": _select,
-    "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
+    "integer_pow": lambda e, x: np.asarray(
+        x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]
+    ),
     "svd": _svd,
     "lu": _lu,
     "cholesky": _cholesky,

@@ -39,7 +39,10 @@ class _Variable:
 
     @property
     def may_be_scalars(self) -> bool:
-        return bool(np.issubdtype(self.aval.dtype, np.floating) or self.aval.dtype == bool) and self.aval.size <= LARGEST
+        return (
+            bool(np.issubdtype(self.aval.dtype, np.floating) or self.aval.dtype == bool)
+            and self.aval.size <= LARGEST
+        )
 
 
 @dataclass(eq=False)
@@ -61,8 +64,12 @@ class _Step:
 
     def results(self, inputs: list) -> list:
         """Return JAX's results for the inputs."""
-        given = {v: x for v, x in zip(self.equation.invars, inputs, strict=True) if not isinstance(v, Literal)}
-        alone = self.around.replace(constvars=[], invars=list(given), outvars=list(self.equation.outvars), eqns=[self.equation])
+        given = {
+            v: x for v, x in zip(self.equation.invars, inputs, strict=True) if not isinstance(v, Literal)
+        }
+        alone = self.around.replace(
+            constvars=[], invars=list(given), outvars=list(self.equation.outvars), eqns=[self.equation]
+        )
         return jaxpr_as_fun(ClosedJaxpr(alone, []))(*given.values())
 
 
@@ -91,7 +98,9 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     # otherwise in their original order
     for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):
         if not step.opaque:
-            results = apply(graph, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
+            results = apply(
+                graph, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs]
+            )
             values |= dict(zip(step.outputs, results, strict=True))
         elif step is step.part[0]:
             values |= _called(graph, step.part, values, users, asked)
@@ -164,8 +173,12 @@ def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked
     for step in steps:
         step.opaque = step.opaque or any(v.is_large for v in from_opaque(step))
     for step in reversed(steps):
-        inside = all(v not in asked and v in users and all(user.opaque for user in users[v]) for v in step.outputs)
-        step.opaque = step.opaque or (inside and (any(v.is_large for v in step.outputs) or bool(from_opaque(step))))
+        inside = all(
+            v not in asked and v in users and all(user.opaque for user in users[v]) for v in step.outputs
+        )
+        step.opaque = step.opaque or (
+            inside and (any(v.is_large for v in step.outputs) or bool(from_opaque(step)))
+        )
     for step in steps:
         made_by = [maker[v] for v in step.variables if v in maker]
         if not step.opaque:
@@ -180,16 +193,27 @@ def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked
                     member.part = joined
 
 
-def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> dict:
+def _called(
+    graph: Graph, part: list[_Step], values: dict, users: dict[_Variable, list[_Step]], asked: set[_Variable]
+) -> dict:
     """Add the call of a part to the graph; return the values of its results."""
     made = [v for step in part for v in step.outputs]
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
     given = [(values[v], v.aval) for v in operands]
-    arrays = [x.node if isinstance(x, _Opaque) else graph.array(x.ids.ravel().tolist(), aval.shape, str(aval.dtype)) for x, aval in given]
-    found = graph.results(graph.opaque(_call(part, operands, results), arrays), {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)})
+    arrays = [
+        x.node if isinstance(x, _Opaque) else graph.array(x.ids.ravel().tolist(), aval.shape, str(aval.dtype))
+        for x, aval in given
+    ]
+    found = graph.results(
+        graph.opaque(_call(part, operands, results), arrays),
+        {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)},
+    )
     taken_apart = [v in asked or not all(user.opaque for user in users[v]) for v in results]
-    return {v: Nodes(graph.entries(node)) if apart else _Opaque(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
+    return {
+        v: Nodes(graph.entries(node)) if apart else _Opaque(node)
+        for v, node, apart in zip(results, found, taken_apart, strict=True)
+    }
 
 
 def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:
@@ -198,7 +222,13 @@ def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]
     def function(*arrays):
         known = dict(zip(operands, arrays, strict=True))
         for step in part:
-            known |= dict(zip(step.outputs, step.results([known[x] if isinstance(x, _Variable) else x for x in step.inputs]), strict=True))
+            known |= dict(
+                zip(
+                    step.outputs,
+                    step.results([known[x] if isinstance(x, _Variable) else x for x in step.inputs]),
+                    strict=True,
+                )
+            )
         return [known[v] for v in results]
 
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))

@@ -26,7 +26,8 @@ class NormalForms:
     reverse took fewer operations in no model).
 
     - `most_terms`: maximum number of terms of a normal form; 0: nodes stay unchanged.
-    - `sign`: 1, -1 or 0 (unknown) for a node. With a known sign, |x| becomes x or -x, and `guards` records it.
+    - `sign`: 1, -1 or 0 (unknown) for a node. With a known sign, |x| becomes x or -x, and `guards` records
+      it.
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
 
@@ -87,7 +88,15 @@ class NormalForms:
         if op == "input":
             return {(node,): 1.0}
         if op in ARRAYS or op == "entry":
-            return {(node if not graph.varies[node] else graph.again(node, [self._rebuilt_or(a) for a in args]),): 1.0}
+            return {
+                (
+                    (
+                        node
+                        if not graph.varies[node]
+                        else graph.again(node, [self._rebuilt_or(a) for a in args])
+                    ),
+                ): 1.0
+            }
         parts = [p for p in (self._expanded[a] for a in args) if p is not None]
         if len(parts) < len(args):
             raise TooLarge
@@ -122,7 +131,9 @@ class NormalForms:
         outside, inside = rooted
         return self._times(self._root(inside) if inside != {(): 1.0} else inside, self._magnitude, outside)
 
-    def _times(self, p: Polynomial, function: Callable[[int], Polynomial], atoms: Iterable[int]) -> Polynomial:
+    def _times(
+        self, p: Polynomial, function: Callable[[int], Polynomial], atoms: Iterable[int]
+    ) -> Polynomial:
         """Return p f(x) f(y) ... for some atoms."""
         for atom in atoms:
             p = self.product(p, function(atom))
@@ -133,12 +144,20 @@ class NormalForms:
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
-            outside, inside = ([atom for atom, k in counts.items() for _ in range(share(k))] for share in (lambda k: k // 2, lambda k: k % 2))
+            outside, inside = (
+                [atom for atom, k in counts.items() for _ in range(share(k))]
+                for share in (lambda k: k // 2, lambda k: k % 2)
+            )
             return (outside, {tuple(inside): c}) if outside else None
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
             extra = Counter(large) - Counter(small)
-            if c == -d and len(large) == len(small) + 2 and [*extra.values()] == [2] and self.graph.op[min(extra)] == "cos":
+            if (
+                c == -d
+                and len(large) == len(small) + 2
+                and [*extra.values()] == [2]
+                and self.graph.op[min(extra)] == "cos"
+            ):
                 return [self.graph.call("sin", self.graph.args[min(extra)][0])], {small: c}
         return None
 
@@ -244,7 +263,9 @@ class NormalForms:
         """Return x for an atom 1/x, None for others."""
         graph = self.graph
         if atom not in self._reciprocals:
-            self._reciprocals[atom] = graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
+            self._reciprocals[atom] = (
+                graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
+            )
         return self._reciprocals[atom]
 
     # and back
@@ -280,13 +301,20 @@ class NormalForms:
         scale = next(iter(q.values()))
         p = self._times({m: c / scale for m, c in p.items()}, self._inverse_atom, common.elements())
         divisor = self.rebuilt({tuple((Counter(m) - common).elements()): c / scale for m, c in q.items()})
-        return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)
+        return (
+            graph.div(self.rebuilt(p), divisor)
+            if graph.varies[divisor]
+            else self.rebuilt(p, None if divisor == graph.one else divisor)
+        )
 
     def cramer(self, M: list[NodeList], f: NodeList) -> NodeList:
         """Return `M^-1 f` in normal form by Cramer's rule, for up to three unknowns."""
         A, b = [[self.expanded(x) for x in row] for row in M], [self.expanded(x) for x in f]
         determinant = self._determinant(A)
-        replaced = [[[b[i] if j == k else A[i][j] for j in range(len(b))] for i in range(len(b))] for k in range(len(b))]
+        replaced = [
+            [[b[i] if j == k else A[i][j] for j in range(len(b))] for i in range(len(b))]
+            for k in range(len(b))
+        ]
         return [self.quotient(self._determinant(R), determinant) for R in replaced]
 
     def _determinant(self, A: list[list[Polynomial]]) -> Polynomial:
@@ -303,15 +331,23 @@ class NormalForms:
 
     def _coefficient(self, p: Polynomial) -> int:
         """Return a node for a polynomial in parameters, without minimising its operations."""
-        return self.graph.total(self.graph.mul(self.graph.const(c), self.graph.product(monomial)) for monomial, c in sorted(p.items()))
+        return self.graph.total(
+            self.graph.mul(self.graph.const(c), self.graph.product(monomial))
+            for monomial, c in sorted(p.items())
+        )
 
     def _horner(self, terms: list[tuple[Monomial, bool]]) -> int:
         graph = self.graph
         counts = Counter(factor for factors, _ in terms for factor in set(factors))
-        factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(graph.one, 0))
+        factor, count = max(
+            counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(graph.one, 0)
+        )
         if count < 2:
             # parameters first
-            products = ((graph.product(sorted(factors, key=graph.varies.__getitem__)), positive) for factors, positive in sorted(terms))
+            products = (
+                (graph.product(sorted(factors, key=graph.varies.__getitem__)), positive)
+                for factors, positive in sorted(terms)
+            )
             return graph.total(product if positive else graph.neg(product) for product, positive in products)
         inside = [(_without(f, factor), s) for f, s in terms if factor in f]
         outside = [(f, s) for f, s in terms if factor not in f]

@@ -28,7 +28,11 @@ def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) 
     needed = set(graph.reachable(rows))
     moved = {name: n for name, n in inputs.items() if n in needed}
     pattern, slopes = _slopes_by_entries(graph, rows, list(moved.values()))
-    given = np.stack([np.broadcast_to(probes.inputs[name], probes.count) for name in moved], axis=1) if moved else np.zeros((probes.count, 0))
+    given = (
+        np.stack([np.broadcast_to(probes.inputs[name], probes.count) for name in moved], axis=1)
+        if moved
+        else np.zeros((probes.count, 0))
+    )
 
     def at(x, which):
         every = given.copy()
@@ -43,10 +47,19 @@ def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) 
     return Projected(at(x, slice(None)), list(moved), pattern, slopes)
 
 
-def _slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
+def _slopes_by_entries(
+    graph: Graph, rows: Sequence[int], variables: Sequence[int]
+) -> tuple[Pattern, list[int]]:
     """Return the structurally nonzero derivatives of rows with respect to variables: their pattern and their
     nodes.
     """
     place = {n: k for k, n in enumerate(variables)}
-    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
-    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]
+    entries = [
+        (i, place[n], slope)
+        for i, row in enumerate(jacobian(graph, rows, variables))
+        for n, slope in row.items()
+        if slope != graph.zero
+    ]
+    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [
+        slope for *_, slope in entries
+    ]

@@ -34,7 +34,9 @@ PYTHON = Language("python", "math.", "    {name} = {value}", "math.inf")
 C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 
 
-def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
+def statements(
+    graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s"
+) -> tuple[list[str], list[str]]:
     """Return lines that name values used more than once, and the expressions of the outputs. `names`: names
     of inputs and of known nodes.
     """
@@ -60,7 +62,7 @@ def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dic
     if reasons:
         raise ValueError(
             f"calls of JAX ({'; '.join(reasons)}) cannot be written as source; rewrite the load or event "
-                "that contains them in scalar operations, or print the scene without it"
+            "that contains them in scalar operations, or print the scene without it"
         )
     return nodes
 
@@ -69,7 +71,13 @@ def _expression(graph: Graph, node: int, written, language: Language) -> tuple[s
     op, args = graph.operation(node)
     if op == "const":
         value = graph.value[node]
-        text = repr(value) if abs(value) < float("inf") else language.infinity if value > 0 else f"-{language.infinity}"
+        text = (
+            repr(value)
+            if abs(value) < float("inf")
+            else language.infinity
+            if value > 0
+            else f"-{language.infinity}"
+        )
         return text, 9 if value >= 0 else 1
     if op == "input":
         return str(graph.value[node]), 9
@@ -95,7 +103,11 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
     for node in _needed(graph, outputs, values):
         op = graph.op[node]
         if op == "const":
-            values[node] = sympy.nsimplify(graph.value[node], rational=True) if abs(graph.value[node]) < 1e6 else sympy.Float(graph.value[node])
+            values[node] = (
+                sympy.nsimplify(graph.value[node], rational=True)
+                if abs(graph.value[node]) < 1e6
+                else sympy.Float(graph.value[node])
+            )
         else:
             function = TABLE[op].sympy
             args = [values[a] for a in graph.args[node]]

@@ -52,8 +52,9 @@ class BuiltFor:
     reference: Any
 
     def __getattr__(self, name: str):
-        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its "
-            "`.scene`")
+        raise AttributeError(
+            f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its `.scene`"
+        )
 
 
 def as_scene(scene) -> Scene:
@@ -69,8 +70,9 @@ def as_scene(scene) -> Scene:
             f"`scene` is the class `{scene.__name__}`, expected an instance; write `{scene.__name__}()`, "
             "with parameters in the parentheses"
         )
-    raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of "
-        "`jj.Scene`")
+    raise ValueError(
+        f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`"
+    )
 
 
 def as_rolling(scene, what: str) -> Scene:
@@ -110,16 +112,20 @@ def of_known_numbers(function: F) -> F:
 
 def as_time(t) -> Scalar:
     """Return a time in s, as a number of the default floating-point type."""
-    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for "
-        "many").astype(real_type())
+    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(
+        real_type()
+    )
 
 
 def one_time(t, name: str = "t"):
     """Return a time on NumPy unless it is traced; None stays None. Raises ValueError with its name unless it
     is one number.
     """
-    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use "
-        "`jax.vmap` for many")
+    return (
+        None
+        if t is None
+        else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
+    )
 
 
 def vector_of_times(ts) -> Float[Entries, "times"]:
@@ -147,10 +153,14 @@ def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
         return x  # the usual case, twenty times faster than the checks below
     listed = ", ".join(names)
     if isinstance(x, Mapping):
-        raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of "
-            f"{listed}; `jj.start(scene, **values)` makes one by name")
+        raise ValueError(
+            f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of "
+            f"{listed}; `jj.start(scene, **values)` makes one by name"
+        )
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
-    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice).astype(real_type())
+    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice).astype(
+        real_type()
+    )
 
 
 class ChangingInputs(eqx.Module):
@@ -174,18 +184,31 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
         return jnp.zeros(len(names), dtype)
     if not isinstance(inputs, Mapping):
         listed = ", ".join(names) or "none: the scene has no inputs"
-        return checked_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
+        return checked_real(
+            inputs,
+            f"`inputs` of `{type(scene).__name__}`",
+            (len(names),),
+            advice=f"one number for each of {listed}",
+        )
     check_names(inputs, names, f"`{type(scene).__name__}` has no input `{{}}`")
     advice = "a function of time is for `simulate`; here give its value at this instant"
-    inputs = {name: scene.modes.number(name, x, "`inputs`") if name in dict(scene.modes.pairs) else x for name, x in inputs.items()}
-    values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of "
-        f"`{type(scene).__name__}`", (), advice=advice) for name in names]
+    inputs = {
+        name: scene.modes.number(name, x, "`inputs`") if name in dict(scene.modes.pairs) else x
+        for name, x in inputs.items()
+    }
+    values = [
+        checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)
+        for name in names
+    ]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)
 
 
 _OURS = str(Path(__file__).parents[1])
 _INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-_NOTE = "Lines of jourdain_jax between yours are omitted from this traceback; JAX_TRACEBACK_FILTERING=off shows them."
+_NOTE = (
+    "Lines of jourdain_jax between yours are omitted from this traceback; JAX_TRACEBACK_FILTERING=off shows"
+    " them."
+)
 
 
 def shown_from_users_lines(function: F) -> F:
@@ -197,7 +220,10 @@ def shown_from_users_lines(function: F) -> F:
     def called(*args, **kwargs):
         __tracebackhide__ = True  # for IPython and pytest
         try:
-            usual = jax.config.jax_numpy_dtype_promotion == "standard" and jax.config.jax_numpy_rank_promotion == "allow"
+            usual = (
+                jax.config.jax_numpy_dtype_promotion == "standard"
+                and jax.config.jax_numpy_rank_promotion == "allow"
+            )
             return (function if usual else with_usual_promotion(function))(*args, **kwargs)
         except Exception as error:
             if not _is_shortened(error):

@@ -56,22 +56,39 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
     solid: str = static()
 
-    def __init__(self, mass: Any, inertia: Any, position: Any, orientation: Any, outline: Any = None, solid: str = ""):
+    def __init__(
+        self, mass: Any, inertia: Any, position: Any, orientation: Any, outline: Any = None, solid: str = ""
+    ):
         self.mass = checked_real(mass, "mass of a rigid body", ())
-        what, advice = "inertia of a rigid body", "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre"
+        what, advice = (
+            "inertia of a rigid body",
+            "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre",
+        )
         matrix = checked_real(inertia, what, advice=advice)
-        self.inertia = jnp.diag(matrix) if matrix.shape == (3,) else checked_real(matrix, what, (3, 3), advice=advice)
+        self.inertia = (
+            jnp.diag(matrix) if matrix.shape == (3,) else checked_real(matrix, what, (3, 3), advice=advice)
+        )
         self.position = checked_real(position, "position of a rigid body", (3,))
-        self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)")
-        self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid "
-            "body")
+        self.orientation = checked_real(
+            orientation,
+            "orientation of a rigid body",
+            (3, 3),
+            advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)",
+        )
+        self.outline = (
+            jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
+        )
         if self.outline.ndim != 2 or self.outline.shape[1] != 3:
-            raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); "
-                "give points of a line in its body frame, m")
+            raise ValueError(
+                f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); "
+                "give points of a line in its body frame, m"
+            )
         self.solid = solid
 
     @staticmethod
-    def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
+    def thin_disc(
+        mass, radius, *, axis: str, position, orientation, axial=None, diametral=None
+    ) -> "RigidBody":
         """Return a disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
 
         Its moments are uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are
@@ -95,16 +112,22 @@ class RigidBody(eqx.Module):
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
         mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
-        moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a "
-            "shell") * mass * radius**2
-        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * np.ones((1, 3)), "ellipsoid")
+        moment = (
+            checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell")
+            * mass
+            * radius**2
+        )
+        return RigidBody(
+            mass, _stack([moment] * 3), position, orientation, radius * np.ones((1, 3)), "ellipsoid"
+        )
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
         """Return a thin uniform rod of the given `length` (m) along the body axis `axis` ("x", "y" or "z"),
         `m l^2/12` about the others.
 
-        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another axis.
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another
+        axis.
         """
         k = _axis_index(axis)
         mass, length = checked_real(mass, "mass of a rod", ()), checked_real(length, "length of a rod", ())
@@ -120,7 +143,10 @@ class RigidBody(eqx.Module):
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
-        mass, sides = checked_real(mass, "mass of a box", ()), checked_real(sides, "sides of a box", (3,), advice="give three lengths, m")
+        mass, sides = (
+            checked_real(mass, "mass of a box", ()),
+            checked_real(sides, "sides of a box", (3,), advice="give three lengths, m"),
+        )
         a, b, c = sides[0], sides[1], sides[2]
         moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
         return RigidBody(mass, moments, position, orientation, sides[None] / 2, "box")

@@ -10,7 +10,15 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real
+from jourdain_jax.calculus.reals import (
+    Number,
+    Scalar,
+    Vector,
+    Vector3,
+    check_kind,
+    checked_positive,
+    checked_real,
+)
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.contact.held_rows import HeldRow
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
@@ -45,8 +53,9 @@ def rod(a: Vector, b: Vector, length: Number) -> Scalar:
     compression). The value is smooth even if the points meet. Eq. (5).
     """
     apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
-    length = checked_positive(length, "length of a rod", advice="give it in m; to keep two points together "
-        "use `jj.pin`")
+    length = checked_positive(
+        length, "length of a rod", advice="give it in m; to keep two points together use `jj.pin`"
+    )
     return (apart @ apart - length**2) / (2 * length)
 
 
@@ -59,10 +68,14 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
     """
     if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
         raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
-    return (_point(b, "second point of a pin") - _point(a, "first point of a pin"))[jnp.array(["xyz".index(axis) for axis in axes])]
+    return (_point(b, "second point of a pin") - _point(a, "first point of a pin"))[
+        jnp.array(["xyz".index(axis) for axis in axes])
+    ]
 
 
-def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None) -> Float[Array, "6"]:
+def weld(
+    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None
+) -> Float[Array, "6"]:
     """Return the geometric constraints (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 
     The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second =
@@ -71,5 +84,14 @@ def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_seco
     """
     for body, which in ((first, "first"), (second, "second")):
         check_kind(body, BodyPose, f"the {which} body of a weld", 'the pose of a body; write pose["name"]')
-    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
-    return jnp.concatenate([second.place(at_second) - first.place(at_first), vee(turn.T @ first.orientation.T @ second.orientation)])
+    turn = (
+        jnp.eye(3, dtype=first.position.dtype)
+        if turn is None
+        else checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
+    )
+    return jnp.concatenate(
+        [
+            second.place(at_second) - first.place(at_first),
+            vee(turn.T @ first.orientation.T @ second.orientation),
+        ]
+    )

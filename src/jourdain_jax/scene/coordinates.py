@@ -21,7 +21,9 @@ from jourdain_jax.scene.names import Labels, Named, check_name
 
 @dataclass(frozen=True)
 class Quaternion:
-    """A singularity-free attitude: four coordinates `(w, x, y, z)`, three speeds (body angular velocity, rad/s)."""
+    """A singularity-free attitude: four coordinates `(w, x, y, z)`, three speeds (body angular velocity,
+    rad/s).
+    """
 
     name: str
 
@@ -76,7 +78,11 @@ class Coordinates:
         """
         parts: list[tuple[int, Array]] = [(i, u[k : k + 1]) for i, k in self.plain]
         parts += [(i, quaternion_rate(q[i : i + 4], u[k : k + 3])) for i, k in self.quaternions]
-        return jnp.concatenate([part for _, part in sorted(parts, key=lambda p: p[0])]) if parts else jnp.zeros(0)
+        return (
+            jnp.concatenate([part for _, part in sorted(parts, key=lambda p: p[0])])
+            if parts
+            else jnp.zeros(0)
+        )
 
 
 def quaternion(name: str) -> Quaternion:
@@ -115,7 +121,12 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
     if not names:
         raise ValueError("`coordinates` was given no name; give at least one, such as jj.coordinates('x y')")
     _check_names(names, "coordinate")
-    return Coordinates(Names(tuple(names), tuple(q_groups)), Names(tuple(speeds), tuple(u_groups)), tuple(quaternions), tuple(plain))
+    return Coordinates(
+        Names(tuple(names), tuple(q_groups)),
+        Names(tuple(speeds), tuple(u_groups)),
+        tuple(quaternions),
+        tuple(plain),
+    )
 
 
 def speeds(names: str) -> Names:
@@ -142,8 +153,10 @@ def _named(names, kind: str) -> Names:
 
 def _split(names, what: str) -> list[str]:
     if not isinstance(names, str):
-        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, separated by "
-            f"spaces: jj.{what}('a b c')")
+        raise ValueError(
+            f"`{what}` was given {described(names)}, expected names in one text, separated by "
+            f"spaces: jj.{what}('a b c')"
+        )
     return names.split()
 
 
@@ -151,11 +164,14 @@ def _check_names(names: Sequence[str], kind: str) -> None:
     counts = Counter(names)
     for name in names:
         if not name.isidentifier():
-            raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and "
-                "underscores")
+            raise ValueError(
+                f"{kind} name `{name}` is not an identifier; use letters, digits and underscores"
+            )
         if keyword.iskeyword(name):
-            raise ValueError(f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; "
-                "choose another")
+            raise ValueError(
+                f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; "
+                "choose another"
+            )
         if counts[name] > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs its own name")
         if name == "t" and kind != "input":

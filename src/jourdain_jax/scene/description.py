@@ -31,7 +31,17 @@ METHODS = (
     "invariants",
     "visuals",
 )
-ATTRIBUTES = ("coordinates", "speeds", "inputs", "modes", "privileged", "domain", "conventions", "example", "example_span")
+ATTRIBUTES = (
+    "coordinates",
+    "speeds",
+    "inputs",
+    "modes",
+    "privileged",
+    "domain",
+    "conventions",
+    "example",
+    "example_span",
+)
 _MEANT = {  # what other programs and textbooks call them
     "forces": "loads",
     "applied_forces": "loads",
@@ -54,8 +64,7 @@ def check_description(scene, base: Any) -> None:
     for what in ("speeds", "inputs"):
         names = getattr(scene, what)
         check_kind(
-            names, Names | None, f"`{what}` of `{kind.__name__}`",
-            f"names; write {what} = jj.{what}('a b c')"
+            names, Names | None, f"`{what}` of `{kind.__name__}`", f"names; write {what} = jj.{what}('a b c')"
         )
     check_kind(scene.modes, Modes, f"`modes` of `{kind.__name__}`", "jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
@@ -67,12 +76,17 @@ def check_description(scene, base: Any) -> None:
     _check_counts(scene)
     for name in scene.speed_names.entries:
         if name in scene.coordinate_names.entries:
-            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed named `{name}`; rename one of "
-                "them")
+            raise ValueError(
+                f"`{kind.__name__}` has a coordinate and a speed named `{name}`; rename one of them"
+            )
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
     if isinstance(example, dict):
-        valid = [name for names in (scene.coordinate_names, scene.speed_names) for name in (*names.entries, *(group for group, _, _ in names.groups))]
+        valid = [
+            name
+            for names in (scene.coordinate_names, scene.speed_names)
+            for name in (*names.entries, *(group for group, _, _ in names.groups))
+        ]
         _check_keys(kind, "example", example, valid)
 
 
@@ -92,8 +106,17 @@ def checked_arguments(kind: type, given: dict) -> None:
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
     """Return a sentence on misspelt methods, attributes and fields of a class; empty if there are none."""
-    own, owners = {field.name for field in fields(kind)}, [owner for owner in kind.__mro__ if owner not in base.__mro__]
-    read = {name for owner in owners for member in vars(owner).values() for f in functions_in(member) for name in names_in(f.__code__)}
+    own, owners = (
+        {field.name for field in fields(kind)},
+        [owner for owner in kind.__mro__ if owner not in base.__mro__],
+    )
+    read = {
+        name
+        for owner in owners
+        for member in vars(owner).values()
+        for f in functions_in(member)
+        for name in names_in(f.__code__)
+    }
     for owner in owners:
         annotated = inspect.get_annotations(owner)
         for name, member in vars(owner).items():
@@ -109,7 +132,9 @@ def _misspelt(kind: type, base: type) -> str:
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
             # the cutoff takes `load` for `loads`, but not `contact_arm` for `contacts`
-            near = near or difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=0.85)
+            near = near or difflib.get_close_matches(
+                name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=0.85
+            )
             # beside the real one it is a helper
             if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):
                 what = "a method" if callable_ else "an attribute"
@@ -126,7 +151,11 @@ def _check_counts(scene) -> None:
     """
     for field in fields(scene):
         value = getattr(scene, field.name)
-        if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):
+        if (
+            isinstance(value, int)
+            and not field.metadata.get("static")
+            and not field.metadata.get("parameter")
+        ):
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is {value}, which is not a parameter; for "
                 f"a count or switch write `{field.name}: {type(value).__name__} = eqx.field(static=True, "
@@ -139,8 +168,10 @@ def _check_domain(scene) -> None:
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
         if has_unit(pair) or np.shape(pair) != (2,) or not _is_ordered(known_numbers(pair)):
-            raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite "
-                "numbers (low, high) with low <= high")
+            raise ValueError(
+                f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite "
+                "numbers (low, high) with low <= high"
+            )
 
 
 def _is_ordered(pair: np.ndarray) -> bool:
@@ -150,4 +181,8 @@ def _is_ordered(pair: np.ndarray) -> bool:
 
 def _check_keys(kind: type, what: str, given, valid) -> None:
     check_kind(given, dict, f"`{what}` of `{kind.__name__}`", "a dictionary of coordinate or speed names")
-    check_names(as_names(given), valid, f"`{what}` of `{kind.__name__}` names `{{}}`, which is not a coordinate or speed")
+    check_names(
+        as_names(given),
+        valid,
+        f"`{what}` of `{kind.__name__}` names `{{}}`, which is not a coordinate or speed",
+    )

@@ -30,7 +30,9 @@ def _hashed(content: object) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
-def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]) -> object:
+def _content(
+    x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]
+) -> object:
     """Return the content for a digest. `within`: the enclosing objects; `known`: memo of digests."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
@@ -38,7 +40,12 @@ def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int
         return "key", str(x.dtype), _content(jax.random.key_data(x), depth, within, known)
     if isinstance(x, jax.Array | np.ndarray | np.generic) and not x.dtype.hasobject:
         array = np.asarray(x)
-        return "array", array.dtype.str, array.shape, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+        return (
+            "array",
+            array.dtype.str,
+            array.shape,
+            hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest(),
+        )
     if _is_formula(x):
         return "formula", type(x).__qualname__, str(x)
     # functions and classes that refer to each other
@@ -87,7 +94,9 @@ def _is_formula(x: object) -> bool:
     symbols differently in every process.
     """
     sympy = sys.modules.get("sympy")
-    return sympy is not None and isinstance(x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction)
+    return sympy is not None and isinstance(
+        x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction
+    )
 
 
 def _pickled(x: object) -> object:
@@ -98,30 +107,44 @@ def _pickled(x: object) -> object:
         kept = copyreg.dispatch_table[type(x)](x) if type(x) in copyreg.dispatch_table else x.__reduce_ex__(4)
     except Exception:  # the methods of any object may raise anything
         return None
-    return kept if isinstance(kept, str) else tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
+    return (
+        kept
+        if isinstance(kept, str)
+        else tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
+    )
 
 
 def _function(f: FunctionType, of) -> object:
-    installed, name = is_installed(f.__globals__.get("__name__")), (f.__module__, f.__qualname__, f.__code__.co_qualname)
+    installed, name = (
+        is_installed(f.__globals__.get("__name__")),
+        (f.__module__, f.__qualname__, f.__code__.co_qualname),
+    )
     if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
         return "function", name
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the content of a name's value; for a user's module, of the attributes that the code names.
-        """
+        """Return the content of a name's value; for a user's module, of the attributes that the code names."""
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))
 
-    named, around = (tuple(zip(names, map(read, map(look, names)), strict=True)) for names, look in names_of(f))
+    named, around = (
+        tuple(zip(names, map(read, map(look, names)), strict=True)) for names, look in names_of(f)
+    )
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named
 
 
 def _class(kind: type, of) -> object:
-    if is_installed(kind.__module__) and (not issubclass(kind, Scene) or getattr(sys.modules[kind.__module__], kind.__name__, None) is kind):
+    if is_installed(kind.__module__) and (
+        not issubclass(kind, Scene) or getattr(sys.modules[kind.__module__], kind.__name__, None) is kind
+    ):
         return "class", kind.__module__, kind.__qualname__
-    own = tuple((name, of(member)) for name, member in sorted(vars(kind).items()) if name == "__call__" or not name.startswith(("__", "_abc_")))
+    own = tuple(
+        (name, of(member))
+        for name, member in sorted(vars(kind).items())
+        if name == "__call__" or not name.startswith(("__", "_abc_"))
+    )
     return "class", kind.__qualname__, own, tuple(of(base) for base in kind.__bases__)

@@ -1,5 +1,5 @@
-"""Caches keyed by scene: by class, names read by its methods (`outside_names.py`) and shapes of parameters, or
-also by values.
+"""Caches keyed by scene: by class, names read by its methods (`outside_names.py`) and shapes of parameters,
+or also by values.
 
 Reference parameters replace traced parameters by numbers. Facts that hold at every state of a scene, such as
 rank and independent speeds, must be known before compilation. They are found by evaluating the scene at a few
@@ -95,7 +95,11 @@ _latest: list[Values] = []
 def _asked_about_before(leaves: list, treedef) -> Values | None:
     """Return the key of the latest scene if its leaves are these objects."""
     for known in _latest:
-        if len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves)) and known.structure == (treedef, jax.config.jax_enable_x64):
+        if (
+            len(known.leaves) == len(leaves)
+            and all(map(is_, known.leaves, leaves))
+            and known.structure == (treedef, jax.config.jax_enable_x64)
+        ):
             return known
     return None
 
@@ -195,7 +199,12 @@ def _is_inertia(x: np.ndarray) -> bool:
     """Return whether the array may be an inertia tensor and is not a rotation matrix. The tolerance is one
     per cent, the accuracy of published moments.
     """
-    if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
+    if (
+        x.shape != (3, 3)
+        or not np.any(x)
+        or np.any(np.abs(x - x.T) > 1e-9 * largest(x))
+        or np.allclose(x @ x.T, np.eye(3))
+    ):
         return False
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
 

@@ -31,9 +31,13 @@ class Load(eqx.Module):
     generalized: dict[str, Scalar]  # N or N m, on the named speed
     potential: Scalar | None  # J; None: not conservative, its work is integrated along the motion
 
-    def __init__(self, forces: Any = None, torques: Any = None, generalized: Any = None, potential: Any = None):
+    def __init__(
+        self, forces: Any = None, torques: Any = None, generalized: Any = None, potential: Any = None
+    ):
         given = {"forces": forces, "torques": torques, "generalized": generalized}
-        self.forces, self.torques, self.generalized = (_real_parts(kind, part) for kind, part in given.items())
+        self.forces, self.torques, self.generalized = (
+            _real_parts(kind, part) for kind, part in given.items()
+        )
         self.potential = None if potential is None else checked_real(potential, "potential of a load")
 
 
@@ -73,7 +77,15 @@ def point_force(point: Point, force: Any) -> Load:
     `motion["body"].point(local)`; no potential.
     """
     point = _as_point(point, "point of a force")
-    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"))
+    return _on_point(
+        point,
+        checked_real(
+            force,
+            f"force on a point of `{point.body}`",
+            (3,),
+            advice="give three components in the inertial frame, N",
+        ),
+    )
 
 
 def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = None) -> Load:
@@ -83,8 +95,9 @@ def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = Non
     No potential. Raises ValueError for an unknown body.
     """
     motion = _motion(motion, "torque")
-    moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial "
-        "frame, N m")
+    moment = checked_real(
+        moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m"
+    )
     names = [body] if reaction is None else [body, reaction]
     check_names(names, motion.bodies, "torque on unknown body `{}`")
     return Load(torques={name: sign * moment for name, sign in zip(names, (1.0, -1.0), strict=False)})
@@ -93,10 +106,14 @@ def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = Non
 def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
     """Return a linear spring between two points `a`, `b`: tension `k (l - l0)`, potential `k (l - l0)^2 / 2`.
 
-    Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0 in m.
+    Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0
+    in m.
     """
     apart, length, direction = _line(a, b, "spring")
-    stiffness, rest_length = checked_real(stiffness, "stiffness of a spring", ()), checked_real(rest_length, "rest length of a spring", ())
+    stiffness, rest_length = (
+        checked_real(stiffness, "stiffness of a spring", ()),
+        checked_real(rest_length, "rest length of a spring", ()),
+    )
     extension = length - rest_length
     # k (l - l0) e, written so that a spring of zero rest length is smooth where its ends meet
     pull = stiffness * (apart - rest_length * direction)
@@ -121,13 +138,19 @@ def generalized_force(motion: Motion, **forces: Any) -> Load:
     """
     motion = _motion(motion, "generalized_force")
     check_names(forces, motion.u.keys(), "generalized force on unknown speed `{}`")
-    return Load(generalized={name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
+    return Load(
+        generalized={
+            name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()
+        }
+    )
 
 
 def _motion(motion: Motion, what: str) -> Motion:
     if not isinstance(motion, Motion):
-        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: the argument of "
-            "`loads(self, motion)`")
+        raise ValueError(
+            f"`{what}` was given {described(motion)}, expected a motion: the argument of "
+            "`loads(self, motion)`"
+        )
     return motion
 
 
@@ -146,7 +169,9 @@ def _line(a: Point, b: Point, what: str):
 
 
 def _on_point(point: Point, force) -> Load:
-    return Load() if point.body is None else Load({point.body: force}, {point.body: jnp.cross(point.arm, force)})
+    return (
+        Load() if point.body is None else Load({point.body: force}, {point.body: jnp.cross(point.arm, force)})
+    )
 
 
 def _between(a: Point, b: Point, pull, potential) -> Load:

@@ -41,8 +41,10 @@ class Modes:
             check_name(value, names, f"{where} gives mode `{name}` the value `{value}`")
             return float(names.index(value))
         if not is_traced(value) and not (np.shape(value) == () and float(value) in range(len(names))):
-            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; "
-                f"{nearest('', names)} Or give its number")
+            raise ValueError(
+                f"{where} gives mode `{name}` the value {described(value)}; "
+                f"{nearest('', names)} Or give its number"
+            )
         return value
 
 
@@ -59,9 +61,15 @@ def modes(**values) -> Modes:
     **Raises** ValueError for fewer than two values, or values that are not texts.
     """
     for name, of_mode in values.items():
-        if isinstance(of_mode, str) or not all(isinstance(value, str) for value in of_mode) or len(set(of_mode)) < 2:
-            raise ValueError(f"mode `{name}` has the values {of_mode!r}, expected two names or more: "
-                f"jj.modes({name}=('open', 'closed'))")
+        if (
+            isinstance(of_mode, str)
+            or not all(isinstance(value, str) for value in of_mode)
+            or len(set(of_mode)) < 2
+        ):
+            raise ValueError(
+                f"mode `{name}` has the values {of_mode!r}, expected two names or more: "
+                f"jj.modes({name}=('open', 'closed'))"
+            )
     return Modes(tuple((name, tuple(of_mode)) for name, of_mode in values.items()))
 
 

@@ -31,8 +31,9 @@ class Point(eqx.Module):
 
 def fixed_point(position: Any) -> Point:
     """Return a point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
-    position = checked_real(position, "position of a fixed point", (3,), advice="give three components in "
-        "the inertial frame, m")
+    position = checked_real(
+        position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m"
+    )
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -63,8 +64,9 @@ class BodyPose(eqx.Module):
         """Return the position (m, inertial frame) of the point with body-frame coordinates `local` (m,
         relative to the mass centre).
         """
-        local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in "
-            "its body frame, m")
+        local = checked_real(
+            local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m"
+        )
         return self.position + self.orientation @ local.astype(self.position.dtype)
 
 
@@ -94,7 +96,9 @@ class BodyMotion(eqx.Module):
         """
         where, advice = f"point of body `{self.name}`", "give three components in the inertial frame, m"
         position = checked_real(position, where, advice=advice)
-        position = checked_real(position, where, self.position.shape if position.ndim > 1 else (3,), advice=advice)
+        position = checked_real(
+            position, where, self.position.shape if position.ndim > 1 else (3,), advice=advice
+        )
         return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
@@ -103,8 +107,7 @@ class BodyMotion(eqx.Module):
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
     def rate_of_pose(self) -> BodyPose:
-        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`, with constant mass and inertia.
-        """
+        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`, with constant mass and inertia."""
         rate = eqx.tree_at(lambda b: b.position, jax.tree.map(jnp.zeros_like, self.body), self.velocity)
         if isinstance(rate, RigidBody):
             rate = eqx.tree_at(lambda b: b.orientation, rate, skew(self.angular_velocity) @ self.orientation)
@@ -126,7 +129,9 @@ class Pose(eqx.Module):
 
 
 class Motion(eqx.Module):
-    """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`, `motion.u.yaw_rate`."""
+    """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`,
+    `motion.u.yaw_rate`.
+    """
 
     t: Scalar
     q: Named
@@ -148,7 +153,9 @@ class Motion(eqx.Module):
 
     def pose(self) -> Pose:
         """Return time, coordinates and the poses of all bodies, without velocities."""
-        return Pose(self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()})
+        return Pose(
+            self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()}
+        )
 
 
 def _lookup(bodies: dict, name: str):

@@ -31,7 +31,9 @@ def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception
         raise error(f"{what}; {nearest(name, valid)}")
 
 
-def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
+def check_names(
+    names: Iterable[str], valid: Iterable[str], what: str, error: type[Exception] = ValueError
+) -> None:
     """Check each of several names. `{}` in `what` is replaced by the name."""
     for name in names:
         check_name(name, valid, what.replace("{}", str(name)), error)
@@ -55,7 +57,9 @@ class Named(eqx.Module):
     """A flat array with access by name to entries and groups of entries: `q.yaw`, `q["yaw"]`, `q.array`."""
 
     array: Float[Array, "*shape"]
-    slots: tuple[tuple[str, int, int], ...] = eqx.field(static=True)  # name, first entry, length (0 for a scalar)
+    slots: tuple[tuple[str, int, int], ...] = eqx.field(
+        static=True
+    )  # name, first entry, length (0 for a scalar)
 
     def __getitem__(self, name: str):
         for slot, first, length in self.slots:

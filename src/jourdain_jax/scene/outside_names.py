@@ -35,7 +35,21 @@ import numpy as np
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.names import Labels
 
-_VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
+_VALUES = (
+    bool,
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    type(None),
+    type(...),
+    range,
+    Fraction,
+    Decimal,
+    re.Pattern,
+    np.dtype,
+)
 _CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_custom_jvp)
 
 
@@ -68,7 +82,9 @@ class NamesRead:
     def _look(self) -> None:
         content: list[tuple] = []
         looks: list[Callable] = []
-        sources: dict[Callable, dict[str, None]] = {}  # the names to read by each: a module is read once for all functions
+        sources: dict[
+            Callable, dict[str, None]
+        ] = {}  # the names to read by each: a module is read once for all functions
         functions: list[FunctionType] = []
         for root in self._roots:
             members = vars(root) if isinstance(root, type) else {"": root}
@@ -77,7 +93,13 @@ class NamesRead:
                 content.append((name, _key_of(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     functions.append(f)
-                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`" if self._strict else ""
+                    where = (
+                        f"`{root.__name__}.{name}`"
+                        if name
+                        else f"the function `{f.__qualname__}`"
+                        if self._strict
+                        else ""
+                    )
                     for names, read in names_of(f):
                         found = [*map(read, names)]
                         if names:
@@ -135,7 +157,9 @@ def functions_in(member) -> list[FunctionType]:
     """Return the Python functions in a member of a class, without wrappers of other modules."""
     found, member = [], member.fget if isinstance(member, property) else member
     while member is not None and not isinstance(member, type):
-        if isinstance(member, FunctionType) and (member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")):
+        if isinstance(member, FunctionType) and (
+            member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")
+        ):
             found.append(member)
         names = ("__wrapped__", "__func__", "func", "method")  # Equinox stores methods as `method`
         member = next((inner for name in names if callable(inner := _attribute(member, name))), None)
@@ -159,7 +183,11 @@ def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[str], Any]], ...]
     # such as a counter of calls
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
-    cells = {name: cell for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True) if name not in written}
+    cells = {
+        name: cell
+        for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True)
+        if name not in written
+    }
     return (own, f.__globals__.get), (tuple(cells), lambda name: _attribute(cells[name], "cell_contents"))
 
 
@@ -168,8 +196,14 @@ def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]
     """Return the names used by code, or by the given instructions only, including attributes and inner
     functions.
     """
-    own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
-    return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
+    own = frozenset(
+        code.co_names
+        if operations is None
+        else (i.argval for i in dis.get_instructions(code) if i.opname in operations)
+    )
+    return own.union(
+        *(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType))
+    )
 
 
 class _Same:
@@ -194,12 +228,14 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
     except StatefulError:
         if not where:
             return _Same(x)
-    what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change unnoticed"
+    what = (
+        f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change unnoticed"
+    )
     raise StatefulError(
-        f"{where} reads `{name}`, "
-        f"{'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
-        f"make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no "
-        "numbers, or replace it by a tuple of numbers"
+        f"{where} reads `{name}`,"
+        f" {'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what};"
+        f" make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no"
+        " numbers, or replace it by a tuple of numbers"
     )
 
 

@@ -22,7 +22,9 @@ def _as_leaf(value):
         return value
 
 
-def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = "") -> Any:
+def parameter(
+    default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""
+) -> Any:
     """Declare a field of a scene as a physical parameter. It is converted to a floating-point array and is
     differentiable.
 
@@ -30,8 +32,20 @@ def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non
     - `positive`, `non_negative`: raise ValueError for other signs when a scene is made with known values.
       Numbers that are not finite are always refused.
     """
-    options = {} if default is ... else {"default": default} if np.ndim(default) == 0 else {"default_factory": lambda: default}
-    metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
+    options = (
+        {}
+        if default is ...
+        else {"default": default}
+        if np.ndim(default) == 0
+        else {"default_factory": lambda: default}
+    )
+    metadata = {
+        "parameter": True,
+        "unit": unit,
+        "positive": positive,
+        "non_negative": non_negative,
+        "about": about,
+    }
     return eqx.field(converter=_as_leaf, metadata=metadata, **options)
 
 
@@ -62,20 +76,26 @@ def check_parameters(scene) -> None:
     for name, value, metadata in parameters_of(scene):
         where = f"parameter `{name}` of `{type(scene).__name__}`"
         if has_unit(value) or not hasattr(value, "dtype"):
-            raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array "
-                "of numbers")
+            raise ValueError(
+                f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers"
+            )
         if not jnp.issubdtype(value.dtype, jnp.floating):
-            raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check "
-                "where it was computed")
+            raise ValueError(
+                f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check "
+                "where it was computed"
+            )
         numbers = known_numbers(value)
         if not all_finite(numbers):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):
-            raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value "
-                "above zero")
+            raise ValueError(
+                f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value above zero"
+            )
         if metadata["non_negative"] and not np.all(numbers >= 0):
-            raise ValueError(f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value "
-                "that is not negative")
+            raise ValueError(
+                f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value "
+                "that is not negative"
+            )
 
 
 def stacked_parameters(scene) -> str:
@@ -84,12 +104,16 @@ def stacked_parameters(scene) -> str:
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}
-    many = [f"`{name}` has the shape {shape}" for name, shape in shapes.items() if name in usual and shape[1:] == usual[name] != shape]
+    many = [
+        f"`{name}` has the shape {shape}"
+        for name, shape in shapes.items()
+        if name in usual and shape[1:] == usual[name] != shape
+    ]
     if not many:
         return ""
     return (
         f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than the "
-        f"default; for many scenes use `jax.vmap`, or `rollout` with `parameters={{name: values}}`"
+        "default; for many scenes use `jax.vmap`, or `rollout` with `parameters={name: values}`"
     )
 
 

@@ -31,8 +31,11 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
 
     **Raises** ValueError for another shape. Differentiable at all numbers.
     """
-    numbers = checked_real(numbers, "`numbers` of `inertia_from_log_cholesky`", advice="give (d1, d2, d3, "
-        "s12, s23, s13), or (d1, d2, d3, s13)")
+    numbers = checked_real(
+        numbers,
+        "`numbers` of `inertia_from_log_cholesky`",
+        advice="give (d1, d2, d3, s12, s23, s13), or (d1, d2, d3, s13)",
+    )
     if numbers.shape not in ((6,), (4,)):
         raise ValueError(
             f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of "
@@ -55,12 +58,15 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
     for another shape, an asymmetric matrix, nonzero Ixy or Iyz with `symmetric`, and moments that no body of
     nonzero thickness has. Traced matrices give NaN instead.
     """
-    I = checked_real(inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal "
-        "moments, kg m^2")
+    I = checked_real(
+        inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal moments, kg m^2"
+    )
     I = jnp.diag(I) if I.shape == (3,) else I
     if I.shape != (3, 3):
-        raise ValueError(f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a "
-            "matrix or three principal moments, kg m^2")
+        raise ValueError(
+            f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a "
+            "matrix or three principal moments, kg m^2"
+        )
     S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
     if known_numbers(I).size:
         _check(np.asarray(I), np.asarray(S), symmetric)
@@ -75,8 +81,10 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
     if not np.all(np.abs(I - I.T) <= 1e-9 * size):
         raise ValueError("`inertia` of `log_cholesky` is not symmetric; give Ixy = Iyx, Ixz = Izx, Iyz = Izy")
     if symmetric and max(abs(I[0, 1]), abs(I[1, 2])) > 1e-9 * size:
-        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but "
-            "`symmetric` excludes them; omit `symmetric`")
+        raise ValueError(
+            f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but "
+            "`symmetric` excludes them; omit `symmetric`"
+        )
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
             f"no body of nonzero thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg "

@@ -33,7 +33,7 @@ class Printed:
         raise NotImplementedError(f"`{type(self).__name__}` has no text for `print`; define `_text(self)`")
 
 
-_picture: Callable = lambda scene: ""  # noqa: E731
+_picture: Callable = lambda scene: ""
 
 
 def show_scenes_with(picture: Callable) -> None:
@@ -53,7 +53,11 @@ def scene_text(scene) -> str:
             text = _value(value)
             text = f"[{text}]" if ", " in text else text
         else:
-            text = repr(value) if value is None or isinstance(value, bool | int | float | str) else type(value).__name__
+            text = (
+                repr(value)
+                if value is None or isinstance(value, bool | int | float | str)
+                else type(value).__name__
+            )
         shown.append(f"{field.name}={text}")
     return f"{type(scene).__name__}({', '.join(shown)})"
 
@@ -63,23 +67,43 @@ def scene_html(scene) -> str:
     and inputs, and a picture at its example start.
     """
     left = "style='text-align:left'"
-    cell = lambda text: f"<td {left}>{html.escape(text)}</td>"  # noqa: E731
+    cell = lambda text: f"<td {left}>{html.escape(text)}</td>"
     about = (type(scene).__doc__ or "").strip().split("\n")[0]
     rows = [
-        f"<tr><th {left}>{html.escape(name)}</th>{cell(_value(value))}{cell(known['unit'])}{cell(known['about'])}</tr>"
+        "<tr><th"
+        f" {left}>{html.escape(name)}</th>{cell(_value(value))}{cell(known['unit'])}{cell(known['about'])}</tr>"
         for name, value, known in parameters_of(scene)
     ]
     heads = "".join(f"<th {left}>{head}</th>" for head in ("parameter", "value", "unit", ""))
-    listed = (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("inputs", scene.inputs))
-    names = "".join(f"<div>{what}: {html.escape(', '.join(given.entries))}</div>" for what, given in listed if given.entries)
+    listed = (
+        ("coordinates", scene.coordinate_names),
+        ("speeds", scene.speed_names),
+        ("inputs", scene.inputs),
+    )
+    names = "".join(
+        f"<div>{what}: {html.escape(', '.join(given.entries))}</div>"
+        for what, given in listed
+        if given.entries
+    )
     table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>" if rows else ""
-    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>" + _picture(scene)
+    return (
+        f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>"
+        + _picture(scene)
+    )
 
 
 def _value(value) -> str:
     if is_traced(value):
         return "being traced"
-    return f"{float(value):.6g}" if value.ndim == 0 else f"array of shape {value.shape}" if value.size > 6 else ", ".join(f"{x:.6g}" for x in value.ravel())
+    return (
+        f"{float(value):.6g}"
+        if value.ndim == 0
+        else (
+            f"array of shape {value.shape}"
+            if value.size > 6
+            else ", ".join(f"{x:.6g}" for x in value.ravel())
+        )
+    )
 
 
 def in_digits(values) -> list[str]:
@@ -94,19 +118,30 @@ def shapes_of(result) -> str:
     shapes = [tuple(leaf.shape) for leaf in jax.tree.leaves(result) if hasattr(leaf, "shape")]
     largest = max(shapes, key=lambda shape: (len(shape), shape), default=())
     name = type(result).__name__
-    return f"{name}, being traced: {len(shapes)} arrays, the largest of shape {largest}; print it outside of `jax.jit`, or use `jax.debug.print`"
+    return (
+        f"{name}, being traced: {len(shapes)} arrays, the largest of shape {largest}; print it outside of"
+        " `jax.jit`, or use `jax.debug.print`"
+    )
 
 
 def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
     """Return the rows as lines with aligned columns, indented by two blanks."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
     """Return lines of a matrix with names of its rows and columns."""
     shape, digits = np.shape(values), in_digits(np.ravel(values))
-    return table([(name, *column_names), *((row, *digits[k * shape[1] : (k + 1) * shape[1]]) for k, row in enumerate(row_names))])
+    return table(
+        [
+            (name, *column_names),
+            *((row, *digits[k * shape[1] : (k + 1) * shape[1]]) for k, row in enumerate(row_names)),
+        ]
+    )
 
 
 def complex_numbers(values) -> list[str]:
@@ -114,4 +149,7 @@ def complex_numbers(values) -> list[str]:
     values = np.asarray(values)
     parts = in_digits(np.concatenate([values.real, values.imag]))
     pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)
-    return [real if imag == "0" else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]
+    return [
+        real if imag == "0" else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i"
+        for real, imag in pairs
+    ]

@@ -14,10 +14,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
+from jourdain_jax.calculus.reals import (
+    Entries,
+    Scalar,
+    Speeds,
+    array_module,
+    checked_unless_traced,
+    described,
+    has_unit,
+    known_numbers,
+    real_type,
+)
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contact.contacts import Contact
-from jourdain_jax.scene.contact.friction_contacts import NONE_SWITCHES, Declared, Switching, has_friction, switching_of
+from jourdain_jax.scene.contact.friction_contacts import (
+    NONE_SWITCHES,
+    Declared,
+    Switching,
+    has_friction,
+    switching_of,
+)
 from jourdain_jax.scene.contact.held_rows import HeldRow
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
@@ -93,8 +109,10 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):
-            raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class "
-                "attribute: coordinates = jj.coordinates('x y ...')")
+            raise ValueError(
+                f"scene `{type(self).__name__}` has no `coordinates`; state them as a class "
+                "attribute: coordinates = jj.coordinates('x y ...')"
+            )
         check_description(self, Scene)
         hold_leaves(self)
         check_parameters(self)
@@ -196,8 +214,7 @@ class Scene(eqx.Module):
         return scene_text(self)
 
     def _repr_html_(self) -> str:
-        """Return HTML for notebooks: class, parameters with values and units, coordinates, speeds and inputs.
-        """
+        """Return HTML for notebooks: class, parameters with values and units, coordinates, speeds and inputs."""
         return scene_html(self)
 
     def replace(self, **changes: Any) -> Self:
@@ -209,8 +226,9 @@ class Scene(eqx.Module):
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:
             if name not in self.__dataclass_fields__:
-                raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; "
-                    f"{nearest(name, names)}")
+                raise ValueError(
+                    f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}"
+                )
         return replace(self, **changes)
 
     def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
@@ -230,7 +248,9 @@ def state_names(scene: Scene) -> Labels:
     return scene.coordinate_names.entries + scene.speed_names.entries
 
 
-def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
+def vectors_named(
+    scene: Scene, values: Mapping
+) -> tuple[Float[Entries, "coordinates"], Float[Entries, "speeds"], Labels]:
     """Return the result of `Scene.named`, as NumPy arrays if all numbers are known."""
     q, u, given = entries_named(scene, values)
     return _vector(q), _vector(u), given
@@ -244,8 +264,10 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
     for name, value in values.items():
         hits = _put(coordinates, q, name, value) + _put(speeds, u, name, value)
         if not hits:
-            raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; "
-                f"{nearest(name, state_names(scene))}")
+            raise ValueError(
+                f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; "
+                f"{nearest(name, state_names(scene))}"
+            )
         given += hits
     for first, _ in scene.coordinates.quaternions:
         given += _completed(coordinates.entries[first : first + 4], q, first, given)
@@ -257,7 +279,9 @@ def _completed(parts: Labels, q: list, first: int, given: list[str]) -> list[str
     named = [name for name in parts if name in given]
     if len(named) in (0, 4):
         return []
-    q[first : first + 4] = [value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)]
+    q[first : first + 4] = [
+        value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)
+    ]
     square = sum(value * value for value in q[first : first + 4])
     if np.any(abs(known_numbers(square) - 1) > 1e-4):  # users round the parts to a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
@@ -328,7 +352,11 @@ def hold_leaves(scene) -> None:
     def held(leaf):
         return HeldFunction(leaf) if callable(leaf) else jnp.asarray(leaf) if type(leaf) is float else leaf
 
-    static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
+    static = tuple(
+        value
+        for field in fields(scene)
+        if field.metadata.get("static") and is_function(value := getattr(scene, field.name))
+    )
     object.__setattr__(scene, "_read", _names_read(type(scene), *static))
     for field in fields(scene):
         if field.metadata.get("static") or field.metadata.get("parameter"):

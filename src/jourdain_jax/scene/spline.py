@@ -51,7 +51,9 @@ class Spline(eqx.Module):
         return smooth_through_samples(jnp.asarray(t, real_type()), self.ts, self.values)
 
 
-def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
+def checked_samples(
+    kind: str, ts, values, least: int, of: str
+) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
     """Return times and values, at least `least` of each, as checked arrays. `kind` and `of` name them in
     errors. Raises ValueError for other shapes and invalid numbers.
     """
@@ -64,12 +66,15 @@ def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[A
         )
     knots, numbers = known_numbers(ts), known_numbers(values)
     if not (all_finite(knots) and np.all(np.diff(knots) > 0)):
-        raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the "
-            "samples by time and merge repeated ones")
+        raise ValueError(
+            f"the times of `{kind}` must be finite and increase from one to the next; sort the "
+            "samples by time and merge repeated ones"
+        )
     if not all_finite(numbers):
         first = int(np.argmin(np.isfinite(numbers)))
-        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit "
-            "missing samples")
+        raise ValueError(
+            f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit missing samples"
+        )
     return ts, values
 
 
@@ -95,6 +100,9 @@ def _second_derivatives(ts, values) -> Float[Array, "samples"]:
     # m_0 = (1 + first) m_1 - first m_2, and likewise at the other end
     first, last = h[0] / h[1], h[-1] / h[-2]
     middle = (2 * (h[:-1] + h[1:])).at[0].add(h[0] * (1 + first)).at[-1].add(h[-1] * (1 + last))
-    below, above = h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last), h[1:].at[-1].set(0.0).at[0].add(-h[0] * first)
+    below, above = (
+        h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last),
+        h[1:].at[-1].set(0.0).at[0].add(-h[0] * first),
+    )
     m = jax.lax.linalg.tridiagonal_solve(below, middle, above, bends[:, None])[:, 0]
     return jnp.concatenate([(1 + first) * m[:1] - first * m[1:2], m, (1 + last) * m[-1:] - last * m[-2:-1]])

@@ -27,12 +27,13 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
     """Return the bodies of a scene by name."""
     bodies = _dictionary(scene, "bodies", (t, q), '{"disc": jj.RigidBody(...)}')
     if not bodies:
-        raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such '
-            'as {"disc": jj.RigidBody(...)}')
+        raise ValueError(
+            f"`bodies` of `{_name(scene)}` returned no body; return at least one by name, such "
+            'as {"disc": jj.RigidBody(...)}'
+        )
     for name, body in bodies.items():
         check_kind(
-            body, get_args(Body), f"body `{name}` of `{_name(scene)}`",
-            "a `jj.Particle` or a `jj.RigidBody`"
+            body, get_args(Body), f"body `{name}` of `{_name(scene)}`", "a `jj.Particle` or a `jj.RigidBody`"
         )
     return bodies
 
@@ -53,10 +54,18 @@ def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "co
 def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
     """Return the loads of a scene; a single load becomes a tuple of one."""
     given = scene.loads(motion)
-    loads = (given,) if isinstance(given, Load) else tuple(given) if isinstance(given, Iterable) and not isinstance(given, dict | str) else None
+    loads = (
+        (given,)
+        if isinstance(given, Load)
+        else tuple(given)
+        if isinstance(given, Iterable) and not isinstance(given, dict | str)
+        else None
+    )
     if loads is None:
-        raise ValueError(f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of "
-            "loads; write return (jj.gravity(motion, 9.81),)")
+        raise ValueError(
+            f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of "
+            "loads; write return (jj.gravity(motion, 9.81),)"
+        )
     return tuple(_checked_load(scene, i, load) for i, load in enumerate(loads))
 
 
@@ -67,24 +76,49 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
         _declared(scene, load.rows, "loads", "joint_friction")
         return load
     checked = Load(
-        forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
-        torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
-        generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
-        potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
+        forces={
+            body: checked_real(value, f"force of {where} on body `{body}`", (3,))
+            for body, value in load.forces.items()
+        },
+        torques={
+            body: checked_real(value, f"torque of {where} on body `{body}`", (3,))
+            for body, value in load.torques.items()
+        },
+        generalized={
+            speed: checked_real(value, f"force of {where} on speed `{speed}`", ())
+            for speed, value in load.generalized.items()
+        },
+        potential=(
+            None if load.potential is None else checked_real(load.potential, f"potential of {where}", ())
+        ),
     )
-    return Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
+    return (
+        Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
+    )
 
 
 def potential_of(scene: Scene, pose: Pose) -> Scalar | None:
     """Return the scene's own potential energy, J; None if there is none."""
     V = scene.potential(pose)
-    return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
+    return (
+        None
+        if V is None
+        else checked_real(
+            V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None"
+        )
+    )
 
 
 def gauge_of(scene: Scene, pose: Pose) -> Scalar | None:
     """Return the scene's gauge function, J s; None if there is none."""
     S = scene.gauge(pose)
-    return None if S is None else checked_real(S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None")
+    return (
+        None
+        if S is None
+        else checked_real(
+            S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None"
+        )
+    )
 
 
 def prescribed_of(scene: Scene, t) -> dict[str, Scalar]:
@@ -110,7 +144,8 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
     for name in names:
         if name not in scene.switching.contacts:
             raise ValueError(
-                f"`{name}` of `{_name(scene)}` got its friction outside the method `{method}`; state `{word}` in that method"
+                f"`{name}` of `{_name(scene)}` got its friction outside the method `{method}`; state `{word}`"
+                " in that method"
             )
 
 
@@ -126,21 +161,31 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     contacts = _dictionary(scene, "contacts", (pose,), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
         check_kind(
-            contact, Contact, f"contact `{name}` of `{_name(scene)}`",
-            "a `jj.disc_contact(...)` or another contact"
+            contact,
+            Contact,
+            f"contact `{name}` of `{_name(scene)}`",
+            "a `jj.disc_contact(...)` or another contact",
         )
         if (contact.friction is not None) != (name in scene.switching.contacts):
-            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside the method "
-                "`contacts`; state `friction=` in that method")
+            raise ValueError(
+                f"contact `{name}` of `{_name(scene)}` got its friction outside the method "
+                "`contacts`; state `friction=` in that method"
+            )
     return contacts
 
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     """Return the events by name; a plain value becomes an event that stops the motion."""
-    advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; name every condition"
+    advice = (
+        "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; name every"
+        " condition"
+    )
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
-        event, where = given if isinstance(given, Event) else Event(given, stop=True), f"event `{name}` of `{_name(scene)}`"
+        event, where = (
+            given if isinstance(given, Event) else Event(given, stop=True),
+            f"event `{name}` of `{_name(scene)}`",
+        )
         for what, changed in (("to", event.to), ("jump", event.jump)):
             check_kind(changed, Mapping, f"`{what}` of {where}", "a dictionary by name")
         if event.stop and (event.to or event.jump):
@@ -148,12 +193,19 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
                 f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, or `stop`"
             )
         check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")
-        check_names(event.jump, state_names(scene), f"{where} moves "
-            "`{}`, which is not a coordinate or speed")
+        check_names(
+            event.jump, state_names(scene), f"{where} moves `{{}}`, which is not a coordinate or speed"
+        )
         found[name] = Event(
             checked_real(event.value, where, (), advice=advice),
-            {mode: checked_real(scene.modes.number(mode, value, where), f"mode `{mode}` of {where}", ()) for mode, value in event.to.items()},
-            {moved: checked_real(value, f"`{moved}` after {where}", ()) for moved, value in event.jump.items()},
+            {
+                mode: checked_real(scene.modes.number(mode, value, where), f"mode `{mode}` of {where}", ())
+                for mode, value in event.to.items()
+            },
+            {
+                moved: checked_real(value, f"`{moved}` after {where}", ())
+                for moved, value in event.jump.items()
+            },
             event.stop,
         )
     return found
@@ -162,7 +214,9 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
     """Return values of the conserved quantities by name."""
     advice = "give every component its own name"
-    return _numbers(scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice)
+    return _numbers(
+        scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice
+    )
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
@@ -171,13 +225,23 @@ def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
     found = {}
     for name, looks in given.items():
         if name and name not in pose:
-            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" '
-                f'(the inertial frame); {nearest(name, pose.bodies)}')
-        found[name] = (looks,) if isinstance(looks, Visual) else tuple(looks) if isinstance(looks, list | tuple) else (looks,)
+            raise ValueError(
+                f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" '
+                f"(the inertial frame); {nearest(name, pose.bodies)}"
+            )
+        found[name] = (
+            (looks,)
+            if isinstance(looks, Visual)
+            else tuple(looks)
+            if isinstance(looks, list | tuple)
+            else (looks,)
+        )
         for look in found[name]:
             if not isinstance(look, Visual):
-                raise ValueError(f"`visuals` of `{_name(scene)}` gives {described(look)} for `{name}`, "
-                    "expected shapes, such as jj.Visual.ball(0.1)")
+                raise ValueError(
+                    f"`visuals` of `{_name(scene)}` gives {described(look)} for `{name}`, "
+                    "expected shapes, such as jj.Visual.ball(0.1)"
+                )
     return found
 
 
@@ -185,22 +249,31 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
     """Return a method's result, which must be a dictionary by name."""
     given = getattr(scene, method)(*at)
     if not isinstance(given, dict):
-        raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary "
-            f"by name; write return {example}")
+        raise ValueError(
+            f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary "
+            f"by name; write return {example}"
+        )
     for name in given:
         if not isinstance(name, str):
-            raise ValueError(f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, "
-                "expected names (texts) as keys")
+            raise ValueError(
+                f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, "
+                "expected names (texts) as keys"
+            )
     return given
 
 
-def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: Shape | None = ()) -> dict[str, Array]:
+def _numbers(
+    scene: Scene, method: str, at, example: str, what: str, advice: str, shape: Shape | None = ()
+) -> dict[str, Array]:
     """Return a method's result at a time, pose or motion: numbers by name, or arrays of another `shape`."""
     return _checked(scene, _dictionary(scene, method, (at,), example), what, advice, shape)
 
 
 def _checked(scene: Scene, given: dict, what: str, advice: str, shape: Shape | None) -> dict[str, Array]:
-    return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
+    return {
+        name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice)
+        for name, value in given.items()
+    }
 
 
 def _name(scene: Scene) -> str:

@@ -69,7 +69,8 @@ class Visual(eqx.Module):
     """
 
     kind: str = static()  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
-    # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule without its ends), line: points, mesh: factors
+    # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule
+    # without its ends), line: points, mesh: factors
     size: Float[Array, "*size"]
     position: Vector3  # m, body frame
     orientation: Matrix3  # own components to body components
@@ -96,7 +97,12 @@ class Visual(eqx.Module):
         ("x", "y" or "z"), its quarters in alternating colours. `look`: as for all shapes.
         """
         radius = _lengths(radius, "radius of a wheel", ())
-        return _about(axis, "wheel", [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())], **look)
+        return _about(
+            axis,
+            "wheel",
+            [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())],
+            **look,
+        )
 
     @staticmethod
     def box(sides, **look: Unpack[Look]) -> "Visual":
@@ -108,14 +114,24 @@ class Visual(eqx.Module):
         """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all
         shapes.
         """
-        return _about(axis, "cylinder", [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())], **look)
+        return _about(
+            axis,
+            "cylinder",
+            [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())],
+            **look,
+        )
 
     @staticmethod
     def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
         """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as
         for all shapes.
         """
-        return _about(axis, "capsule", [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())], **look)
+        return _about(
+            axis,
+            "capsule",
+            [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())],
+            **look,
+        )
 
     @staticmethod
     def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
@@ -127,7 +143,14 @@ class Visual(eqx.Module):
                 f"a line to be drawn has {len(points)} points, expected at least two; write "
                 "jj.Visual.line(a, b)"
             )
-        stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
+        stacked = jnp.stack(
+            [
+                checked_real(
+                    p, "point of a line to be drawn", (3,), advice="give three components, m"
+                ).astype(float)
+                for p in points
+            ]
+        )
         radius = None if radius is None else _lengths(radius, "radius of a line", ())
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
 
@@ -136,10 +159,14 @@ class Visual(eqx.Module):
         """Return a spring between two points `a`, `b` (m, body frame): a wire with this number of `turns` and
         `radius` (m); `colour`, `opacity` as for all shapes.
         """
-        a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, "
-            "m").astype(float) for p in (a, b))
+        a, b = (
+            checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float)
+            for p in (a, b)
+        )
         radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
-        along = jnp.where(length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0]))
+        along = jnp.where(
+            length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0])
+        )
         share = np.linspace(0.0, 1.0, 12 * turns + 1)[:, None]
         wide = np.clip(np.minimum(share, 1 - share) * 12, 0.0, 1.0)  # straight at both ends
         across = tangents_of(along)
@@ -162,9 +189,13 @@ class Visual(eqx.Module):
                 f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m"
             )
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
-        if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
-            raise ValueError("faces of a mesh need at least three vertex numbers each, from 0 to "
-                f"{len(corners) - 1}, in order")
+        if not polygons or any(
+            len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons
+        ):
+            raise ValueError(
+                "faces of a mesh need at least three vertex numbers each, from 0 to "
+                f"{len(corners) - 1}, in order"
+            )
         factors = jnp.broadcast_to(_lengths(scale, "scale of a mesh"), (3,))
         return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
@@ -182,10 +213,13 @@ class Visual(eqx.Module):
                 f"at `{os.getcwd()}`"
             )
         try:
-            read = needed("trimesh", "reading a mesh from a file", "robots").load(os.fspath(path), force="mesh")
+            read = needed("trimesh", "reading a mesh from a file", "robots").load(
+                os.fspath(path), force="mesh"
+            )
         except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
-            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as "
-                ".stl or .obj") from None
+            raise ValueError(
+                f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj"
+            ) from None
         if not len(read.faces):
             raise ValueError(f"the file `{os.fspath(path)}` has no faces, expected a mesh")
         return Visual.mesh(read.vertices, read.faces, scale=scale, **look)
@@ -203,20 +237,35 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
     return eqx.tree_at(lambda v: v.orientation, placed, placed.orientation @ cyclic)
 
 
-def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None) -> Visual:
+def shape(
+    kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None
+) -> Visual:
     """Return a shape of this kind; the other arguments as for all shapes."""
-    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, "
-        "m").astype(real_type())
-    turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
+    at = checked_real(
+        at, f"place of a {kind}", (3,), advice="give three components in the body frame, m"
+    ).astype(real_type())
+    turn = (
+        jnp.eye(3)
+        if turn is None
+        else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
+    )
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
 
 
 def _checked(visual: Visual) -> Visual:
     colour = visual.colour
-    if colour is not None and not (isinstance(colour, str) and len(colour) == 7 and colour[0] == "#" and set(colour[1:].lower()) <= set("0123456789abcdef")):
-        raise ValueError(f'colour of a {visual.kind} is {described(colour)}, expected six hexadecimal '
-            'digits, such as "#1f77b4"')
+    if colour is not None and not (
+        isinstance(colour, str)
+        and len(colour) == 7
+        and colour[0] == "#"
+        and set(colour[1:].lower()) <= set("0123456789abcdef")
+    ):
+        raise ValueError(
+            f"colour of a {visual.kind} is {described(colour)}, expected six hexadecimal "
+            'digits, such as "#1f77b4"'
+        )
     if not isinstance(visual.opacity, int | float) or not 0 < visual.opacity <= 1:
-        raise ValueError(f"opacity of a {visual.kind} is {visual.opacity!r}, expected a number above 0 and "
-            "at most 1")
+        raise ValueError(
+            f"opacity of a {visual.kind} is {visual.opacity!r}, expected a number above 0 and at most 1"
+        )
     return visual

@@ -36,7 +36,15 @@ class Assembled:
         return np.isfinite(self.error)
 
 
-def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, tries: int = 4) -> Assembled:
+def assemble(
+    look: Look,
+    pattern: Pattern,
+    q: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    generic: np.ndarray,
+    tries: int = 4,
+) -> Assembled:
     """Return configurations near q on the constraints. `look(q[k], k)` returns residuals and slopes of the
     constraints at the states with indices k; slopes are the nonzero entries of a sparse matrix.
 
@@ -49,7 +57,9 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
 
     def newton(q: np.ndarray, which: np.ndarray, **limits) -> tuple[np.ndarray, np.ndarray]:
         q, last = np.array(q, float), np.full(len(q), np.inf)
-        q[which], last[which] = nearest_root(lambda q, k: look(q, which[k]), lambda G, g: pattern.shortest(G, g, typical), q[which], **limits)
+        q[which], last[which] = nearest_root(
+            lambda q, k: look(q, which[k]), lambda G, g: pattern.shortest(G, g, typical), q[which], **limits
+        )
         return q, last
 
     def judged(q: np.ndarray, shift: np.ndarray) -> Assembled:
@@ -62,7 +72,7 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
             # changes by its own size
             arrived = np.all(np.abs(residual) <= 1e4 * np.finfo(float).eps * size, axis=1) & (shift <= 1e-7)
             outside = np.max(np.maximum(np.maximum(low - q, q - high), 0.0) / width, axis=1, initial=0.0)
-        nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)  # noqa: E731
+        nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)
         return Assembled(q, nowhere(position_error, True), nowhere(shift, arrived), nowhere(outside, True))
 
     found, generator = judged(*newton(q, every)), np.random.default_rng(2)
@@ -70,7 +80,10 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
         lost = ~(found.on_rows & (found.outside <= 1e-6)) & (generic | (attempt == 0))
         if not lost.any():
             break
-        begin, which = generator.uniform(low, high, q.shape) if attempt else np.clip(q, low, high), np.flatnonzero(lost)
+        begin, which = (
+            generator.uniform(low, high, q.shape) if attempt else np.clip(q, low, high),
+            np.flatnonzero(lost),
+        )
         # steps of at most a quarter of the domain's width, within the domain
         near, _ = newton(begin, which, longest=width / 4, within=(low, high))
         again = judged(*newton(near, which))
@@ -94,7 +107,9 @@ def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarr
     return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
 
 
-def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
+def typical_row_lengths(
+    A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]
+) -> Float[np.ndarray, "rows"]:
     """Return the typical length of each row: the median over states, or the largest if the row vanishes at
     half of them.
 
@@ -134,7 +149,9 @@ def speed_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return _bounds(scene, scene.speed_names.entries, SPEED_DOMAIN)
 
 
-def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_states(
+    scene: Scene, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states from the domain, not yet projected onto the constraints."""
     q_low, q_high = coordinate_bounds(scene)
     u_low, u_high = speed_bounds(scene)

@@ -55,10 +55,13 @@ def numbers_of(scene: Scene, motion: Motion) -> Numbers:
     laws |= {f"`{name}`": row.friction for name, row in held_rows_of(scene, motion).items()}
     return stated_of(scene, pose, loads_of(scene, motion)) | {
         "position": {f"body `{name}`": body.position for name, body in pose.bodies.items()},
-        "touch": {f"contact `{name}`": contact.point + contact.plane.normal for name, contact in contacts.items()},
+        "touch": {
+            f"contact `{name}`": contact.point + contact.plane.normal for name, contact in contacts.items()
+        },
         "friction": {f"the friction of {name}": law.sliding for name, law in laws.items()},
         "static": {
-            f"the static friction of {name}": jnp.stack([law.static, law.sliding]) for name, law in laws.items()
+            f"the static friction of {name}": jnp.stack([law.static, law.sliding])
+            for name, law in laws.items()
         },
         **_of_grounds(scene, motion),
     }
@@ -70,21 +73,49 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
-    size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
+    size = lambda x: jnp.sum(jnp.abs(x))
     away = _round_off(pose)  # relative round-off, for contacts far from the origin
     return {
         "mass": {name: body.mass for name, body in bodies.items()},  # kg
         # kg m^2; the fourth row is round-off: moments of a body with a radius of gyration of 1e-9 m
-        "inertia": {name: jnp.concatenate([body.inertia, jnp.full((1, 3), 1e-18 * body.mass)]) for name, body in rigid.items()},
+        "inertia": {
+            name: jnp.concatenate([body.inertia, jnp.full((1, 3), 1e-18 * body.mass)])
+            for name, body in rigid.items()
+        },
         "orientation": {name: body.orientation for name, body in rigid.items()},
-        "unit": {f"the normal of {name}": c.plane.normal @ c.plane.normal for name, c in contacts.items()}
-        | {f"the axis of {name}": c.ground.axis @ c.ground.axis for name, c in contacts.items() if isinstance(c.ground, Cylinder)},
+        "unit": (
+            {f"the normal of {name}": c.plane.normal @ c.plane.normal for name, c in contacts.items()}
+            | {
+                f"the axis of {name}": c.ground.axis @ c.ground.axis
+                for name, c in contacts.items()
+                if isinstance(c.ground, Cylinder)
+            }
+        ),
         # m; with the distance of the contact from the mass centre
-        "gap": {name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)]) for name, c in closed.items()},
-        "length": {f"{what} of {name}": length for name, c in contacts.items() for what, length in _lengths(c).items()},  # m
-        "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
-        "restitution": {f"the restitution of {name}": c.restitution for name, c in contacts.items() if c.restitution is not None},
-        "gravity": {f"the direction of gravity in load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
+        "gap": {
+            name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)])
+            for name, c in closed.items()
+        },
+        "length": {
+            f"{what} of {name}": length
+            for name, c in contacts.items()
+            for what, length in _lengths(c).items()
+        },  # m
+        "tyre": {
+            name: c.shape.tyre
+            for name, c in contacts.items()
+            if isinstance(c.shape, Wheel) and c.shape.tyre is not None
+        },  # m
+        "restitution": {
+            f"the restitution of {name}": c.restitution
+            for name, c in contacts.items()
+            if c.restitution is not None
+        },
+        "gravity": {
+            f"the direction of gravity in load {k}": load.direction @ load.direction
+            for k, load in enumerate(loads, 1)
+            if isinstance(load, Gravity)
+        },
     }
 
 
@@ -136,10 +167,20 @@ def _negative(x):
     """
     I, size = x[..., :3, :], _size(x)
     I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
-    at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
-    minor = lambda i, j, k, m: at(i, k) * at(j, m) - at(i, m) * at(j, k)  # noqa: E731
+    at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)
+    minor = lambda i, j, k, m: at(i, k) * at(j, m) - at(i, m) * at(j, k)
     whole = sum(at(0, i) * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
-    return reduce(or_, (x < 0 for x in (*(at(i, i) for i in range(3)), *(minor(i, j, i, j) for i, j in combinations(range(3), 2)), whole)))
+    return reduce(
+        or_,
+        (
+            x < 0
+            for x in (
+                *(at(i, i) for i in range(3)),
+                *(minor(i, j, i, j) for i, j in combinations(range(3), 2)),
+                whole,
+            )
+        ),
+    )
 
 
 def _from_identity(R):
@@ -147,8 +188,11 @@ def _from_identity(R):
 
 
 def _volume(R):
-    at = lambda i, k: R[..., i, k]  # noqa: E731
-    return sum(at(0, i) * (at(1, (i + 1) % 3) * at(2, (i + 2) % 3) - at(1, (i + 2) % 3) * at(2, (i + 1) % 3)) for i in range(3))
+    at = lambda i, k: R[..., i, k]
+    return sum(
+        at(0, i) * (at(1, (i + 1) % 3) * at(2, (i + 2) % 3) - at(1, (i + 2) % 3) * at(2, (i + 1) % 3))
+        for i in range(3)
+    )
 
 
 def _off(square):
@@ -170,15 +214,19 @@ def _exceeds_the_others(x):
 
 
 def _says_nothing(piece: str) -> Callable:
-    return lambda _: f"has no finite {piece} at any probed state, expected finite numbers; check its computation"
+    return lambda _: (
+        f"has no finite {piece} at any probed state, expected finite numbers; check its computation"
+    )
 
 
 def _unit(kind: str, group: str) -> Check:
     return Check(
         kind,
         lambda square: _off(square) > TOLERANCE,
-        lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; "
-            "divide it by its length",
+        lambda square: (
+            f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; "
+            "divide it by its length"
+        ),
         "not a unit vector",
         group,
     )
@@ -200,7 +248,10 @@ def _stated_twice(kind: str) -> Check:
 
 
 CHECKS = (
-    *(Check(piece, _nowhere, _says_nothing(piece)) for piece in ("mass", "inertia", "orientation", "position")),
+    *(
+        Check(piece, _nowhere, _says_nothing(piece))
+        for piece in ("mass", "inertia", "orientation", "position")
+    ),
     Check(
         "touch",
         _nowhere,
@@ -219,8 +270,10 @@ CHECKS = (
     Check(
         "inertia",
         _lopsided,
-        lambda x: "has an inertia that is not symmetric; give the same products of inertia above and below "
-            "the diagonal",
+        lambda x: (
+            "has an inertia that is not symmetric; give the same products of inertia above and below "
+            "the diagonal"
+        ),
         "an inertia that is not symmetric",
     ),
     Check(
@@ -248,8 +301,18 @@ CHECKS = (
         "a reflected orientation",
     ),
     _unit("unit", "grounds"),
-    Check("length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check it", "no positive length"),
-    Check("tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius >= 0", "a negative tyre"),
+    Check(
+        "length",
+        lambda x: x <= 0,
+        lambda x: f"is {x:.4g} m, expected a positive number; check it",
+        "no positive length",
+    ),
+    Check(
+        "tyre",
+        lambda x: x < 0,
+        lambda x: f"has a tyre of {x:.4g} m, expected a radius >= 0",
+        "a negative tyre",
+    ),
     Check(
         "gap",
         lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],
@@ -259,14 +322,24 @@ CHECKS = (
         ),
         "a body off its ground",
     ),
-    Check("friction", lambda x: x < 0, lambda x: f"is {x:.4g}, expected a coefficient that is not negative", "a negative coefficient of friction"),
+    Check(
+        "friction",
+        lambda x: x < 0,
+        lambda x: f"is {x:.4g}, expected a coefficient that is not negative",
+        "a negative coefficient of friction",
+    ),
     Check(
         "static",
         lambda x: x[..., 0] < x[..., 1],
         lambda x: f"is {x[0]:.4g}, expected at least the coefficient of sliding, {x[1]:.4g}",
         "static friction below sliding friction",
     ),
-    Check("restitution", lambda x: (x < 0) | (x > 1), lambda x: f"is {x:.4g}, expected a number from 0 to 1", "a restitution that is not from 0 to 1"),
+    Check(
+        "restitution",
+        lambda x: (x < 0) | (x > 1),
+        lambda x: f"is {x:.4g}, expected a number from 0 to 1",
+        "a restitution that is not from 0 to 1",
+    ),
     _unit("gravity", "gravity"),
     Check(
         "ground",
@@ -310,14 +383,18 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
     states = tuple(jnp.concatenate([x[None], more.astype(x.dtype)]) for x, more in pairs)
     # not vmapped: loads may be callbacks without batching
-    numbers = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states)
+    numbers = jax.lax.map(
+        lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states
+    )
     seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
     return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
     """Return whether any number shows a fault, by kind. Axes: states first, then bodies or grounds."""
-    found = [check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked]
+    found = [
+        check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked
+    ]
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
 
 
@@ -332,13 +409,20 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
     moving = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
-    size = lambda *parts: sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(parts))  # noqa: E731
+    size = lambda *parts: sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(parts))
 
     def rates(name: str, t_rate, q_rate, of_bodies):
         def where(t, q, bodies):
-            contact, ground = contacts_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))[name], contacts[name].ground
+            contact, ground = (
+                contacts_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))[name],
+                contacts[name].ground,
+            )
             if ground is not None:
-                ground = [getattr(contact.ground, part) for part in ("origin", "normal", "axis", "radius") if hasattr(ground, part)]
+                ground = [
+                    getattr(contact.ground, part)
+                    for part in ("origin", "normal", "axis", "radius")
+                    if hasattr(ground, part)
+                ]
                 ground.append(contact.ground.value(contacts[name].point))
             return contact.plane.normal, contact.plane.origin, ground
 
@@ -347,17 +431,30 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     for name, contact in contacts.items():
         plane, arm = contact.plane, contact.point - contact.plane.origin
         normal_rate, origin_rate, _ = rates(name, jnp.ones_like(motion.t), motion.qdot.array, moving)
-        twice = plane.normal @ origin_rate - normal_rate @ arm, plane.normal @ plane.velocity_at(contact.point)
+        twice = (
+            plane.normal @ origin_rate - normal_rate @ arm,
+            plane.normal @ plane.velocity_at(contact.point),
+        )
         could = size(origin_rate, plane.velocity) + size(arm) * size(normal_rate, plane.angular_velocity)
         could += _round_off(pose)  # of rates of 1 m/s that vanish at this state
-        found["own plane" if contact.shape is None else "plane"]["the plane of contact "
-            f"`{name}`"] = jnp.stack([*twice, could])
+        found["own plane" if contact.shape is None else "plane"][f"the plane of contact `{name}`"] = (
+            jnp.stack([*twice, could])
+        )
         if contact.ground is not None:
-            others = {body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate) for body, rate in moving.items()}
+            others = {
+                body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate)
+                for body, rate in moving.items()
+            }
             carried = rates(name, jnp.zeros_like(motion.t), jnp.zeros_like(motion.q.array), others)[2]
-            speeds = [(body.velocity, body.angular_velocity) for other, body in motion.bodies.items() if other != contact.body]
+            speeds = [
+                (body.velocity, body.angular_velocity)
+                for other, body in motion.bodies.items()
+                if other != contact.body
+            ]
             stated = plane.velocity, plane.angular_velocity
-            found["ground"][f"the ground of contact `{name}`"] = jnp.stack([size(carried) / (size(speeds) + 1e-8 + 0.0 * motion.t), size(stated)])
+            found["ground"][f"the ground of contact `{name}`"] = jnp.stack(
+                [size(carried) / (size(speeds) + 1e-8 + 0.0 * motion.t), size(stated)]
+            )
     return found
 
 
@@ -373,7 +470,11 @@ def impossible_bodies(scene: Scene, q) -> Sentences:
 
 @eval_numpy
 def _weights(scene: Scene, q) -> Numbers:
-    return {kind: of for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items() if kind in ("mass", "inertia")}
+    return {
+        kind: of
+        for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items()
+        if kind in ("mass", "inertia")
+    }
 
 
 def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:

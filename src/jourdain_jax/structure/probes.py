@@ -27,7 +27,13 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, is_combination, on_rows
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.assembly import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths
+from jourdain_jax.structure.assembly import (
+    Assembled,
+    assemble,
+    coordinate_bounds,
+    speed_scales,
+    typical_lengths,
+)
 from jourdain_jax.structure.plausibility import Numbers
 from jourdain_jax.structure.trace import TracedScene, named_values, traced_scene
 
@@ -37,7 +43,18 @@ TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
 # Quantities that an integration cannot do without. If calls compute them, distant states are probed; for
 # loads, nothing is assumed.
-_MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at rest", "motion at rest", "inertia", "nonlinear"})
+_MOTION = frozenset(
+    {
+        "rows",
+        "poses",
+        "inertias",
+        "coordinate rates",
+        "rows at rest",
+        "motion at rest",
+        "inertia",
+        "nonlinear",
+    }
+)
 
 
 class Probed(eqx.Module):
@@ -97,14 +114,25 @@ def looked_at(scene: Scene) -> LookedAt:
     by_speed, rows = jacobian(g, flat, u), len(at.phi)
     at_rest = g.substituted([*flat, *at.qdot.tolist()], dict.fromkeys(u, g.zero))
     weights = _flat([at.mass, at.inertia])
-    by_time = {"rows": [at.phi, at.closure], "poses": [at.position, at.orientation], "inertias": weights, "coordinate rates": at.qdot}
+    by_time = {
+        "rows": [at.phi, at.closure],
+        "poses": [at.position, at.orientation],
+        "inertias": weights,
+        "coordinate rates": at.qdot,
+    }
     along_motion = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
     changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
     potentials = derivatives(g, traced.particulars.potentials.tolist(), changed)
     vanishing = {name: derivatives(g, _flat(nodes), {traced.t: g.one}) for name, nodes in by_time.items()}
     vanishing |= {name: _flat(nodes) for name, nodes in traced.particulars.explicit.items()}
-    vanishing |= {"rows at rest": at_rest[:rows], "motion at rest": at_rest[rows:], "inertia": derivatives(g, weights, along_motion)}
-    vanishing |= {"rows of inputs": derivatives(g, at.phi.tolist(), changed)} | {f"potential {k}": [rate] for k, rate in enumerate(potentials)}
+    vanishing |= {
+        "rows at rest": at_rest[:rows],
+        "motion at rest": at_rest[rows:],
+        "inertia": derivatives(g, weights, along_motion),
+    }
+    vanishing |= {"rows of inputs": derivatives(g, at.phi.tolist(), changed)} | {
+        f"potential {k}": [rate] for k, rate in enumerate(potentials)
+    }
     closures = traced.closures
     return LookedAt(
         traced=traced,
@@ -135,7 +163,9 @@ def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: 
     bent = any(a and b for a, b in zip(depend_on(g, entries, u), passing, strict=True))
     found = {name for name, nodes in vanishing.items() if any(passes(g, nodes, kinds))}
     found |= {"rank"} if any(passing) or "rows at rest" in found else set()
-    return frozenset(found | ({"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set()))
+    return frozenset(
+        found | ({"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set())
+    )
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
@@ -144,7 +174,9 @@ def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> P
 
     `limits`: as in `assemble`. Raises `Unsupported` for a call without a derivative in JAX.
     """
-    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(u_other)
+    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(
+        u_other
+    )
 
 
 def projected(scene: Scene, t, q) -> Assembled:
@@ -169,7 +201,9 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced
     generic = generic_states(traced, at.values)
-    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [at.nodes.vanishing["rows at rest"]]
+    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [
+        at.nodes.vanishing["rows at rest"]
+    ]
     found = generic([n for column in columns_of_rows for n in column])
     shape = len(columns_of_rows), len(traced.at.phi), -1
     A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
@@ -246,7 +280,9 @@ class _AtStates:
         """Return `M = sum m beta' beta + gamma' I gamma`."""
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
         partial = self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist())
-        return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
+        return mass_matrix(
+            mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0)
+        )
 
     def speeds_on_rows(self) -> np.ndarray:
         """Return speeds projected onto the constraints, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds;
@@ -257,7 +293,9 @@ class _AtStates:
             return u
         M = self._mass_matrix()
         c = speed_scales(M)
-        metric = c[:, :, None] * np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # C L'^-1
+        metric = c[:, :, None] * np.stack(
+            [_inverse_root(m) for m in c[:, :, None] * M * c[:, None]]
+        )  # C L'^-1
 
         def moved(x, which):
             return u[which] + np.einsum("sij,sj->si", metric[which], x)
@@ -281,8 +319,14 @@ class _AtStates:
             q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
         if not self.traced.at.closure.size:
             return Assembled(q, *np.zeros((3, len(q))))
-        rows, entries, place = self.nodes.closures, self.nodes.of_closures, {n: k for k, n in enumerate(self.traced.q.tolist())}
-        pattern = Pattern.of([(i, place[n]) for i, row in enumerate(entries) for n in row], (len(rows), len(place)))
+        rows, entries, place = (
+            self.nodes.closures,
+            self.nodes.of_closures,
+            {n: k for k, n in enumerate(self.traced.q.tolist())},
+        )
+        pattern = Pattern.of(
+            [(i, place[n]) for i, row in enumerate(entries) for n in row], (len(rows), len(place))
+        )
         slopes = [node for row in entries for node in row.values()]
 
         def look(q, which):

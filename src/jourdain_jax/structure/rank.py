@@ -32,7 +32,9 @@ def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
-    return Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
+    return Scaled(
+        A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c
+    )
 
 
 def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
@@ -43,11 +45,17 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
     # smaller singular values are errors of the configuration, not of the rows
-    return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1).tolist()
+    return np.sum(
+        sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1
+    ).tolist()
 
 
 def contradictions(
-    who: str, names: Labels, A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
+    who: str,
+    names: Labels,
+    A: Float[np.ndarray, "states rows speeds"],
+    at_rest: Float[np.ndarray, "states rows"],
+    ranks: list[int],
 ) -> Labels:
     """Return a sentence on constraints that no speeds satisfy together at any of the random states.
 
@@ -66,18 +74,27 @@ def contradictions(
     idle = [name for name, s in wrong if not A[:, s].any()]
     if idle:
         return (
-            f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
-            "relations between coordinates in `geometric_constraints`",
+            (
+                f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
+                "relations between coordinates in `geometric_constraints`"
+            ),
         )
     several = ", ".join(f"`{name}`" for name, _ in wrong)
     return (
-        f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of {len(A)} "
-        "random states; omit or correct one",
+        (
+            f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of"
+            f" {len(A)} random states; omit or correct one"
+        ),
     )
 
 
 def redundant_rows(
-    found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: Labels, far: Callable[[], Scaled]
+    found: Scaled,
+    errors: np.ndarray,
+    ranks: list[int],
+    generic: np.ndarray,
+    names: Labels,
+    far: Callable[[], Scaled],
 ) -> Labels:
     """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
     state and is well conditioned.
@@ -114,7 +131,11 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
         if its_rank == rank:
             c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
             given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(eps_of(A))
-            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
+            made.append(
+                c * (length[s] / usual[s]) / (length[rest] / usual[rest])
+                if given
+                else np.full(len(rest), np.inf)
+            )
     return np.array(made).reshape(len(made), len(rest))
 
 
@@ -132,10 +153,15 @@ def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Ind
     there are `freedoms` of them.
     """
     check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
-    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
+    chosen = tuple(
+        scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:")
+        for name in as_names(names)
+    )
     if len(set(chosen)) != len(chosen):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice "
-            f"({', '.join(as_names(names))}); name independent ones")
+        raise ValueError(
+            f"`privileged` of `{type(scene).__name__}` names a speed twice "
+            f"({', '.join(as_names(names))}); name independent ones"
+        )
     if len(chosen) != freedoms:
         raise ValueError(
             f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has "
@@ -174,7 +200,9 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
 
     def merit(dependent, probes):
         pivots = pivots_at(probes, list(dependent), rank)
-        return round(worst_pivot(probes, list(dependent), rank, pivots), 6), round(float(np.median(pivots)), 6)
+        return round(worst_pivot(probes, list(dependent), rank, pivots), 6), round(
+            float(np.median(pivots)), 6
+        )
 
     some = scaled[:: max(1, len(scaled) // 40)]
     best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:40]

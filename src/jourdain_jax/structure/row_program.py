@@ -78,7 +78,10 @@ def row_program(scene: Scene) -> RowProgram | None:
     if graph.calls(needed):
         return None
     own, place = part_of(graph, needed)
-    listed: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in jax.tree.map(lambda n: int(place[n]), parts).items()}
+    listed: dict[str, Any] = {
+        name: tuple(x) if isinstance(x, list) else x
+        for name, x in jax.tree.map(lambda n: int(place[n]), parts).items()
+    }
     return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
 
 
@@ -96,7 +99,10 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
     held = traced.q.tolist() if any(depend_on(g, looked.closures, of_parameters)) else []
     varying = [traced.t, *traced.q.tolist(), *traced.u.tolist()]
-    placed = [[g.const(t), *(own or map(g.const, q)), *map(g.const, u)] for (t, q, u), own in zip(states, on_rows, strict=True)]
+    placed = [
+        [g.const(t), *(own or map(g.const, q)), *map(g.const, u)]
+        for (t, q, u), own in zip(states, on_rows, strict=True)
+    ]
     others = [dict(zip(varying, state, strict=True)) for state in placed]
 
     def at_states(nodes: np.ndarray) -> np.ndarray:
@@ -106,7 +112,7 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     judged = dict.fromkeys(check.of for check in CHECKS if check.label)
     every = {kind: list(map(np.asarray, traced.particulars.numbers[kind].values())) for kind in judged}
     deciding = {kind: [*of_parameters, *(held if kind in BY_ROWS else [])] for kind in judged}
-    matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))  # noqa: E731
+    matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))
     kept = {kind: [x for x in of if matters(kind, x)] for kind, of in every.items()}
     stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
     nodes = [*traced.parameters, *stacked.values()]
@@ -136,6 +142,11 @@ def _mass_matrix(nodes: LookedAt, u: list[int]) -> Matrix | None:
     momenta = jacobian(graph, [kinetic], u)[0]
     slopes = jacobian(graph, list(momenta.values()), u)
     place = {n: k for k, n in enumerate(u)}
-    found = {(place[n], place[m]): node for n, row in zip(momenta, slopes, strict=True) for m, node in row.items() if place[m] <= place[n]}
+    found = {
+        (place[n], place[m]): node
+        for n, row in zip(momenta, slopes, strict=True)
+        for m, node in row.items()
+        if place[m] <= place[n]
+    }
     at_rest = graph.substituted(list(found.values()), dict.fromkeys(u, graph.zero))
     return {key: int(node) for key, node in zip(found, at_rest, strict=True) if node != graph.zero}

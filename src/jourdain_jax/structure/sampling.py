@@ -20,8 +20,7 @@ NEARLY_INSIDE = 0.05  # in widths of the domain
 
 
 class NoStateFoundError(ValueError):
-    """Error for a domain without a state that satisfies the geometric constraints and has finite constraints.
-    """
+    """Error for a domain without a state that satisfies the geometric constraints and has finite constraints."""
 
 
 @of_known_numbers
@@ -51,16 +50,22 @@ def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
     """Return the error for a scene whose constraints are NaN at all of `count` random states."""
     low, high = coordinate_bounds(scene)
     attitude = {first + k for first, _ in scene.coordinates.quaternions for k in range(4)}
-    spans = [f"`{name}` from {low[i]:.4g} to {high[i]:.4g}" for i, name in enumerate(scene.coordinate_names.entries) if i not in attitude]
+    spans = [
+        f"`{name}` from {low[i]:.4g} to {high[i]:.4g}"
+        for i, name in enumerate(scene.coordinate_names.entries)
+        if i not in attitude
+    ]
     return NoStateFoundError(
         f"the constraints of `{type(scene).__name__}` are NaN at all of {count} random states, with "
         f"{', '.join(spans)}: a pose, a contact or a constraint is undefined there, such as the square root "
         "of a negative number; state a `domain` inside which they are defined, as in `domain = "
-        f"{{'x': (-0.1, 0.1)}}`"
+        "{'x': (-0.1, 0.1)}`"
     )
 
 
-def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def drawn_states(
+    scene: Scene, count: int, generator: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield states from the domain, not yet projected; if these fail, states near the scene's example, if it
     has one.
     """
@@ -123,7 +128,13 @@ def symmetric_configurations(scene: Scene) -> np.ndarray:
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
-    turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
+    turns = [
+        (i, a)
+        for i in range(len(low))
+        if i not in attitude
+        for a in (np.pi / 2, -np.pi / 2)
+        if low[i] <= a <= high[i]
+    ]
     # long chains get fewer configurations: 12,000 coordinates in all, but at least 24 configurations
     most = max(24, min(200, 12_000 // max(1, len(low))))
     if len(turns) < most:

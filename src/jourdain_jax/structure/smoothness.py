@@ -36,9 +36,17 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
     """
     nodes = looked_at(scene)
     at, geometric = nodes.traced.at, len(nodes.traced.at.closure)
-    smooth = owned(scene, **{name: getattr(at, name) for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")})
+    smooth = owned(
+        scene,
+        **{
+            name: getattr(at, name)
+            for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")
+        },
+    )
     # values of velocity constraints, which must be continuous in time
-    rows = dict(zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True))
+    rows = dict(
+        zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True)
+    )
     if not any(passes(nodes.graph, smooth | rows, NONANALYTIC | CALLS)):
         return ()
 
@@ -59,9 +67,14 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
         if node in smooth:
             found.setdefault(smooth[node], _said(scene, smooth[node], f"at t = {sides[1, 0]:.6g} s"))
         # if A changes too, a state may satisfy both
-        elif np.allclose(*values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9):
-            found.setdefault(rows[node], f"constraint `{rows[node]}` of `{type(scene).__name__}` jumps at t "
-                                         f"= {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}")
+        elif np.allclose(
+            *values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9
+        ):
+            found.setdefault(
+                rows[node],
+                f"constraint `{rows[node]}` of `{type(scene).__name__}` jumps at t "
+                f"= {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}",
+            )
     # three kinks along coordinates indicate a look-up table; a single one may lie off any motion
     for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(scene, q))).items():
         if count >= 3:
@@ -81,7 +94,9 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         knots = knots[np.isfinite(knots)]
         if knots.size >= 2:
             middle = (knots[:-1] + knots[1:]) / 2
-            chosen = np.unique(np.linspace(0, max(knots.size - 3, 0), min(128, max(knots.size - 2, 1))).astype(int))
+            chosen = np.unique(
+                np.linspace(0, max(knots.size - 3, 0), min(128, max(knots.size - 2, 1))).astype(int)
+            )
             low.append(middle[chosen] if knots.size > 2 else knots[:1])
             high.append(middle[chosen + 1] if knots.size > 2 else middle)
     low, high = np.concatenate(low), np.concatenate(high)

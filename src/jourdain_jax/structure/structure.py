@@ -26,7 +26,17 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import speed_scales, typical_row_lengths
 from jourdain_jax.structure.plausibility import sentences
 from jourdain_jax.structure.probes import TIMED, Probed, follow_from_others, probed_on_graph
-from jourdain_jax.structure.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
+from jourdain_jax.structure.rank import (
+    Scaled,
+    best_privileged,
+    contradictions,
+    named_speeds,
+    pivots_at,
+    ranks_of,
+    redundant_rows,
+    scaled_states,
+    worst_pivot,
+)
 from jourdain_jax.structure.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.structure.smoothness import kinks
 
@@ -71,9 +81,30 @@ class Structure:
     @property
     def decisions(self) -> tuple:
         """Return the findings that decide how the scene is integrated; the others describe it."""
-        of_rows = self.row_names, self.rank, self.redundant_rows, self.may_set_in, self.affine, self.homogeneous, self.rows_of_inputs
-        of_speeds = self.independent, self.chosen_by_user, self.well_conditioned, self.typical_pivot >= WELL_CONDITIONED
-        return *of_rows, *of_speeds, self.timed, self.driven, self.massless, self.varying_inertia, self.potentials_of_inputs
+        of_rows = (
+            self.row_names,
+            self.rank,
+            self.redundant_rows,
+            self.may_set_in,
+            self.affine,
+            self.homogeneous,
+            self.rows_of_inputs,
+        )
+        of_speeds = (
+            self.independent,
+            self.chosen_by_user,
+            self.well_conditioned,
+            self.typical_pivot >= WELL_CONDITIONED,
+        )
+        return (
+            *of_rows,
+            *of_speeds,
+            self.timed,
+            self.driven,
+            self.massless,
+            self.varying_inertia,
+            self.potentials_of_inputs,
+        )
 
     @property
     def rheonomic(self) -> bool:
@@ -149,7 +180,9 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
             far[1][:, first : first + 4] = q[:count, first : first + 4]
         u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
         beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
-        return replace(found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u)))
+        return replace(
+            found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u))
+        )
     except Unsupported as reason:
         raise ValueError(
             f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
@@ -193,8 +226,7 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def is_judged(scene: Scene) -> bool:
-    """Return whether the parameters of a scene are known, so that findings at its probed states apply to it.
-    """
+    """Return whether the parameters of a scene are known, so that findings at its probed states apply to it."""
     return not is_traced(scene)
 
 
@@ -239,19 +271,28 @@ def _probed_structure(scene: Scene) -> Structure:
             break
     on_rows = usable_states(scene, found, generic)
     numbers = at_index(found.numbers, on_rows)
-    rough, (grounds, bodies, faults) = kinks(scene, found.q[on_rows & generic], u), (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
+    rough, (grounds, bodies, faults) = (
+        kinks(scene, found.q[on_rows & generic], u),
+        (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults")),
+    )
     A = found.A * speed_scales(found.M)[:, None]
     usable = all_finite(A, axis=(1, 2)) & on_rows
     if not faults and not usable.any():
         finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
-        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "(all)"
+        named = (
+            ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "(all)"
+        )
         faults = (
-            f"constraints {named} of `{type(scene).__name__}` are not finite at any probed state, expected "
-            "numbers; check their computation",
+            (
+                f"constraints {named} of `{type(scene).__name__}` are not finite at any probed state,"
+                " expected numbers; check their computation"
+            ),
         )
     if usable.any() and not usable[generic].any():
         raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone do not show the generic rank
-    typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
+    typical = typical_row_lengths(
+        A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic]
+    )
     beyond = found.A_beyond[generic]
     t, u, generic, found = at_index((t, u, generic, found), usable)
     scaled = scaled_states(found, typical)
@@ -262,12 +303,21 @@ def _probed_structure(scene: Scene) -> Structure:
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
-    independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
+    independent = (
+        best_privileged(candidates, count, rank)
+        if by_user is None
+        else named_speeds(scene, by_user, count - rank)
+    )
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
-    acts, at_rest = lambda name: name in unproved or _moves(found.vanishing[name]), found.vanishing["rows at rest"]
-    affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
+    acts, at_rest = (
+        lambda name: name in unproved or _moves(found.vanishing[name]),
+        found.vanishing["rows at rest"],
+    )
+    affine = "nonlinear" not in unproved and not _exceeds(
+        found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]
+    )
     # near round-off: integrating zero work does less harm than omitting work
     homogeneous = "rows at rest" not in unproved and not _exceeds(at_rest, 32 * eps, _speeds(found, u))
     rows_of_inputs = acts("rows of inputs")
@@ -275,18 +325,30 @@ def _probed_structure(scene: Scene) -> Structure:
     asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
-        faults = contradictions(type(scene).__name__, names, scaled.A[generic], asked, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
+        faults = contradictions(
+            type(scene).__name__,
+            names,
+            scaled.A[generic],
+            asked,
+            [r for r, is_random in zip(ranks, generic, strict=True) if is_random],
+        )
     # last, since the replacement of a traced direction must not hide another fault
     faults = faults or sentences(scene, found.numbers, "gravity")
-    redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
+    redundant = redundant_rows(
+        scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn)
+    )
     return Structure(
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
         redundant_rows=redundant,
-        may_set_in=redundant
-        if redundant and "rank" in unproved and not follow_from_others(scene, t, found.q, u, [names.index(name) for name in redundant])
-        else (),
+        may_set_in=(
+            redundant
+            if redundant
+            and "rank" in unproved
+            and not follow_from_others(scene, t, found.q, u, [names.index(name) for name in redundant])
+            else ()
+        ),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=worst_pivot(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
@@ -297,7 +359,13 @@ def _probed_structure(scene: Scene) -> Structure:
         driven=acts("motion at rest"),
         massless=_is_singular(scaled.M[generic]),
         varying_inertia=acts("inertia"),
-        potentials_of_inputs=tuple(sorted(int(name.split()[1]) for name in found.vanishing if name.startswith("potential ") and acts(name))),
+        potentials_of_inputs=tuple(
+            sorted(
+                int(name.split()[1])
+                for name in found.vanishing
+                if name.startswith("potential ") and acts(name)
+            )
+        ),
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user is not None,
         kinks=rough,
@@ -317,14 +385,20 @@ def _probed_structure(scene: Scene) -> Structure:
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
     """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
     symmetric = symmetric_configurations(scene)
-    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
+    t, q, u = (
+        np.concatenate([t, np.zeros(len(symmetric))]),
+        np.concatenate([q, symmetric]),
+        np.concatenate([u, u[:1].repeat(len(symmetric), 0)]),
+    )
     generic = np.arange(len(t)) < RANDOM_PROBES
     return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
 
 
 def _is_singular(M: np.ndarray) -> bool:
     """Return whether scaled inertias are singular at all states."""
-    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M)))
+    return bool(M.size) and bool(
+        np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M))
+    )
 
 
 def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
@@ -363,7 +437,11 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:
-    values = [f"{name} = {value:.4g}" for name, value in zip(scene.coordinate_names.entries, q, strict=True) if abs(value) > 1e-12]
+    values = [
+        f"{name} = {value:.4g}"
+        for name, value in zip(scene.coordinate_names.entries, q, strict=True)
+        if abs(value) > 1e-12
+    ]
     return ", ".join(values) or "all coordinates zero"
 
 

@@ -27,11 +27,25 @@ from jaxtyping import Array, Float, Num, PyTree
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
 from jourdain_jax.equations.contact_state import At
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, of_bodies, pose_at, velocities_of
+from jourdain_jax.equations.kinematics import (
+    coordinate_rates,
+    inertias_of,
+    motion_at,
+    of_bodies,
+    pose_at,
+    velocities_of,
+)
 from jourdain_jax.equations.phases import contact_changes, contact_events, contacts_at_start, put_back
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.scene_parts import names_of_bodies, names_of_position_rows
-from jourdain_jax.equations.virtual_power import energies_at, impressed, loads_at, potential_energy, resultants, slip_turns
+from jourdain_jax.equations.virtual_power import (
+    energies_at,
+    impressed,
+    loads_at,
+    potential_energy,
+    resultants,
+    slip_turns,
+)
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
@@ -86,7 +100,9 @@ class Particulars(eqx.Module):
 
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
     """Return the potential of each load; zero for a load without one."""
-    stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
+    stored = [
+        0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)
+    ]
     return jnp.stack(stored) if stored else jnp.zeros(0, motion.q.array.dtype)
 
 
@@ -95,12 +111,17 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
     def pieces(t):
         held = eqx.tree_at(lambda m: m.t, motion, t)
-        return {"loads": resultants(scene, held, loads=loads_of(scene, held)), "potential": potential_energy(scene, held)}
+        return {
+            "loads": resultants(scene, held, loads=loads_of(scene, held)),
+            "potential": potential_energy(scene, held),
+        }
 
     return jax.jvp(pieces, (motion.t,), (jnp.ones_like(motion.t),))[1]
 
 
-def velocity_quantities(scene: Scene, motion: Motion, of_inputs: Indices = (), with_events: bool = True) -> VelocityQuantities:
+def velocity_quantities(
+    scene: Scene, motion: Motion, of_inputs: Indices = (), with_events: bool = True
+) -> VelocityQuantities:
     """Return the traced quantities, evaluated at numbers; `of_inputs`: indices of the loads whose potential
     depends on inputs.
     """
@@ -141,13 +162,17 @@ def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Ar
     return jnp.stack([values[name] for name in sorted(values)]) if values else jnp.zeros(0)
 
 
-def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None = None) -> Float[Array, "events rows"]:
+def event_resets(
+    scene: Scene, motion: Motion, of_inputs: Indices, at: At | None = None
+) -> Float[Array, "events rows"]:
     """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the stored
     energy of the loads `of_inputs`.
 
     The arrays are empty if all events stop the motion.
     """
-    every = events_of(scene, motion) | (contact_changes(at or At(scene, motion)) if scene.switching.contacts else {})
+    every = events_of(scene, motion) | (
+        contact_changes(at or At(scene, motion)) if scene.switching.contacts else {}
+    )
     events = [event for _, event in sorted(every.items())]
     if all(event.stop for event in events):
         return jnp.zeros((len(events), 0))
@@ -157,7 +182,9 @@ def event_resets(scene: Scene, motion: Motion, of_inputs: Indices, at: At | None
 
     def stored(state: Float[Array, "rows"]) -> Scalar:
         q, u, after = jnp.split(state, (len(motion.q.array), len(state) - len(modes)))
-        return stored_by_inputs(scene, motion_at(scene, motion.t, q, 0.0 * u, jnp.concatenate([given, after])), of_inputs)
+        return stored_by_inputs(
+            scene, motion_at(scene, motion.t, q, 0.0 * u, jnp.concatenate([given, after])), of_inputs
+        )
 
     def after(event: Event) -> Float[Array, "rows"]:
         state = [event.jump.get(name, value) for name, value in zip(names, now, strict=False)]
@@ -197,7 +224,10 @@ class TracedScene(Variables):
     def closures(self) -> list[int]:
         """Return the geometric constraints, and the unit norms of quaternions as constraints."""
         g = self.graph
-        return [*self.at.closure.tolist(), *(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in self.attitudes)]
+        return [
+            *self.at.closure.tolist(),
+            *(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in self.attitudes),
+        ]
 
     @property
     def motion(self) -> list[np.ndarray]:
@@ -249,13 +279,18 @@ def _traced(scene: Scene, of_inputs: Indices) -> tuple:
 def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
     leaves, treedef = jax.tree.flatten(scene)
     real = real_type()
-    state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
+    state = [
+        jax.ShapeDtypeStruct(shape, real)
+        for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))
+    ]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
 
     def quantities(leaves, t, q, u, inputs):
         scene = jax.tree.unflatten(treedef, leaves)
         motion = motion_at(scene, t, q, u, inputs)
-        particulars = Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
+        particulars = Particulars(
+            numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion)
+        )
         return velocity_quantities(scene, motion, of_inputs), particulars
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
@@ -271,21 +306,34 @@ def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
 def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene:
     graph = Graph(MOST_MULTIPLICATIONS, keeps_rules=True)
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
-    sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
+    sizes = {
+        "t": (),
+        "q": (len(scene.coordinate_names),),
+        "u": (len(scene.speed_names),),
+        "i": (len(scene.inputs),),
+    }
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
     quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr), quaternions)
+    return TracedScene(
+        graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr), quaternions
+    )
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:
-    return np.array([graph.input(f"{name}_{i}", varies) for i in range(int(np.prod(shape)))], np.int64).reshape(shape)
+    return np.array(
+        [graph.input(f"{name}_{i}", varies) for i in range(int(np.prod(shape)))], np.int64
+    ).reshape(shape)
 
 
 def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
     """Return values of the inputs of the scene's graph by name; states may have a leading axis."""
-    named = {f"p{k}_{i}": value for k, leaf in enumerate(jax.tree.leaves(scene)) for i, value in enumerate(np.ravel(leaf))}
+    named = {
+        f"p{k}_{i}": value
+        for k, leaf in enumerate(jax.tree.leaves(scene))
+        for i, value in enumerate(np.ravel(leaf))
+    }
     named["t_0"] = t
     for prefix, values in zip("qui", (q, u, inputs), strict=True):
         named |= {f"{prefix}_{i}": column for i, column in enumerate(np.moveaxis(np.asarray(values), -1, 0))}
@@ -297,9 +345,15 @@ def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
     """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`. If owners share a
     node, the first counts.
     """
-    of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {"mass": "mass of", "inertia": "inertia of"}
+    of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {
+        "mass": "mass of",
+        "inertia": "inertia of",
+    }
     of_bodies |= {"force": "force on", "torque": "torque on"}
-    named = {field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)] for field, what in of_bodies.items()}
+    named = {
+        field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)]
+        for field, what in of_bodies.items()
+    }
     named["direct"] = [f"the force along `{name}`" for name in scene.speed_names.entries]
     named["qdot"] = [f"the rate of coordinate `{name}`" for name in scene.coordinate_names.entries]
     named["closure"] = named["phi"] = [f"constraint `{name}`" for name in names_of_position_rows(scene)]
@@ -313,7 +367,9 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None) -> Scalar:
+def explicit_power(
+    scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None
+) -> Scalar:
     """Return the part of `rate_of_work` without accelerations, in W: of loads without a potential, and of
     potentials that depend on time or on inputs.
 
@@ -322,7 +378,9 @@ def explicit_power(scene: Scene, motion: Motion, of_inputs: Indices, loads: tupl
 
     `loads`: the scene's loads at this motion, if already known.
     """
-    by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
+    by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(
+        scene, motion, potential_energy
+    )
     return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
 
 
@@ -337,7 +395,10 @@ def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
     along = (t, q), (jnp.ones_like(t), nu)
     held = motion.pose().bodies
     whole = jax.jvp(lambda t, q: potential_of(scene, pose_at(scene, t, q)), *along)[1]
-    return whole - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
+    return (
+        whole
+        - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
+    )
 
 
 def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
@@ -349,7 +410,12 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> S
 
 
 def power_of_loads(
-    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: Indices | None = None, loads: tuple[Load, ...] | None = None
+    scene: Scene,
+    motion: Motion,
+    *,
+    conservative: bool | None = None,
+    among: Indices | None = None,
+    loads: tuple[Load, ...] | None = None,
 ) -> Scalar:
     """Return `sum F.v + L.omega + Q_k u_k` in W, over the loads with a potential (`conservative=True`),
     without one (`False`), or with the indices `among`.

@@ -8,7 +8,16 @@ from jourdain_jax.studies.design import Design
 from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.studies.folder_lock import InUseError
 from jourdain_jax.studies.mean_gradients import MeanGradients
-from jourdain_jax.studies.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
+from jourdain_jax.studies.outputs import (
+    End,
+    EventTime,
+    Happened,
+    Integral,
+    Largest,
+    LargestMagnitude,
+    Quantity,
+    Smallest,
+)
 from jourdain_jax.studies.result import StudyResult, merge_studies
 from jourdain_jax.studies.sobol import SobolIndices, sobol_indices
 

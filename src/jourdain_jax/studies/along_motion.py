@@ -22,7 +22,9 @@ Values = Float[Array, "times"]
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # number of values that determine a polynomial
 
 
-def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
+def sampled(
+    motion: Trajectory, quantity: str | Callable
+) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
     """Return times and values of a quantity (a name, or a function of a trajectory that returns its values at
     all times), and the number of valid ones.
 
@@ -41,7 +43,9 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
 
     work = None if motion.work is None else with_end(motion.work, jnp.full_like(motion.t_end, jnp.nan))
     times = with_end(ts, motion.t_end)
-    whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
+    whole = dataclasses.replace(
+        motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work
+    )
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
     if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
         raise ValueError(
@@ -59,14 +63,19 @@ def largest(times: Values, values: Values, count: Count) -> Scalar:
     if times.shape[0] < FOR_EXTREMES:
         return values[k]
     first, s, y = _window(times, values, count, k - FOR_EXTREMES // 2, k, FOR_EXTREMES)
-    low, high = s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)], s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)]
+    low, high = (
+        s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)],
+        s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)],
+    )
     # a fine grid for the polynomial
     places = jnp.linspace(low, high, 33)
     near = places[jnp.argmax(jax.vmap(lambda place: _polynomial(s, y, place))(places))]
     slope = jax.grad(lambda place: _polynomial(s, y, place))
     bend = jax.grad(slope)(near)
     at = jnp.clip(near - jnp.where(bend < 0, slope(near) / jnp.where(bend < 0, bend, -1.0), 0.0), low, high)
-    return jnp.where(count >= FOR_EXTREMES, jnp.maximum(values[k], _polynomial(s, y, jax.lax.stop_gradient(at))), values[k])
+    return jnp.where(
+        count >= FOR_EXTREMES, jnp.maximum(values[k], _polynomial(s, y, jax.lax.stop_gradient(at))), values[k]
+    )
 
 
 def integral(times: Values, values: Values, count: Count) -> Scalar:

@@ -23,7 +23,9 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     check_kind(client, distributed.Client, "`client`", "a `dask.distributed.Client`")
     sent = sent_to_others(task)
 
-    def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+    def workers(
+        store: Store, numbers: list[int], interrupted: Callable[[], bool]
+    ) -> Iterator[tuple[int, int]]:
         # a task instead of scattered data: the scheduler can recreate it when a worker dies
         study = client.submit(bytes, sent, pure=False)
         asked = study, str(store.path.resolve()), os.getpid(), _places(distributed, client)
@@ -33,7 +35,14 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
 
         def compute(numbers: list[int], alone: bool):
             killed = distributed.KilledWorker
-            return computed(lambda number: pool.submit(_chunk, number, *asked), killed, store, numbers, interrupted, 1 if alone else most)
+            return computed(
+                lambda number: pool.submit(_chunk, number, *asked),
+                killed,
+                store,
+                numbers,
+                interrupted,
+                1 if alone else most,
+            )
 
         return whatever_dies(store, numbers, interrupted, compute, 1)
 

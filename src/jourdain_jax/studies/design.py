@@ -76,8 +76,10 @@ class Design(Printed):
         except ValueError:  # rows of unequal length
             column = np.empty(0)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
-            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as "
-                "jj.studies.Normal(0, 1), jj.studies.Levels([...]) or a list of numbers")
+            raise ValueError(
+                f"`{name}` varies as {described(what)}, expected a distribution such as "
+                "jj.studies.Normal(0, 1), jj.studies.Levels([...]) or a list of numbers"
+            )
         if not all_finite(column):
             raise ValueError(
                 f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; "
@@ -88,22 +90,35 @@ class Design(Printed):
     def _check_sampler(self) -> None:
         if self.sampler in (GRID, TABLE):
             name, what = next(iter(self.variables.items()))
-            raise ValueError(f"a {self.sampler} takes "
-                f"{'`jj.studies.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as "
-                f"{what!r}")
+            raise ValueError(
+                f"a {self.sampler} takes"
+                f" {'`jj.studies.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}`"
+                f" varies as {what!r}"
+            )
         if not isinstance(self.sampler, str) or self.sampler not in SAMPLERS:
-            raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} "
-                "Grids take `jj.studies.Levels`, tables columns.")
-        samples = checked_whole(self.samples, "`samples`", 1, MOST_SAMPLES, expected="of at least 1 and at "
-            f"most {MOST_SAMPLES}")
+            raise ValueError(
+                f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} "
+                "Grids take `jj.studies.Levels`, tables columns."
+            )
+        samples = checked_whole(
+            self.samples, "`samples`", 1, MOST_SAMPLES, expected=f"of at least 1 and at most {MOST_SAMPLES}"
+        )
         if self.sampler in ("sobol", "saltelli") and samples > MOST_SOBOL:
-            raise ValueError(f"`samples` is {samples}, expected at most {MOST_SOBOL} for a Sobol sequence; "
-                "take sampler='random'")
+            raise ValueError(
+                f"`samples` is {samples}, expected at most {MOST_SOBOL} for a Sobol sequence; "
+                "take sampler='random'"
+            )
         group = len(self.variables) + 2
         if self.sampler == "saltelli" and (samples % group or self.correlation):
-            wrong = "variables are correlated, for which Sobol' indices are not defined" if self.correlation else f"`samples` is {samples}"
-            raise ValueError(f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of "
-                f"{group} samples (variables + 2)")
+            wrong = (
+                "variables are correlated, for which Sobol' indices are not defined"
+                if self.correlation
+                else f"`samples` is {samples}"
+            )
+            raise ValueError(
+                f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of "
+                f"{group} samples (variables + 2)"
+            )
 
     def _check_given(self, kind: str) -> None:
         if self.correlation:
@@ -113,14 +128,22 @@ class Design(Printed):
         if kind == GRID:
             count = math.prod(len(levels.levels) for levels in self.variables.values())
             if count > MOST_CROSSED:
-                raise ValueError(f"these levels form {count} samples, expected at most {MOST_CROSSED}; give "
-                    "fewer, or distributions")
+                raise ValueError(
+                    f"these levels form {count} samples, expected at most {MOST_CROSSED}; give "
+                    "fewer, or distributions"
+                )
         else:
-            object.__setattr__(self, "variables", {name: np.asarray(column, float) for name, column in self.variables.items()})
+            object.__setattr__(
+                self,
+                "variables",
+                {name: np.asarray(column, float) for name, column in self.variables.items()},
+            )
             lengths = {name: len(column) for name, column in self.variables.items()}
             if len(set(lengths.values())) > 1:
-                raise ValueError("columns differ in length: " + ", ".join(f"`{name}` has "
-                    f"{length}" for name, length in lengths.items()))
+                raise ValueError(
+                    "columns differ in length: "
+                    + ", ".join(f"`{name}` has {length}" for name, length in lengths.items())
+                )
             count = next(iter(lengths.values()))
         if self.samples not in (None, count):
             raise ValueError(f"`samples` is {self.samples}, but the {kind} has {count}; omit `samples`")
@@ -134,14 +157,20 @@ class Design(Printed):
         matrix = np.eye(len(names))
         for pair, value in self.correlation.items():
             if not isinstance(pair, tuple) or len(pair) != 2:
-                raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as "
-                    f"({names[0]!r}, {names[-1]!r}): 0.5")
-            value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number "
-                "between -1 and 1"))
+                raise ValueError(
+                    f"`correlation` has the entry {pair!r}, expected pairs of names, such as "
+                    f"({names[0]!r}, {names[-1]!r}): 0.5"
+                )
+            value = float(
+                checked_known(
+                    value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"
+                )
+            )
             check_names(pair, names, "`correlation` names `{}`, which does not vary")
             if len(set(pair)) != 2 or not -1 < value < 1:
-                raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number "
-                    "between -1 and 1")
+                raise ValueError(
+                    f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1"
+                )
             if (back := self.correlation.get(pair[::-1], value)) != value:
                 raise ValueError(f"the correlation of {pair} is both {value} and {back}; give it once")
             i, j = map(names.index, pair)
@@ -149,8 +178,10 @@ class Design(Printed):
         try:
             return np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:
-            raise ValueError(f"no quantities have these correlations: the matrix\n{matrix}\nis not positive "
-                "definite; make them smaller") from None
+            raise ValueError(
+                f"no quantities have these correlations: the matrix\n{matrix}\nis not positive "
+                "definite; make them smaller"
+            ) from None
 
     @property
     def names(self) -> Labels:
@@ -180,11 +211,17 @@ class Design(Printed):
         if self.sampler == GRID:
             shape = [len(levels.levels) for levels in self.variables.values()]
             places = np.unravel_index(index, shape)
-            return {name: np.asarray(levels.levels)[place] for (name, levels), place in zip(self.variables.items(), places, strict=True)}
+            return {
+                name: np.asarray(levels.levels)[place]
+                for (name, levels), place in zip(self.variables.items(), places, strict=True)
+            }
         u, values = self._drawn(jnp.asarray(index) if on_device else index), Distribution.values
         if on_device:
             values = jax.jit(values, static_argnums=0)
-        return {name: values(distribution, u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
+        return {
+            name: values(distribution, u[:, i])
+            for i, (name, distribution) in enumerate(self.variables.items())
+        }
 
     def probabilities(self, first: int, last: int) -> np.ndarray:
         """Return the probabilities at which the distributions are evaluated, for samples `first` to `last` -
@@ -202,9 +239,19 @@ class Design(Printed):
         return u if self._factor is None else correlate(self._factor, u)
 
     def _text(self) -> str:
-        lines = [f"Design: {len(self)} samples, {self.sampler}" + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")]
+        lines = [
+            f"Design: {len(self)} samples, {self.sampler}"
+            + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")
+        ]
         for name, what in self.variables.items():
-            shown = f"{len(what)} values from {what.min():g} to {what.max():g}" if isinstance(what, np.ndarray) else repr(what)
+            shown = (
+                f"{len(what)} values from {what.min():g} to {what.max():g}"
+                if isinstance(what, np.ndarray)
+                else repr(what)
+            )
             lines.append(f"  {name}: {shown}")
-        lines += [f"  correlation of {' and '.join(pair)}: {value:g}" for pair, value in (self.correlation or {}).items()]
+        lines += [
+            f"  correlation of {' and '.join(pair)}: {value:g}"
+            for pair, value in (self.correlation or {}).items()
+        ]
         return "\n".join(lines)

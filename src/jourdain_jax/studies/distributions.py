@@ -21,8 +21,7 @@ class Distribution:
     _positive: ClassVar[str] = ""  # name of the number that must be positive
 
     def __post_init__(self):
-        """Convert the numbers to floats. Raises ValueError for numbers that are not finite or out of range.
-        """
+        """Convert the numbers to floats. Raises ValueError for numbers that are not finite or out of range."""
         kind, known = type(self).__name__, dict(vars(self))
         for name, value in known.items():
             known[name] = float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number"))
@@ -32,11 +31,13 @@ class Distribution:
         if known.get("sigma", 0.0) < 0:
             raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation >= 0")
         if not known.get("low", 0.0) < known.get("high", 1.0):
-            raise ValueError(f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low "
-                "< high")
+            raise ValueError(
+                f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low < high"
+            )
         if self._positive and known[self._positive] <= 0:
-            raise ValueError(f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a "
-                "positive number")
+            raise ValueError(
+                f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a positive number"
+            )
 
     def values(self, u):
         """Return the values at the probabilities `u`, between 0 and 1."""
@@ -47,7 +48,10 @@ class Distribution:
         are imaginary parts (complex step), exact to round-off.
         """
         known, tiny = vars(self), 1e-30
-        return {name: np.imag(self._inverse(u, *(known | {name: known[name] + 1j * tiny}).values())) / tiny for name in known}
+        return {
+            name: np.imag(self._inverse(u, *(known | {name: known[name] + 1j * tiny}).values())) / tiny
+            for name in known
+        }
 
     @staticmethod
     @abstractmethod
@@ -122,6 +126,7 @@ class Levels:
     def __init__(self, levels: Sequence[float]):
         found = np.asarray(checked_known(levels, "`levels`", advice="give a list of numbers"), float)
         if found.ndim != 1 or not found.size or not all_finite(found):
-            raise ValueError(f"`levels` has the shape {found.shape}, expected a list of finite numbers, at "
-                "least one")
+            raise ValueError(
+                f"`levels` has the shape {found.shape}, expected a list of finite numbers, at least one"
+            )
         object.__setattr__(self, "levels", tuple(found.tolist()))

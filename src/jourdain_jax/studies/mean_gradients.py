@@ -66,12 +66,16 @@ class MeanGradients(Printed):
         return float(self.gradient[self.outputs.index(output), self.names.index(name)])
 
     def _text(self) -> str:
-        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (
-            f"; {self.failed} failed and are omitted" if self.failed else "")]
+        lines = [
+            f"Gradients of means over {int(self.lanes.max(initial=0))} lanes"
+            + (f"; {self.failed} failed and are omitted" if self.failed else "")
+        ]
         for i, output in enumerate(self.outputs):
             lines.append(f"  {output}: mean {self.mean[i]:.6g}")
-            lines += [f"    by {name}: {self.gradient[i, j]:.6g} +- "
-                f"{self.standard_error[i, j]:.2g}" for j, name in enumerate(self.names)]
+            lines += [
+                f"    by {name}: {self.gradient[i, j]:.6g} +- {self.standard_error[i, j]:.2g}"
+                for j, name in enumerate(self.names)
+            ]
         return "\n".join([*lines, *(f"  warning: {text}" for text in self.warnings)])
 
 
@@ -83,17 +87,23 @@ def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
     columns = (*task.design.names, *shared)
     # 2048 motions with their tangents, in one batch
     size = max(8, min(task.block, 2048 // (1 + len(columns))))
-    common = {name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared}
+    common = {
+        name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared
+    }
     of_block = _of_block(task, columns)
     blocks = []
     for first in range(0, len(task.design), size):
         count = min(size, len(task.design) - first)
-        drawn = task.design.values(first, first + count) | {name: np.full(count, value) for name, value in common.items()}
+        drawn = task.design.values(first, first + count) | {
+            name: np.full(count, value) for name, value in common.items()
+        }
         drawn = {name: np.pad(column, (0, size - count), mode="edge") for name, column in drawn.items()}
         with nan_is_a_mark():
             found, derivative, end = (np.asarray(x) for x in of_block(drawn))
         numbers = _numbers(task, shared, first, first + count)
-        weighted = [derivative[columns.index(column), :count] * factor[:, None] for column, _, factor in numbers]
+        weighted = [
+            derivative[columns.index(column), :count] * factor[:, None] for column, _, factor in numbers
+        ]
         blocks.append((found[:count], np.stack(weighted, axis=-1), end[:count]))
     names = [name for _, name, _ in numbers]
     return _gathered(task, names, *map(np.concatenate, zip(*blocks, strict=True)))
@@ -104,8 +114,9 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
     for name in shared:
         if name not in known or name in task.design.names:
             said = "varies over the samples; omit it" if name in known else "is no parameter of the scene"
-            raise ValueError(f"`{name}` {said}; "
-                f"{nearest(name, [one for one in known if one not in task.design.names])}")
+            raise ValueError(
+                f"`{name}` {said}; {nearest(name, [one for one in known if one not in task.design.names])}"
+            )
         if known[name]:
             raise ValueError(f"parameter `{name}` is an array; give parameters that are one number")
 
@@ -117,13 +128,22 @@ def _of_block(task: Task, columns: Sequence[str]):
 
     def outputs(drawn: Mapping):
         starts, parameters = task.starts_and_parameters(drawn)
-        rolled = rollout(task.scene, starts, parameters=parameters or None, **task.span, options=task.options).lanes
+        rolled = rollout(
+            task.scene, starts, parameters=parameters or None, **task.span, options=task.options
+        ).lanes
         found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
-        return found, jnp.where(rolled.result == result_codes.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
+        return found, jnp.where(
+            rolled.result == result_codes.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2)
+        )
 
     def of_block(drawn):
-        along = {name: jnp.stack([jnp.full_like(drawn[name], float(name == column)) for column in columns]) for name in columns}
-        return jax.vmap(lambda tangent: jax.jvp(outputs, (drawn,), (tangent,), has_aux=True), out_axes=(None, 0, None))(along)
+        along = {
+            name: jnp.stack([jnp.full_like(drawn[name], float(name == column)) for column in columns])
+            for name in columns
+        }
+        return jax.vmap(
+            lambda tangent: jax.jvp(outputs, (drawn,), (tangent,), has_aux=True), out_axes=(None, 0, None)
+        )(along)
 
     return eqx.filter_jit(of_block)
 
@@ -140,7 +160,9 @@ def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[t
     return found + [(name, name, even) for name in shared]
 
 
-def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray) -> MeanGradients:
+def _gathered(
+    task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray
+) -> MeanGradients:
     """Return means over the samples with a finite output; `values` (samples, outputs), `derivatives`
     (samples, outputs, names).
     """
@@ -173,4 +195,6 @@ def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, en
             )
     for text in warned:
         warn(text, SensitivityWarning)
-    return MeanGradients(tuple(task.outputs), tuple(names), mean[:, 0], gradient, error, count[:, 0], failed, tuple(warned))
+    return MeanGradients(
+        tuple(task.outputs), tuple(names), mean[:, 0], gradient, error, count[:, 0], failed, tuple(warned)
+    )

@@ -56,15 +56,24 @@ def room(allowed: int, *, here: bool) -> float:
     held = resident() if here else 240e6
     give_back_at_once()
     if allowed < held + COMPILED:
-        need = f"{'this process' if here else 'a new process'} holds {held / 1e6:.0f} MB before it begins, and compiling may take {COMPILED / 1e6:.0f} MB"
-        raise ValueError(f"`memory` allows {allowed / 1e6:.0f} MB for each computing process, but {need}; "
-            "give more, or use fewer processes")
+        need = (
+            f"{'this process' if here else 'a new process'} holds {held / 1e6:.0f} MB before it begins, and"
+            f" compiling may take {COMPILED / 1e6:.0f} MB"
+        )
+        raise ValueError(
+            f"`memory` allows {allowed / 1e6:.0f} MB for each computing process, but {need}; "
+            "give more, or use fewer processes"
+        )
     return allowed - held - COMPILED
 
 
 def check(allowed: int) -> None:
     """Raise MemoryError if this process now uses more than `allowed` bytes."""
     if (held := resident()) > allowed:
-        text = f"a process holds {held / 1e6:.0f} MB, and `memory` allows {allowed / 1e6:.0f} MB for each; all finished chunks are kept"
-        raise MemoryError(f"{text}. Run the study again with more memory, fewer processes, or fewer times "
-            "`ts`")
+        text = (
+            f"a process holds {held / 1e6:.0f} MB, and `memory` allows {allowed / 1e6:.0f} MB for each; all"
+            " finished chunks are kept"
+        )
+        raise MemoryError(
+            f"{text}. Run the study again with more memory, fewer processes, or fewer times `ts`"
+        )

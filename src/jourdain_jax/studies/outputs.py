@@ -39,8 +39,11 @@ class Output:
 
 def _check_name(output: Output, name, scene: Scene) -> None:
     valid = (*scene.coordinate_names, *scene.speed_names)
-    check_name(name, valid, f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such "
-        "coordinate or speed")
+    check_name(
+        name,
+        valid,
+        f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed",
+    )
 
 
 @dataclass(frozen=True)
@@ -143,18 +146,23 @@ class OfEvent(Output):
                 "give it a method `events`"
             )
         if self.event is not None and self.event not in valid:
-            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such "
-                f"stop event; {nearest(self.event, valid)}")
+            raise ValueError(
+                f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such "
+                f"stop event; {nearest(self.event, valid)}"
+            )
 
     def _happened(self, motion: Trajectory):
         stopped = motion.result == EVENT
-        return stopped if self.event is None else stopped & (motion.event == motion.event_names.index(self.event))
+        return (
+            stopped
+            if self.event is None
+            else stopped & (motion.event == motion.event_names.index(self.event))
+        )
 
 
 @dataclass(frozen=True)
 class EventTime(OfEvent):
-    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN if it did not.
-    """
+    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN if it did not."""
 
     unit = "s"
 
@@ -176,7 +184,7 @@ class Happened(OfEvent):
 class Quantity(Output):
     """A number computed by `function` from a `Trajectory` with operations of JAX, and its `unit` as a text.
 
-        jj.studies.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
+    jj.studies.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """
 
     function: Callable
@@ -186,8 +194,10 @@ class Quantity(Output):
         found = self.function(motion)
         shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
         if shape != () or jnp.iscomplexobj(found):
-            raise ValueError(f"an output is {described(found)}, expected one real number for a motion; take "
-                "an entry or reduce it, or give one output for each")
+            raise ValueError(
+                f"an output is {described(found)}, expected one real number for a motion; take "
+                "an entry or reduce it, or give one output for each"
+            )
         return jnp.asarray(found, motion.q_end.dtype)
 
 
@@ -198,18 +208,24 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
     if outputs is None:
         outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names, *scene.speed_names)}
     if not isinstance(outputs, Mapping) or not outputs:
-        raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as '
-            '{"final lean": jj.studies.End("lean", "rad")}')
+        raise ValueError(
+            f"`outputs` is {described(outputs)}, expected a dictionary by name, such as "
+            '{"final lean": jj.studies.End("lean", "rad")}'
+        )
     found = {}
     for name, output in outputs.items():
         # it becomes the name of a folder
         printable = isinstance(name, str) and name.isprintable() and len(name.encode()) <= 200
         if not printable or not re.fullmatch(r"[^/\\_.][^/\\]*", name):
-            raise ValueError(f"an output is called {shortened(repr(name))}, expected printable text of at most "
-                "200 bytes without `/` and `\\` that begins with neither `_` nor `.`")
+            raise ValueError(
+                f"an output is called {shortened(repr(name))}, expected printable text of at most "
+                "200 bytes without `/` and `\\` that begins with neither `_` nor `.`"
+            )
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
-            raise ValueError(f"output `{name}` is {described(output)}, expected an output such as "
-                "jj.studies.End('lean'), or a function of a trajectory")
+            raise ValueError(
+                f"output `{name}` is {described(output)}, expected an output such as "
+                "jj.studies.End('lean'), or a function of a trajectory"
+            )
         found[name] = output if isinstance(output, Output) else Quantity(output)
         found[name].check(scene)
     return found

@@ -44,7 +44,9 @@ class Lane(Printed):
         return simulate(own, self.starts, **dict(task.span) | {"options": task.options} | options)
 
     def _text(self) -> str:
-        given = {name: f"{np.asarray(value).tolist()}" for name, value in (self.parameters | self.starts).items()}
+        given = {
+            name: f"{np.asarray(value).tolist()}" for name, value in (self.parameters | self.starts).items()
+        }
         lines = [f"Lane {self.number}: " + ", ".join(f"{name} = {value}" for name, value in given.items())]
         if self.kept:
             lines.append(f"  {result_codes.MESSAGES.get(int(self.kept['result']), 'not computed yet')}")
@@ -100,8 +102,9 @@ class StudyResult(Printed):
         IndexError if there is none.
         """
         if not 0 <= number < len(self):
-            raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to "
-                f"{len(self) - 1}")
+            raise IndexError(
+                f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}"
+            )
         if self.task is None:
             raise ValueError(
                 "the scene of this study is unknown here; call `study.run` with the same arguments, which "
@@ -110,14 +113,19 @@ class StudyResult(Printed):
         kept = {}
         if self.store.columns:
             self.store.check_arrays({number // self.store.chunk}.intersection(self.store.receipts()))
-            kept = {name: float(array[number]) for name, array in self._opened().items() if array.dims == ("lane",)}
-        values = {name: float(column[0]) for name, column in self.task.design.values(number, number + 1).items()}
+            kept = {
+                name: float(array[number])
+                for name, array in self._opened().items()
+                if array.dims == ("lane",)
+            }
+        values = {
+            name: float(column[0]) for name, column in self.task.design.values(number, number + 1).items()
+        }
         return Lane(self.task, number, *self.task.starts_and_parameters(values), kept)
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Return means, covariances, histograms and extremes of the outputs over the samples that have them.
-        """
+        """Return means, covariances, histograms and extremes of the outputs over the samples that have them."""
         grid = self.store.read_grid()
         if grid is None or not self._done:
             raise ValueError(
@@ -139,8 +147,7 @@ class StudyResult(Printed):
         return float(self.statistics.covariance[self._place(first), self._place(second)])
 
     def quantile(self, output: str, level: float) -> tuple[float, float]:
-        """Return two bounds of the quantile `level` (0 to 1) of an `output`: the edges of its histogram cell.
-        """
+        """Return two bounds of the quantile `level` (0 to 1) of an `output`: the edges of its histogram cell."""
         if not 0 <= level <= 1:
             raise ValueError(f"`level` is {level}, expected a number from 0 to 1")
         self._place(output)
@@ -175,10 +182,14 @@ class StudyResult(Printed):
         """
         self._place(output)
         if self.store.study["sampler"] != "saltelli":
-            raise ValueError("Sobol' indices need sampler='saltelli'; this study has "
-                f"'{self.store.study['sampler']}'")
+            raise ValueError(
+                f"Sobol' indices need sampler='saltelli'; this study has '{self.store.study['sampler']}'"
+            )
         if self.store.study["save"] == "statistics" or not self.complete:
-            raise ValueError("Sobol' indices need all lanes of a study with save='outputs'" + ("" if self.complete else "; run it to its end"))
+            raise ValueError(
+                "Sobol' indices need all lanes of a study with save='outputs'"
+                + ("" if self.complete else "; run it to its end")
+            )
         return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
 
     def _place(self, output: str) -> int:
@@ -195,16 +206,24 @@ class StudyResult(Printed):
         return self._opened()
 
     def _opened(self):
-        return needed("xarray", "a study as labelled arrays", "studies").open_zarr(self.store.path, chunks=None, consolidated=True)
+        return needed("xarray", "a study as labelled arrays", "studies").open_zarr(
+            self.store.path, chunks=None, consolidated=True
+        )
 
     def to_netcdf(self, path: FilePath) -> None:
         """Write all arrays to the NetCDF file `path`, by any installed engine of xarray."""
         found = self.to_xarray().load()
-        found.attrs = {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.attrs.items()}
+        found.attrs = {
+            name: value if isinstance(value, int | float | str) else repr(value)
+            for name, value in found.attrs.items()
+        }
         found.attrs.pop("coordinates", None)
         for array in found.variables.values():
-            array.attrs = {name: np.array(value, array.dtype) if name.startswith("flag_") and isinstance(value, list) else
-                           " ".join(value) if isinstance(value, list) else value for name, value in array.attrs.items()}  # fmt: skip
+            array.attrs = {
+                name: np.array(value, array.dtype) if name.startswith("flag_") else " ".join(value)
+                for name, value in array.attrs.items()
+                if isinstance(value, list)
+            } | {name: value for name, value in array.attrs.items() if not isinstance(value, list)}
             array.encoding = {}
         found.to_netcdf(path)
 
@@ -228,7 +247,14 @@ class StudyResult(Printed):
             axis, (counts, edges, beyond) = whole.add_subplot(1, len(names), k + 1), self._bars(name, cells)
             axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
             if beyond.any():
-                axis.stairs(np.where(beyond, counts, 0), edges, fill=True, color="#1f5fa8", alpha=0.25, label="anywhere in here")
+                axis.stairs(
+                    np.where(beyond, counts, 0),
+                    edges,
+                    fill=True,
+                    color="#1f5fa8",
+                    alpha=0.25,
+                    label="anywhere in here",
+                )
                 axis.legend(fontsize="small")
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
             column = self.store.columns.get(name)
@@ -241,7 +267,9 @@ class StudyResult(Printed):
         drawn = [name for name in self.outputs if self._done and self._bars(name, 40)[0].sum() > 0]
         shown = drawn[:12]  # limit for a notebook
         more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
-        return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
+        return super()._repr_html_() + (
+            figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else ""
+        )
 
     def _in_short(self, output: str, level: float) -> str:
         """Return a quantile as one number, the middle of its cell; beyond the grid, as a bound."""
@@ -252,22 +280,38 @@ class StudyResult(Printed):
     def _text(self) -> str:
         tally = self._tally
         done = int(tally.codes.sum())
-        lines = [f"Study in {self.store.path}: {done} of {len(self)} lanes" + ("" if self.complete else
-            "; run it again to continue")]
-        lines += [f"  {count} {result_codes.MESSAGES[CODES.index(name)].split(';')[0]}" for name, count in self.counts.items()]
+        lines = [
+            f"Study in {self.store.path}: {done} of {len(self)} lanes"
+            + ("" if self.complete else "; run it again to continue")
+        ]
+        lines += [
+            f"  {count} {result_codes.MESSAGES[CODES.index(name)].split(';')[0]}"
+            for name, count in self.counts.items()
+        ]
         if self.failed.size:
-            lines.append("  failed: lanes " + ", ".join(map(str, self.failed[:10])) + (" ..." if self.failed.size > 10 else ""))
+            lines.append(
+                "  failed: lanes "
+                + ", ".join(map(str, self.failed[:10]))
+                + (" ..." if self.failed.size > 10 else "")
+            )
         if tally.again[0]:
             lines.append(f"  {tally.again[0]} were run again in another way")
         if done:
-            lines.append(f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} "
-                "rejected a lane")
+            lines.append(
+                f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} "
+                "rejected a lane"
+            )
             width = max(map(len, self.outputs))
-            lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} "
-                f"{'median':>12} {'97.5 %':>12}")
+            lines.append(
+                f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} "
+                f"{'median':>12} {'97.5 %':>12}"
+            )
             for i, name in enumerate(self.outputs):
                 middle = (f"{self._in_short(name, level):>12}" for level in LEVELS)
-                numbers = f"{self.statistics.lanes[i, i]:>9} {self.statistics.mean[i]:12.5g} {self.statistics.deviation[i]:12.5g} {' '.join(middle)}"
+                numbers = (
+                    f"{self.statistics.lanes[i, i]:>9} {self.statistics.mean[i]:12.5g}"
+                    f" {self.statistics.deviation[i]:12.5g} {' '.join(middle)}"
+                )
                 lines.append(f"  {name:<{width}} {numbers}")
         return "\n".join(lines)
 
@@ -301,11 +345,17 @@ def merge_studies(path: FilePath, shares: Sequence[FilePath]) -> StudyResult:
         held = set(target.done()[0])
         for share in shares:
             other = Store(share)
-            different = [name for name in ("identity", "chunk", "block", "samples") if other.study[name] != target.study[name]]
+            different = [
+                name
+                for name in ("identity", "chunk", "block", "samples")
+                if other.study[name] != target.study[name]
+            ]
             grid, own = other.read_grid(), target.read_grid()
             if different or (grid and own and grid != own):
-                raise ValueError(f"`{share}` holds no share of the study in `{path}`: "
-                    f"{' and '.join(different) or 'the grid of statistics'} differ")
+                raise ValueError(
+                    f"`{share}` holds no share of the study in `{path}`: "
+                    f"{' and '.join(different) or 'the grid of statistics'} differ"
+                )
             if grid and not own:
                 target.write_grid(grid)
             for number in other.receipts():

@@ -92,20 +92,34 @@ class Runner:
         first = number * task.block
         count = min(task.block, len(task.design) - first)
         index = np.minimum(first + np.arange(task.block), len(task.design) - 1)
-        values = task.design._at(index, on_device=jax.default_backend() != "cpu" and jax.config.jax_enable_x64)
+        values = task.design._at(
+            index, on_device=jax.default_backend() != "cpu" and jax.config.jax_enable_x64
+        )
         starts, parameters = task.starts_and_parameters(values)
-        rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
+        rolled = rollout(
+            task.scene,
+            starts,
+            parameters=parameters or None,
+            chunk=task.block,
+            progress=False,
+            **task.span,
+            options=task.options,
+        ).lanes
         with nan_is_a_mark():
             outputs = self._outputs_of(rolled)
         ends = {name: getattr(rolled, field) for name, (field, *_) in OF_LANES.items()}
 
         def rows(array, every: int) -> np.ndarray:
-            return np.asarray(array if every == 1 else _rows(array, np.arange(-first % every, count, every)))[:count]
+            return np.asarray(array if every == 1 else _rows(array, np.arange(-first % every, count, every)))[
+                :count
+            ]
 
         found: dict[str, np.ndarray] = {}
         if self.store.columns:
             every = self.store.columns["result"].every
-            found = {name: rows(array, every) for name, array in (values | ends).items()} | dict(zip(task.outputs, rows(outputs, every).T, strict=True))
+            found = {name: rows(array, every) for name, array in (values | ends).items()} | dict(
+                zip(task.outputs, rows(outputs, every).T, strict=True)
+            )
         if task.keep_every:
             for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):
                 found |= dict(zip(names, np.moveaxis(rows(array, task.keep_every), -1, 0), strict=True))
@@ -120,7 +134,9 @@ def _rows(array, index):
     return array[index]
 
 
-def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
+def bounded(
+    task: Task, path, chunk: int | None, allowed: int | None, *, here: bool
+) -> tuple[Task, int | None]:
     """Return the task, and the number of samples of its chunks. Blocks have the size used in the folder or,
     in a new folder, a size that keeps a process below `allowed` bytes.
 
@@ -140,11 +156,16 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
             most = int(0.5 * room / (memory.CHUNKS * max(task.bytes_of_kept_lane, 1.0)))
             chunk = min(_chunk(task, None), max(unit, most // unit * unit))
     lanes = begun.chunk if begun else _chunk(task, chunk)
-    if (need := memory.BLOCKS * task.block * task.bytes_of_lane + memory.CHUNKS * lanes * task.bytes_of_kept_lane) > room:
+    if (
+        need := memory.BLOCKS * task.block * task.bytes_of_lane
+        + memory.CHUNKS * lanes * task.bytes_of_kept_lane
+    ) > room:
         text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB"
         text += f", but `memory` leaves only {room / 1e6:.0f} MB for each process"
-        raise ValueError(f"{text}; give more memory, fewer processes, a smaller `chunk`, fewer times `ts`, "
-            "or a larger `keep_every`")
+        raise ValueError(
+            f"{text}; give more memory, fewer processes, a smaller `chunk`, fewer times `ts`, "
+            "or a larger `keep_every`"
+        )
     return replace(task, memory=allowed), chunk
 
 
@@ -164,7 +185,11 @@ def _constants(task: Task) -> dict[str, tuple]:
         return {}
     found = {"time": ("time", np.asarray(task.ts, float), {"units": "s"})}
     if task.stride > 1:
-        found["saved_lane"] = ("saved_lane", np.arange(0, len(task.design), task.stride, dtype=np.int32), {"long_name": "lane whose trajectory is kept"})
+        found["saved_lane"] = (
+            "saved_lane",
+            np.arange(0, len(task.design), task.stride, dtype=np.int32),
+            {"long_name": "lane whose trajectory is kept"},
+        )
     return found
 
 
@@ -189,13 +214,28 @@ def versions() -> dict[str, str]:
 
 
 def _study(task: Task, chunk: int | None, command: str) -> dict:
-    about = {"samples": len(task.design), "block": task.block, "chunk": _chunk(task, chunk), "save": task.save, "outputs": list(task.outputs)}
-    return about | {"varied": list(task.design.names), "sampler": task.design.sampler, "identity": task.identity(), "versions": versions(), "command": command}
+    about = {
+        "samples": len(task.design),
+        "block": task.block,
+        "chunk": _chunk(task, chunk),
+        "save": task.save,
+        "outputs": list(task.outputs),
+    }
+    return about | {
+        "varied": list(task.design.names),
+        "sampler": task.design.sampler,
+        "identity": task.identity(),
+        "versions": versions(),
+        "command": command,
+    }
 
 
 def attributes(task: Task) -> dict:
     """Return the attributes of the store, which describe the study."""
-    parameters = {name: {"value": np.asarray(value).tolist(), "unit": about["unit"]} for name, value, about in parameters_of(task.scene)}
+    parameters = {
+        name: {"value": np.asarray(value).tolist(), "unit": about["unit"]}
+        for name, value, about in parameters_of(task.scene)
+    }
     return {
         "title": f"study of {type(task.scene).__name__}",
         "scene": f"{type(task.scene).__module__}.{type(task.scene).__qualname__}",
@@ -218,7 +258,11 @@ def _as_text(x) -> object:
     """Return an option as text; numbers stay numbers. Memory addresses of functions, different in every
     process, are omitted.
     """
-    return np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
+    return (
+        np.asarray(x).tolist()
+        if isinstance(x, int | float | np.ndarray | jax.Array)
+        else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
+    )
 
 
 def _check_same(store: Store, task: Task, chunk: int | None) -> None:
@@ -227,15 +271,26 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     if other:
         was, now = store.attributes, json.loads(json.dumps(attributes(task)))
         what = ", ".join(_difference(name, was, now) for name in other)
-        raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new folder, or "
-            "the arguments of that study")
+        raise ValueError(
+            f"`{store.path}` holds another study; what differs: {what}; give a new folder, or "
+            "the arguments of that study"
+        )
     if chunk is not None and chunk != store.chunk:
-        raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is "
-            f"{chunk}; omit `chunk`")
+        raise ValueError(
+            f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is "
+            f"{chunk}; omit `chunk`"
+        )
     now = versions()
-    changed = [f"{name} {held} (now {now[name]})" for name, held in store.study["versions"].items() if now.get(name) != held]
+    changed = [
+        f"{name} {held} (now {now[name]})"
+        for name, held in store.study["versions"].items()
+        if now.get(name) != held
+    ]
     if changed:
-        warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; new results may differ from the stored ones in their last digits")
+        warn(
+            f"`{store.path}` was begun with other versions: {', '.join(changed)}; new results may differ from"
+            " the stored ones in their last digits"
+        )
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
@@ -245,7 +300,9 @@ def _difference(part: str, was: dict, now: dict) -> str:
     kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part)
     if kept is None:
         return part
-    names = [f"`{name}`" for name in sorted({*was[kept], *now[kept]}) if was[kept].get(name) != now[kept].get(name)]
+    names = [
+        f"`{name}`" for name in sorted({*was[kept], *now[kept]}) if was[kept].get(name) != now[kept].get(name)
+    ]
     if part == "scene" and not names:
         names = ["its methods"]
     return f"{part} ({', '.join(names)})" if names else part
@@ -272,7 +329,16 @@ def _interruptions() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int, int], command: str, workers: Callable) -> Store:
+def run(
+    task: Task,
+    path,
+    *,
+    chunk: int | None,
+    progress: bool,
+    shard: tuple[int, int],
+    command: str,
+    workers: Callable,
+) -> Store:
     """Compute the missing part of a task in the folder `path`.
 
     `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
@@ -286,7 +352,14 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
             warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}")
         missing = sorted({*range(shard[0] - 1, store.chunks, shard[1])}.difference(done))
         known = _lanes(store, done)
-        bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)
+        bar = tqdm(
+            total=known + _lanes(store, missing),
+            initial=known,
+            unit="lane",
+            unit_scale=True,
+            disable=not progress,
+            smoothing=0.1,
+        )
         failed, finished, began = 0, 0, time.monotonic()
         with bar, _interruptions() as interrupted:
             for lanes, wrong in workers(store, missing, interrupted):
@@ -298,8 +371,10 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
             Runner(task, store)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
-            raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same "
-                "call continues from there")
+            raise KeyboardInterrupt(
+                f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same "
+                "call continues from there"
+            )
     return store
 
 

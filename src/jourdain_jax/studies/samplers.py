@@ -55,7 +55,11 @@ def random(seed: int, index, variables: int, samples: int):
     """
     groups = -(-variables // 4)  # one counter gives four words
     if isinstance(index, jax.Array):
-        words = [word for group in range(groups) for word in _philox((index * groups + (1 + group)).astype(np.uint64), seed)]
+        words = [
+            word
+            for group in range(groups)
+            for word in _philox((index * groups + (1 + group)).astype(np.uint64), seed)
+        ]
         words = jnp.stack(words, axis=1)
     else:  # the same words from NumPy's generator, for indices in order
         first, last = int(index[:1].sum()), int(index[-1:].sum())
@@ -130,7 +134,11 @@ def saltelli(seed: int, index, variables: int, samples: int):
     """Return the samples with these indices of Saltelli's design, shape (len(index), variables)."""
     xp, group = library(index), variables + 2
     points, place = sobol(seed, index // group, 2 * variables, -(-samples // group)), (index % group)[:, None]
-    return xp.where((place == xp.arange(1, variables + 1)) | (place == group - 1), points[:, variables:], points[:, :variables])
+    return xp.where(
+        (place == xp.arange(1, variables + 1)) | (place == group - 1),
+        points[:, variables:],
+        points[:, :variables],
+    )
 
 
 SAMPLERS = {"random": random, "latin-hypercube": latin_hypercube, "sobol": sobol, "saltelli": saltelli}

@@ -40,12 +40,18 @@ class SobolIndices(Printed):
     def _text(self) -> str:
         width = max(map(len, self.names))
         note = f"; {self.left_out} groups with a missing value are omitted" if self.left_out else ""
-        lines = [f"Sobol' indices from {self.groups} groups of samples, with limits of "
-            f"{100 * self.confidence:g} %{note}"]
+        lines = [
+            f"Sobol' indices from {self.groups} groups of samples, with limits of "
+            f"{100 * self.confidence:g} %{note}"
+        ]
         lines.append(f"  {'':<{width}} {'first order':>22} {'total':>22}")
-        rows = zip(self.names, self.first, self.first_half_width, self.total, self.total_half_width, strict=True)
-        lines += [f"  {name:<{width}} {f'{s:.4f} +- {ds:.4f}':>22} "
-            f"{f'{st:.4f} +- {dst:.4f}':>22}" for name, s, ds, st, dst in rows]
+        rows = zip(
+            self.names, self.first, self.first_half_width, self.total, self.total_half_width, strict=True
+        )
+        lines += [
+            f"  {name:<{width}} {f'{s:.4f} +- {ds:.4f}':>22} {f'{st:.4f} +- {dst:.4f}':>22}"
+            for name, s, ds, st, dst in rows
+        ]
         return "\n".join(lines)
 
 
@@ -64,16 +70,20 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     values, names = np.asarray(values, float), tuple(names)
     group = len(names) + 2
     if values.ndim != 1 or values.size % group or not values.size:
-        raise ValueError(f"there are {values.size} values, expected a multiple of {group}: of a design of "
-            f"{len(names)} variables with sampler='saltelli'")
+        raise ValueError(
+            f"there are {values.size} values, expected a multiple of {group}: of a design of "
+            f"{len(names)} variables with sampler='saltelli'"
+        )
     if not 0 < confidence < 1:
         raise ValueError(f"`confidence` is {confidence}, expected a number between 0 and 1")
     groups = values.reshape(-1, group)
     sound = np.isfinite(groups).all(axis=1)
     groups = groups[sound]
     if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # whose variance is the divisor
-        raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' "
-            "indices need a quantity that varies")
+        raise ValueError(
+            "fewer than two groups of samples have values, or all values are equal; Sobol' "
+            "indices need a quantity that varies"
+        )
     generator = np.random.default_rng(0)
     drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(200)])
     half = special.ndtri(0.5 + confidence / 2) * drawn.std(axis=0, ddof=1)

@@ -44,7 +44,9 @@ class Grid:
         ends = []
         for column in values.T:
             finite = column[np.isfinite(column)]
-            low, high, centre = (finite.min(), finite.max(), np.mean(finite)) if finite.size else (-1.0, 1.0, 0.0)
+            low, high, centre = (
+                (finite.min(), finite.max(), np.mean(finite)) if finite.size else (-1.0, 1.0, 0.0)
+            )
             half = 0.5 * (high - low) or max(1e-6 * abs(low), 1e-12)
             ends.append((low - half, high + half, centre))
         low, high, centre = np.array(ends, float).reshape(-1, 3).T
@@ -64,9 +66,13 @@ class Grid:
         that are not finite or not in order.
         """
         low, high, centre = numbers = [np.array(found[name], float) for name in ("low", "high", "centre")]
-        if any(x.shape != (outputs,) or not np.isfinite(x).all() for x in numbers) or np.any((centre < low) | (centre > high)):
-            raise ValueError(f"the grid of the statistics is {found}, expected finite numbers in order, one "
-                f"each for {outputs} outputs")
+        if any(x.shape != (outputs,) or not np.isfinite(x).all() for x in numbers) or np.any(
+            (centre < low) | (centre > high)
+        ):
+            raise ValueError(
+                f"the grid of the statistics is {found}, expected finite numbers in order, one "
+                f"each for {outputs} outputs"
+            )
         return cls(low, high, centre)
 
 
@@ -86,8 +92,7 @@ class Tally:
 
     @classmethod
     def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
-        """Return the tally of the first `lanes` of a block, from the results and values (samples, outputs).
-        """
+        """Return the tally of the first `lanes` of a block, from the results and values (samples, outputs)."""
         with jax.enable_x64(True):
             counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
         failed = np.zeros(0, np.int64)
@@ -118,10 +123,23 @@ class Tally:
     @classmethod
     def checked(cls, arrays: Mapping[str, np.ndarray], lanes: range, outputs: int) -> "Tally":
         """Return the tally in these arrays of some `lanes`. Raises ValueError for numbers out of range."""
-        codes, again, steps, failed, sums, (place, counts), extremes = (arrays[name] for name in cls.__dataclass_fields__)
-        shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
-        numbers = codes.sum() == len(lanes) and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
-        within = np.all((failed >= lanes.start) & (failed < lanes.stop)) and np.all((place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0))
+        codes, again, steps, failed, sums, (place, counts), extremes = (
+            arrays[name] for name in cls.__dataclass_fields__
+        )
+        shapes = (
+            again.shape == (1,)
+            and steps.shape == (2,)
+            and sums.shape[1:] == (3, outputs, outputs)
+            and extremes.shape == (2, outputs)
+        )
+        numbers = (
+            codes.sum() == len(lanes)
+            and codes.size <= len(CODES)
+            and min(codes.min(), again.min(), steps.min()) >= 0
+        )
+        within = np.all((failed >= lanes.start) & (failed < lanes.stop)) and np.all(
+            (place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0)
+        )
         if not (shapes and numbers and within):
             raise ValueError("the receipt of a chunk holds numbers that are out of their ranges")
         return cls(**dict(arrays) | {"codes": np.pad(codes, (0, len(CODES) - codes.size))})
@@ -140,11 +158,20 @@ def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
     return {
         "codes": jnp.sum((ends["result"][:, None] == jnp.arange(len(CODES))) & counts[:, None], axis=0),
         "again": jnp.sum((ends["retries"] > 0) & counts)[None],
-        "steps": jnp.stack([jnp.sum(jnp.where(counts, ends[name], 0), dtype=int) for name in ("steps", "rejected_steps")]),
+        "steps": jnp.stack(
+            [jnp.sum(jnp.where(counts, ends[name], 0), dtype=int) for name in ("steps", "rejected_steps")]
+        ),
         # not by a matrix product, whose rounding may depend on threads
-        "sums": jnp.stack([jnp.sum(a[:, :, None] * b[:, None], axis=0) for a, b in ((m, m), (x, m), (x, x))])[None],
+        "sums": jnp.stack([jnp.sum(a[:, :, None] * b[:, None], axis=0) for a, b in ((m, m), (x, m), (x, x))])[
+            None
+        ],
         "cells": cells,
-        "extremes": jnp.stack([jnp.min(values, 0, initial=jnp.inf, where=finite), jnp.max(values, 0, initial=-jnp.inf, where=finite)]),
+        "extremes": jnp.stack(
+            [
+                jnp.min(values, 0, initial=jnp.inf, where=finite),
+                jnp.max(values, 0, initial=-jnp.inf, where=finite),
+            ]
+        ),
     }
 
 

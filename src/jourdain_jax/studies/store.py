@@ -78,7 +78,9 @@ class Receipt:
         listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
         head = vars(self) | {"checksums": dict(self.checksums), "arrays": listed}
         del head["tally"]
-        return _ended(_BEGIN + json.dumps(head).encode() + b"\n" + b"".join(map(np.ndarray.tobytes, arrays.values())))
+        return _ended(
+            _BEGIN + json.dumps(head).encode() + b"\n" + b"".join(map(np.ndarray.tobytes, arrays.values()))
+        )
 
     @staticmethod
     def unpacked(content: bytes, outputs: int) -> "Receipt":
@@ -106,13 +108,24 @@ class Store:
         self.study = self._read_study()
         self._digests = self._read_manifest()
         self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
-        self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
+        self.columns = {
+            name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))})
+            for name, entry in self.study["columns"].items()
+        }
         self.outputs = tuple(self.study.get("outputs", ()))
-        decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # equal in all shares
+        decides = [
+            self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")
+        ]  # equal in all shares
         self.identity = _digest(json.dumps(decides).encode())
 
     @staticmethod
-    def make(path: FilePath, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
+    def make(
+        path: FilePath,
+        study: Mapping,
+        columns: Mapping[str, Column],
+        constants: Mapping[str, tuple],
+        attributes: Mapping,
+    ) -> "Store":
         """Create a folder, completely or not at all; an existing one is not changed. `constants`: name ->
         axis, values, attributes.
         """
@@ -130,23 +143,46 @@ class Store:
                 group = zarr.create_group(beside, zarr_format=3, attributes=dict(attributes))
 
                 def array(name: str, axes: Sequence[str], shape, chunks, about: Mapping, **kind):
-                    options = {"dimension_names": axes, "compressors": [zarr.codecs.Crc32cCodec()], "attributes": dict(about)}
+                    options = {
+                        "dimension_names": axes,
+                        "compressors": [zarr.codecs.Crc32cCodec()],
+                        "attributes": dict(about),
+                    }
                     return group.create_array(name, shape=shape, chunks=chunks, **options, **kind)
 
                 for name, column in columns.items():
-                    axes, more = zip(("lane" if column.every == 1 else "saved_lane", 0), *column.more, strict=True)
+                    axes, more = zip(
+                        ("lane" if column.every == 1 else "saved_lane", 0), *column.more, strict=True
+                    )
                     shape, chunks = ((-(-count // column.every), *more[1:]) for count in (lanes, chunk))
-                    array(name, axes, shape, chunks, column.attributes, dtype=column.dtype, fill_value=column.fill)
+                    array(
+                        name,
+                        axes,
+                        shape,
+                        chunks,
+                        column.attributes,
+                        dtype=column.dtype,
+                        fill_value=column.fill,
+                    )
                     (beside / name / "c").mkdir(exist_ok=True)
                 for name, (axis, values, about) in constants.items():
                     array(name, (axis,), values.shape, values.shape, about, dtype=values.dtype)[:] = values
                 group.create_group("run")
                 zarr.consolidate_metadata(beside, zarr_format=3)
             (beside / "run" / "chunks").mkdir()
-            entries = {name: vars(column) | {"attributes": dict(column.attributes)} for name, column in columns.items()}
-            write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
+            entries = {
+                name: vars(column) | {"attributes": dict(column.attributes)}
+                for name, column in columns.items()
+            }
+            write_whole(
+                beside / "run" / "study.json",
+                json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(),
+                wait=True,
+            )
             files = [file for file in beside.rglob("*") if file.is_file()]
-            _write_manifest(beside, {file.relative_to(beside).as_posix(): _digest(file.read_bytes()) for file in files})
+            _write_manifest(
+                beside, {file.relative_to(beside).as_posix(): _digest(file.read_bytes()) for file in files}
+            )
             with contextlib.suppress(OSError):  # an empty folder, which blocks a rename on Windows
                 path.rmdir()
             try:
@@ -155,7 +191,10 @@ class Store:
                 if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
                     raise
         except OSError as error:
-            text = f"cannot write the study ({os.strerror(error.errno or 0)}); choose a folder that can be written to"
+            text = (
+                f"cannot write the study ({os.strerror(error.errno or 0)}); choose a folder that can be"
+                " written to"
+            )
             raise OSError(error.errno, text, str(path)) from error
         finally:
             shutil.rmtree(beside, ignore_errors=True)
@@ -166,11 +205,20 @@ class Store:
         if not os.path.exists(self.path / "run" / "study.json"):
             if os.path.isfile(self.path):
                 raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
-            what = "is not a study: it holds no `run/study.json`" if os.path.exists(self.path) else "does not exist"
-            raise ValueError(f"`{shortened(self.path, 300)}` {what}; give the folder of a study, or a new name")
+            what = (
+                "is not a study: it holds no `run/study.json`"
+                if os.path.exists(self.path)
+                else "does not exist"
+            )
+            raise ValueError(
+                f"`{shortened(self.path, 300)}` {what}; give the folder of a study, or a new name"
+            )
         found = self._json("run/study.json")
         if found.get("format") != FORMAT:
-            text = f"has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it, or run the study anew"
+            text = (
+                f"has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the"
+                " version that wrote it, or run the study anew"
+            )
             raise ValueError(f"`{self.path}` {text} in another folder")
         if fault := _beyond(found):
             raise self._damaged("run/study.json", fault)
@@ -201,8 +249,10 @@ class Store:
         return read_bytes(self.path / name, 100_000_000, "the folder of a study with all its files")
 
     def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
-        return ValueError(f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move "
-            "the folder away and run it anew")
+        return ValueError(
+            f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move "
+            "the folder away and run it anew"
+        )
 
     @property
     def attributes(self) -> dict:
@@ -273,13 +323,19 @@ class Store:
         checksums = {}
         with self._named():
             for name, column in self.columns.items():
-                full = np.full((self.chunk // column.every, *(length for _, length in column.more)), column.fill, np.dtype(column.dtype).newbyteorder("<"))
+                full = np.full(
+                    (self.chunk // column.every, *(length for _, length in column.more)),
+                    column.fill,
+                    np.dtype(column.dtype).newbyteorder("<"),
+                )
                 full[: len(values[name])] = values[name]
                 content = _ended(full.tobytes())
                 checksums[name] = int.from_bytes(content[-4:], "little")
                 self._write(name, number, content)
             of = self.identity, self._digests.get(_GRID, "")
-            write_whole(self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed())
+            write_whole(
+                self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed()
+            )
 
     def receipt(self, number: int) -> Receipt | None:
         """Return the receipt of a chunk; None if it is missing, damaged, or belongs to another chunk, study
@@ -288,7 +344,12 @@ class Store:
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
             own = [self.identity, self._digests.get(_GRID, found.of[-1])]
-            return found if ((found.first, found.last), list(found.of), {*found.checksums}) == (self.span(number), own, {*self.columns}) else None
+            return (
+                found
+                if ((found.first, found.last), list(found.of), {*found.checksums})
+                == (self.span(number), own, {*self.columns})
+                else None
+            )
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             return None
 
@@ -297,9 +358,15 @@ class Store:
         try:
             names = os.listdir(self.path / "run" / "chunks")
         except OSError as error:
-            raise ValueError(f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was "
-                "moved or removed") from None
-        return sorted(int(name) for name in names if name.isdecimal() and name == str(int(name)) and int(name) < self.chunks)
+            raise ValueError(
+                f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was "
+                "moved or removed"
+            ) from None
+        return sorted(
+            int(name)
+            for name in names
+            if name.isdecimal() and name == str(int(name)) and int(name) < self.chunks
+        )
 
     def is_whole(self, number: int) -> bool:
         """Return whether a chunk has its receipt and all its arrays, unchanged."""
@@ -311,7 +378,11 @@ class Store:
         """
         receipt = self.receipt(number)
         for name, column in self.columns.items():
-            size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
+            size = (
+                np.dtype(column.dtype).itemsize
+                * (self.chunk // column.every)
+                * math.prod(length for _, length in column.more)
+            )
             try:
                 with open(self._file(name, number), "rb") as file:
                     content, stated = file.read(size), file.read(5)
@@ -326,7 +397,10 @@ class Store:
         """Raise ValueError if arrays of chunks do not match their receipts."""
         for number in numbers:
             if self.columns and (wrong := self._wrong(number)):
-                text = f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
+                text = (
+                    f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the"
+                    " chunk, is not what was written"
+                )
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
@@ -385,7 +459,11 @@ def _digest_of(digests: Mapping[str, str]) -> str:
 
 
 def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
-    write_whole(path / _MANIFEST, json.dumps({"digests": dict(digests), "digest": _digest_of(digests)}, indent=1).encode(), wait=True)
+    write_whole(
+        path / _MANIFEST,
+        json.dumps({"digests": dict(digests), "digest": _digest_of(digests)}, indent=1).encode(),
+        wait=True,
+    )
 
 
 def _ended(content: bytes) -> bytes:

@@ -50,9 +50,11 @@ class Study(Printed):
 
     - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
       number for all samples (the rest is solved for, as by `jj.start`; default: the scene's example). A
-      variation is a distribution (`jj.studies.Normal`, `jj.studies.Uniform`, `jj.studies.LogNormal`, `jj.studies.LogUniform`), `jj.studies.Levels` of
-      a grid, or a list with one number per sample; all must be of one kind.
-    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.studies.Design`. Sample k depends only on the seed and k.
+      variation is a distribution (`jj.studies.Normal`, `jj.studies.Uniform`, `jj.studies.LogNormal`,
+      `jj.studies.LogUniform`), `jj.studies.Levels` of a grid, or a list with one number per sample; all must
+      be of one kind.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.studies.Design`. Sample k depends only on the
+      seed and k.
 
         disc = jj.models.TiltingDisc()
         start = {"lean": jj.studies.Uniform(-0.6, 0.6), "spin_rate": -3.0}
@@ -80,24 +82,38 @@ class Study(Printed):
         object.__setattr__(self, "scene", as_scene(self.scene))
         varying, constants = self._named()
         object.__setattr__(self, "_constants", constants)
-        column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
-        pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
-        object.__setattr__(self, "design", Design(varying, self.sampler, self.samples, self.seed, pairs or None))
+        column = {name: name + AT_START for name in self.start or ()} | {
+            name: name for name in self.vary or ()
+        }
+        pairs = {
+            tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value
+            for pair, value in (self.correlation or {}).items()
+        }
+        object.__setattr__(
+            self, "design", Design(varying, self.sampler, self.samples, self.seed, pairs or None)
+        )
 
     def _named(self) -> tuple[dict, dict]:
         """Return the varying quantities by the names of their columns, and the constant start values."""
-        examples = {"vary": '{"mass": jj.studies.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
+        examples = {
+            "vary": '{"mass": jj.studies.Normal(12.0, 0.3)}',
+            "start": '{"lean": 0.3}',
+            "correlation": '{("mass", "radius"): 0.5}',
+        }
         for what, example in examples.items():
             if (given := getattr(self, what)) is not None and not isinstance(given, Mapping):
-                raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as "
-                    f"{example}")
+                raise ValueError(
+                    f"`{what}` is {described(given)}, expected a dictionary by name, such as {example}"
+                )
         known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
         varying = {}
         for name, how in (self.vary or {}).items():
             check_name(name, known, f"scene `{type(self.scene).__name__}` has no parameter `{name}`")
             if known[name]:
-                raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a "
-                    "parameter from which the scene makes that array")
+                raise ValueError(
+                    f"parameter `{name}` is an array; what varies must be one number: vary a "
+                    "parameter from which the scene makes that array"
+                )
             if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
                 raise ValueError(
                     f"parameter `{name}` is to vary as {described(how)}; set one value on the scene itself, "
@@ -108,14 +124,18 @@ class Study(Printed):
         groups = {group for names in (q, u) for group, _, _ in names.groups}
         constants = {}
         for name, how in (self.scene.example if self.start is None else self.start).items():
-            check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed "
-                f"`{name}` to start with")
+            check_name(
+                name,
+                (*q, *u, *groups),
+                f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with",
+            )
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
                 checked_real(how, f"start `{name}`", advice="give its value")
                 constants[name] = how
             elif name in groups:
-                raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its "
-                    "entries")
+                raise ValueError(
+                    f"start `{name}` is a vector; what varies must be one number: vary its entries"
+                )
             else:
                 varying[name + AT_START] = how
         return varying, constants
@@ -138,18 +158,31 @@ class Study(Printed):
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
-            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected=
-                "of at least 1, or None to store no trajectories")
+            keep_every = checked_whole(
+                keep_every,
+                "`keep_every`",
+                1,
+                MOST_SAMPLES,
+                expected="of at least 1, or None to store no trajectories",
+            )
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
-        if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
+        if (
+            isinstance(self._given, Model)
+            and self._given.formulation == build(self.scene, backend=options.backend).formulation
+        ):
             # as for the scene itself: a study may continue with another memory bound
             options = replace(options, formulation=None)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and keep_every is None and not any(output.over_times for output in known.values()):
             times = last[None]
-        if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
-            text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would omit the time between"
+        if times[0] != first and (
+            missed := [name for name, output in known.items() if isinstance(output, Integral)]
+        ):
+            text = (
+                f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}`"
+                " would omit the time between"
+            )
             raise ValueError(f"{text}; begin `ts` at the start of the motion")
         span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
         return Task(self.scene, self.design, self._constants, known, span, options, save, keep_every)
@@ -174,9 +207,10 @@ class Study(Printed):
 
         - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
           are evaluated (default: 201 equidistant ones; only the end if all outputs use only the end).
-        - `outputs`: name -> `jj.studies.End`, `jj.studies.Largest`, `jj.studies.Smallest`, `jj.studies.LargestMagnitude`, `jj.studies.Integral`,
-          `jj.studies.EventTime`, `jj.studies.Happened`, `jj.studies.Quantity`, or a function of a trajectory; default: the end values
-          of all coordinates and speeds. They are NaN for failed motions.
+        - `outputs`: name -> `jj.studies.End`, `jj.studies.Largest`, `jj.studies.Smallest`,
+          `jj.studies.LargestMagnitude`, `jj.studies.Integral`, `jj.studies.EventTime`, `jj.studies.Happened`,
+          `jj.studies.Quantity`, or a function of a trajectory; default: the end values of all coordinates and
+          speeds. They are NaN for failed motions.
         - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
           "statistics" stores only counts, sums and histograms.
         - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample (with save="statistics"
@@ -208,12 +242,22 @@ class Study(Printed):
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
         checked_whole(processes, "`processes`", 1, expected="of at least 1")
         if client is not None and processes != 1:
-            raise ValueError("`client` and `processes` are both given; give one of them: the workers of a "
-                "cluster, or processes of this machine")
+            raise ValueError(
+                "`client` and `processes` are both given; give one of them: the workers of a "
+                "cluster, or processes of this machine"
+            )
         here = client is None and processes == 1
         memory = self._given.memory if isinstance(self._given, Model) else None
-        task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
-        compute = partial(in_this_process, task) if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
+        task, chunk = bounded(
+            task, path, chunk, None if memory is None else of_each(memory, processes), here=here
+        )
+        compute = (
+            partial(in_this_process, task)
+            if here
+            else on_cluster(task, client)
+            if client is not None
+            else in_processes(task, processes)
+        )
         store = run(task, path, chunk=chunk, progress=progress, shard=shard, command=command, workers=compute)
         return StudyResult(store, task)
 
@@ -235,5 +279,9 @@ class Study(Printed):
         return mean_gradients(self.task(**what), tuple(parameters))
 
     def _text(self) -> str:
-        constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._constants.items())
-        return f"Study of {type(self.scene).__name__}\n{self.design}" + (f"\n  all start with {constants}" if constants else "")
+        constants = ", ".join(
+            f"{name} = {np.asarray(value).tolist()}" for name, value in self._constants.items()
+        )
+        return f"Study of {type(self.scene).__name__}\n{self.design}" + (
+            f"\n  all start with {constants}" if constants else ""
+        )

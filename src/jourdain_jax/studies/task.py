@@ -46,7 +46,9 @@ class Task:
     save: str
     keep_every: int | None  # interval of samples whose states at `ts` are stored; None: none
     # samples; equal in all processes. A GPU takes some ten thousand at once
-    largest_block: int = field(default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17)
+    largest_block: int = field(
+        default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17
+    )
     memory: int | None = None  # bytes allowed for each computing process
 
     @property
@@ -66,7 +68,10 @@ class Task:
     @property
     def bytes_of_kept_lane(self) -> float:
         """Return the stored bytes per sample, on average."""
-        return sum(np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every for column in self.columns().values())
+        return sum(
+            np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every
+            for column in self.columns().values()
+        )
 
     @property
     def stride(self) -> int:
@@ -79,15 +84,20 @@ class Task:
         return np.asarray(self.span["ts"])
 
     def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
-        """Return start values (including shared ones) and parameters, from the columns of the design by name.
-        """
-        starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
-        return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
+        """Return start values (including shared ones) and parameters, from the columns of the design by name."""
+        starts = {
+            name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)
+        }
+        return dict(self.constants) | starts, {
+            name: column for name, column in values.items() if not name.endswith(AT_START)
+        }
 
     def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
         """Return the outputs of one motion; NaN if it failed."""
         sound = motion.nan_if_failed()
-        return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in self.outputs.values()])
+        return jnp.stack(
+            [jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in self.outputs.values()]
+        )
 
     @property
     def settled(self) -> dict[str, Any]:
@@ -109,7 +119,11 @@ class Task:
             found.append((name, Column("float64", math.nan, attributes, every=every)))
 
         for name in self.design.names:
-            about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
+            about = (
+                f"start value of {name.removesuffix(AT_START)}"
+                if name.endswith(AT_START)
+                else f"parameter {name}"
+            )
             number(name, about, units.get(name, ""), role="varied")
         for name, (_, dtype, fill, attributes) in OF_LANES.items():
             events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}
@@ -133,7 +147,15 @@ class Task:
         return {
             "scene": digest((type(self.scene), self.scene)),
             "start": digest(dict(self.constants)),
-            "design": digest((dict(self.design.variables), self.design.sampler, len(self.design), self.design.seed, self.design.correlation)),
+            "design": digest(
+                (
+                    dict(self.design.variables),
+                    self.design.sampler,
+                    len(self.design),
+                    self.design.seed,
+                    self.design.correlation,
+                )
+            ),
             "outputs": digest(dict(self.outputs)),
             "options": digest(dict(sorted(self.settled.items()))),
             "save": digest((self.save, self.keep_every)),

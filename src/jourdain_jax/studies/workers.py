@@ -35,15 +35,24 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
     """Return the workers of `run`. Raises ValueError if the task cannot be sent to another process."""
     sent = sent_to_others(task)
 
-    def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+    def workers(
+        store: Store, numbers: list[int], interrupted: Callable[[], bool]
+    ) -> Iterator[tuple[int, int]]:
         def compute(numbers: list[int], alone: bool):
             context, most = get_context("spawn"), 1 if alone else count
             begun, places = context.Event(), context.Queue()
             for place in range(most):
                 places.put((place, most))
-            with ProcessPoolExecutor(most, mp_context=context, initializer=_begin, initargs=(sent, places, begun)) as pool:
+            with ProcessPoolExecutor(
+                most, mp_context=context, initializer=_begin, initargs=(sent, places, begun)
+            ) as pool:
                 died = yield from computed(
-                    lambda number: pool.submit(chunk, number, sent, str(store.path)), BrokenProcessPool, store, numbers, interrupted, most
+                    lambda number: pool.submit(chunk, number, sent, str(store.path)),
+                    BrokenProcessPool,
+                    store,
+                    numbers,
+                    interrupted,
+                    most,
                 )
                 if died and not begun.is_set():
                     raise RuntimeError(_NONE_BEGAN)
@@ -68,7 +77,9 @@ def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
         return receipt.lanes if receipt else runner.run(number)
 
 
-def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
+def whatever_dies(
+    store: Store, numbers, interrupted, compute: Callable, attempts: int
+) -> Iterator[tuple[int, int]]:
     """Yield the counts of the chunks `numbers`, computed even if processes die. Chunks on which they die
     repeatedly are omitted with a warning.
 
@@ -113,11 +124,16 @@ def sent_to_others(task: Task) -> bytes:
     try:
         return pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        text = "define scene and outputs at the top level of a module, not as lambdas or inside functions, or take processes=1 and no `client`"
+        text = (
+            "define scene and outputs at the top level of a module, not as lambdas or inside functions, or"
+            " take processes=1 and no `client`"
+        )
         raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
 
 
-def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
+def computed(
+    submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int
+) -> Generator[tuple[int, int], None, list[int]]:
     """Yield the numbers of samples and of failed ones of chunks as they finish, at most `most` of them at
     once. Return the indices of chunks on which a process died.
 
@@ -127,7 +143,12 @@ def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted
     running: dict[Any, int] = {}
     died: list[int] = []
     while True:
-        while not died and len(running) < most and not interrupted() and (number := next(left, None)) is not None:
+        while (
+            not died
+            and len(running) < most
+            and not interrupted()
+            and (number := next(left, None)) is not None
+        ):
             try:
                 running[submit(number)] = number
             except deadly:  # a pool with a dead process
@@ -161,7 +182,11 @@ def keep_to_share(place: int, count: int) -> None:
     """Bind this thread, and all threads that it starts, to the cores of process `place` of `count`. Call it
     before JAX starts its threads, one per core.
     """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    cores = (
+        sorted(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else list(range(os.cpu_count() or 1))
+    )
     own = cores[place::count] or cores
     os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
     with contextlib.suppress(AttributeError, OSError):  # not every system supports this

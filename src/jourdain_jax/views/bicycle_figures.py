@@ -2,7 +2,6 @@
 space.
 """
 
-
 import numpy as np
 
 from jourdain_jax.bicycle.job import Study
@@ -21,20 +20,35 @@ def draw_eigenvalues(study: Study, path: FilePath) -> None:
     quantiles of the samples, also for the weave and capsize speeds. The stable range is green.
     """
     plt = pyplot()
-    figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")
+    figure, (real, imaginary) = plt.subplots(
+        2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained"
+    )
     nominal, samples = study.eigenvalues[0], study.eigenvalues[1:][study.physical]
     for name, columns, colour in _MODES:
         for column in columns:
-            _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, name if column == columns[0] else None)
-    _band(imaginary, study.grid, np.abs(nominal[:, 2].imag), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
+            _band(
+                real,
+                study.grid,
+                nominal[:, column].real,
+                samples[:, :, column].real,
+                colour,
+                name if column == columns[0] else None,
+            )
+    _band(
+        imaginary, study.grid, np.abs(nominal[:, 2].imag), np.abs(samples[:, :, 2].imag), "tab:blue", "weave"
+    )
     _mark_range(study, (real, imaginary))
     real.axhline(0.0, color="0.3", lw=0.8)
     real.set(ylim=(-_CEILING, _CEILING), ylabel="real part in 1/s")
-    imaginary.set(ylabel="imaginary part in rad/s",
-        xlabel="forward speed in m/s", xlim=(study.grid[0], study.grid[-1]))
+    imaginary.set(
+        ylabel="imaginary part in rad/s", xlabel="forward speed in m/s", xlim=(study.grid[0], study.grid[-1])
+    )
     imaginary.set_ylim(bottom=0.0)
-    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands (grey for the speeds) "
-        f"contain 95 % of {len(samples)} samples", fontsize=10)
+    real.set_title(
+        f"{study.bicycle.name}: eigenvalues of upright running; bands (grey for the speeds) "
+        f"contain 95 % of {len(samples)} samples",
+        fontsize=10,
+    )
     real.legend(loc="lower right", fontsize=9)
     for axis in (real, imaginary):
         axis.grid(alpha=0.3)
@@ -51,7 +65,10 @@ def _band(axis, speed, nominal, samples, colour, name) -> None:
 
 def _mark_range(study: Study, axes) -> None:
     """Mark the stable range in green and the weave and capsize speeds with their confidence limits."""
-    speeds = {name: study.speeds[f"{name}_speed"] or {"value": np.inf, "low": None, "high": None} for name in ("weave", "capsize")}
+    speeds = {
+        name: study.speeds[f"{name}_speed"] or {"value": np.inf, "low": None, "high": None}
+        for name in ("weave", "capsize")
+    }
     weave, last = speeds["weave"]["value"], study.grid[-1]
     end = speeds["capsize"]["value"] if speeds["capsize"]["value"] > weave else last
     spans = [(weave, min(end, last), {"color": "tab:green", "alpha": 0.08})] if weave < np.inf else []
@@ -65,7 +82,15 @@ def _mark_range(study: Study, axes) -> None:
             axis.axvline(value, color="0.4", lw=0.8, ls="--")
         side, beside = ("right", -8) if name == "weave" else ("left", 8)
         text = f"{name} speed\n{value:.2f} m/s{limits}"
-        axes[0].annotate(text, (value, _CEILING), xytext=(beside, -6), textcoords="offset points", ha=side, va="top", fontsize=9)
+        axes[0].annotate(
+            text,
+            (value, _CEILING),
+            xytext=(beside, -6),
+            textcoords="offset points",
+            ha=side,
+            va="top",
+            fontsize=9,
+        )
     for axis in axes:
         for low, high, paint in spans:
             axis.axvspan(low, high, lw=0, **paint)
@@ -78,14 +103,18 @@ def draw_rides(study: Study, path: FilePath) -> None:
     labels = [f"{speed:.2f} m/s, {label}" for label, speed in zip(rides.labels, rides.speeds, strict=True)]
     title = f"{study.bicycle.name}: hands-free after a kick in lean rate"
     figure, panels = pyplot().subplots(2, 1, sharex=True, figsize=(7.5, 5.5), layout="constrained")
-    plot(lanes, "lean", "steer", units={"lean": "deg", "steer": "deg"}, labels=labels, title=title, axes=panels)
+    plot(
+        lanes, "lean", "steer", units={"lean": "deg", "steer": "deg"}, labels=labels, title=title, axes=panels
+    )
     for panel, name in zip(panels, ("lean", "steer"), strict=True):
         panel.set_ylabel(f"{name} to the right in degrees")
     for lane in lanes:
         if np.isnan(np.asarray(lane["lean"])[-1]):
             end = float(lane.t_end), np.degrees(float(lane.q_end[3]))
             panels[0].plot(*end, "kx")
-            panels[0].annotate(lane.event_names[int(lane.event)], end, xytext=(6, -4), textcoords="offset points", fontsize=9)
+            panels[0].annotate(
+                lane.event_names[int(lane.event)], end, xytext=(6, -4), textcoords="offset points", fontsize=9
+            )
     figure.savefig(path, dpi=150)
     pyplot().close(figure)
 
@@ -94,5 +123,10 @@ def animate_ride(study: Study, path: FilePath) -> None:
     """Animate the first ride (below the stable range), with the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)
-    animate(lane, path, follow=True, paths=[],
-        title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}")
+    animate(
+        lane,
+        path,
+        follow=True,
+        paths=[],
+        title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}",
+    )

@@ -26,7 +26,9 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
         if _moves(contact):
             continue
         ground = _ground(trajectory, drawn, name, contact, low, high)
-        numbers = [ground["triangles"]] if ground["kind"] == "mesh" else [ground["origin"], ground["axes"][:, 2]]
+        numbers = (
+            [ground["triangles"]] if ground["kind"] == "mesh" else [ground["origin"], ground["axes"][:, 2]]
+        )
         # draw the same ground once for all its contacts
         found.setdefault(b"".join((np.round(x, 9) + 0.0).tobytes() for x in numbers), ground)
     return [*found.values()] or [_plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)]
@@ -35,23 +37,38 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
 def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
     ground = contact.ground
     if isinstance(ground, Sphere):  # if bodies are inside the sphere, draw only its lower half
-        profile = float(ground.radius[0]) * arc(np.pi / 2 if ground.side == "inside" else np.pi, _CELLS // 2 + 1)
+        profile = float(ground.radius[0]) * arc(
+            np.pi / 2 if ground.side == "inside" else np.pi, _CELLS // 2 + 1
+        )
         return _mesh(revolved(profile, _CELLS) + np.asarray(ground.origin)[0])
     if isinstance(ground, Cylinder):
         axis, origin = np.asarray(ground.axis)[0], np.asarray(ground.origin)[0]
         corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1)), axis=-1)
         along, radius = (corners - origin) @ axis, float(ground.radius[0])
-        return _mesh(revolved(np.array([[radius, along.min()], [radius, along.max()]]), 2 * _CELLS) @ onto_axis(axis).T + origin)
+        return _mesh(
+            revolved(np.array([[radius, along.min()], [radius, along.max()]]), 2 * _CELLS) @ onto_axis(axis).T
+            + origin
+        )
     if isinstance(ground, Curved):
         return _surface(trajectory, drawn, name, contact, low, high)
     plane = contact.plane
-    return _plane(np.asarray(plane.origin)[0], np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1), low, high)
+    return _plane(
+        np.asarray(plane.origin)[0],
+        np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1),
+        low,
+        high,
+    )
 
 
 def _moves(contact: Contact) -> bool:
     """Return whether the contact plane moves."""
-    normals, offsets = np.asarray(contact.plane.normal), np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1)
-    return isinstance(contact.ground, Plane | None) and bool(np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max()))
+    normals, offsets = (
+        np.asarray(contact.plane.normal),
+        np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1),
+    )
+    return isinstance(contact.ground, Plane | None) and bool(
+        np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max())
+    )
 
 
 def _plane(origin, axes, low, high) -> dict:
@@ -69,8 +86,7 @@ def floor_under(low, high) -> float:
 
 
 def _mesh(grid: np.ndarray) -> dict:
-    """Return the triangles between neighbouring points of a grid, without triangles that have a NaN corner.
-    """
+    """Return the triangles between neighbouring points of a grid, without triangles that have a NaN corner."""
     triangles = quads(grid)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
     return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))]}
 
@@ -78,7 +94,9 @@ def _mesh(grid: np.ndarray) -> dict:
 def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
     """Return a surface or height map over the box plus a margin at the first time."""
     margin = 0.15 * max(high - low)
-    x, y = np.meshgrid(*(np.linspace(low[k] - margin, high[k] + margin, _CELLS + 1) for k in range(2)), indexing="ij")
+    x, y = np.meshgrid(
+        *(np.linspace(low[k] - margin, high[k] + margin, _CELLS + 1) for k in range(2)), indexing="ij"
+    )
     k, from_height = drawn.reached[0], float(np.asarray(contact.point)[0, 2])
 
     def heights(scene, t, q, x, y):
@@ -97,5 +115,7 @@ def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, 
 
         return jax.vmap(height)(x, y)
 
-    z = np.asarray(jax.jit(heights)(trajectory.scene, trajectory.ts[k], trajectory.q[k], x.ravel(), y.ravel())).reshape(x.shape)
+    z = np.asarray(
+        jax.jit(heights)(trajectory.scene, trajectory.ts[k], trajectory.q[k], x.ravel(), y.ravel())
+    ).reshape(x.shape)
     return _mesh(np.stack([x, y, z], axis=-1))

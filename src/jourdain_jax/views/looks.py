@@ -22,7 +22,18 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import contacts_of, visuals_of
 from jourdain_jax.scene.visuals import Visual
 
-PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+PALETTE = (
+    "#1f77b4",
+    "#ff7f0e",
+    "#2ca02c",
+    "#d62728",
+    "#9467bd",
+    "#8c564b",
+    "#e377c2",
+    "#7f7f7f",
+    "#bcbd22",
+    "#17becf",
+)
 PLAIN = "#8a8a86"  # colour of visuals that belong to no body
 
 
@@ -39,8 +50,14 @@ class DrawnBody:
 
     def extents(self) -> np.ndarray:
         """Return points (times, points, 3) in space, m, whose bounding box contains the body."""
-        local = [np.broadcast_to(points, (len(self.positions), *points.shape[-2:])) for points in map(_corners_of, self.looks)]
-        return np.einsum("tij,tpj->tpi", self.orientations, np.concatenate(local, axis=1)) + self.positions[:, None]
+        local = [
+            np.broadcast_to(points, (len(self.positions), *points.shape[-2:]))
+            for points in map(_corners_of, self.looks)
+        ]
+        return (
+            np.einsum("tij,tpj->tpi", self.orientations, np.concatenate(local, axis=1))
+            + self.positions[:, None]
+        )
 
 
 @dataclass(frozen=True)
@@ -56,7 +73,12 @@ class Drawn:
     @property
     def size(self) -> float:
         """Return the longest side (m) of the bounding box of all bodies at the first time."""
-        return float(max(np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(), 1e-3))
+        return float(
+            max(
+                np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(),
+                1e-3,
+            )
+        )
 
     @property
     def thin(self) -> float:
@@ -71,16 +93,21 @@ def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
         raise ValueError(
-            f"the motion reached none of its saved times, so there is nothing to {what}; pass earlier `ts`")
+            f"the motion reached none of its saved times, so there is nothing to {what}; pass earlier `ts`"
+        )
     if most is not None and most < reached.size:
         reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
-    return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))
+    return _drawn(
+        np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached)
+    )
 
 
 def looks_at(scene: Scene, state: State) -> Drawn:
     """Return the drawing of one state, without compilation."""
     seen = eager_if_concrete(_seen)(scene, state.t, state.q, state.u, None)
-    return _drawn(np.asarray(state.t)[None], np.zeros(1, int), jax.tree.map(lambda x: np.asarray(x)[None], seen))
+    return _drawn(
+        np.asarray(state.t)[None], np.zeros(1, int), jax.tree.map(lambda x: np.asarray(x)[None], seen)
+    )
 
 
 def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
@@ -93,13 +120,19 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     sized = any(isinstance(body, RigidBody) or name in stated for name, body in first.items())
     for name, body in first.items():
         if name not in stated:
-            shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
-            at_all = lambda x: np.broadcast_to(x, (len(reached), *np.shape(x)))  # noqa: E731
+            shapes = [
+                _at(contact.shape, 0)
+                for contact in contacts.values()
+                if contact.body == name and contact.shape is not None
+            ]
+            at_all = lambda x: np.broadcast_to(x, (len(reached), *np.shape(x)))
             stated[name] = [jax.tree.map(at_all, look) for look in guessed(body, shapes, dot)]
     drawn, upright = {}, np.broadcast_to(np.eye(3), (len(reached), 3, 3))
     for k, (name, body) in enumerate(bodies.items()):
         turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else upright
-        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], stated[name])
+        drawn[name] = DrawnBody(
+            name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], stated[name]
+        )
     if stated.get(""):
         still = np.zeros((len(reached), 3))
         drawn[""] = DrawnBody("", PLAIN, still, upright, still, stated[""])
@@ -114,7 +147,12 @@ def _seen(scene, t, q, u, inputs):
         if isinstance(contact.ground, Surface | HeightMap):
             contacts[name] = eqx.tree_at(lambda c: c.ground, contact, Curved())
     bodies = {name: found.body for name, found in motion.bodies.items()}
-    return bodies, {name: found.angular_velocity for name, found in motion.bodies.items()}, visuals_of(scene, pose), contacts
+    return (
+        bodies,
+        {name: found.angular_velocity for name, found in motion.bodies.items()},
+        visuals_of(scene, pose),
+        contacts,
+    )
 
 
 class Curved(eqx.Module):
@@ -174,7 +212,9 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
         return [Visual.ellipsoid(shape.semi_axes, at=at, turn=to_body @ np.asarray(shape.orientation))]
     assert isinstance(shape, Wheel)
     width = 0.1 * shape.radius if shape.tyre is None else 2 * shape.tyre
-    return [Visual.wheel(shape.radius, width, axis="z", at=at, turn=onto_axis(to_body @ np.asarray(shape.axle)))]
+    return [
+        Visual.wheel(shape.radius, width, axis="z", at=at, turn=onto_axis(to_body @ np.asarray(shape.axle)))
+    ]
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:

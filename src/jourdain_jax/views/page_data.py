@@ -51,21 +51,29 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
     """Return the description of the page and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
-    everywhere = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
+    everywhere = np.concatenate(
+        [body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()]
+    )
     near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), everywhere))
     size, reach = (float(np.ptp(box, axis=0).max()) for box in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
     # follow by default if the motion spans more than five times the size of its bodies
-    follow = first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
+    follow = (
+        first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
+    )
     shown = size if follow else max(size, reach / 3)
     arrows, longest = _arrows(motions, drawn, shown) if display.forces else ([[] for _ in drawn], "")
     power = 10.0 ** np.floor(np.log10(shown / 4))
     tile = float(power * max(k for k in (1, 2, 5) if k * power <= shown / 4 * (1 + 1e-9)))
     grounds = grounds_of(motions[0], first, *far)
-    squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
+    squares = (
+        f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
+    )
     page = {
         "title": display.title,
-        "names": [{"name": name, "colour": display.colours.get(name, colour)} for name, colour in colours.items()],
+        "names": [
+            {"name": name, "colour": display.colours.get(name, colour)} for name, colour in colours.items()
+        ],
         "note": "; ".join(note for note in (squares, longest) if note),
         "span": [float(first.ts[0]), float(first.ts[-1])],
         "motions": [_motion(numbers, *one, display) for one in zip(motions, drawn, arrows, strict=True)],
@@ -87,7 +95,9 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
 def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, display: Display) -> dict:
     colour = {name: display.colours.get(name, body.colour) for name, body in drawn.bodies.items()}
     if display.paths is not None:
-        paths = [(name, np.asarray(motion.point(name, local))[drawn.reached]) for name, local in display.paths]
+        paths = [
+            (name, np.asarray(motion.point(name, local))[drawn.reached]) for name, local in display.paths
+        ]
     elif drawn.contacts:
         paths = [(contact.body, np.asarray(contact.point)) for contact in drawn.contacts.values()]
     else:
@@ -96,7 +106,10 @@ def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, di
         "ts": numbers.add(drawn.ts),
         "bodies": [_body(numbers, body, drawn, colour[name]) for name, body in drawn.bodies.items()],
         "paths": [{"colour": colour[name], "points": numbers.add(points)} for name, points in paths],
-        "forces": [{"name": name, "points": numbers.add(points), "vectors": numbers.add(vectors)} for name, points, vectors in arrows],
+        "forces": [
+            {"name": name, "points": numbers.add(points), "vectors": numbers.add(vectors)}
+            for name, points, vectors in arrows
+        ],
     }
 
 
@@ -116,16 +129,30 @@ def _shape(numbers: Numbers, visual: Visual, colour: str, thin: float) -> dict:
     shape: dict = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity}
     size = np.asarray(visual.size)
     if visual.kind == "line":
-        return shape | {"size": [], "count": size.shape[1], "points": numbers.add(_still(size)), "radius": radius_of(visual) or thin}
+        return shape | {
+            "size": [],
+            "count": size.shape[1],
+            "points": numbers.add(_still(size)),
+            "radius": radius_of(visual) or thin,
+        }
     if visual.kind == "mesh":
         shape["mesh"] = numbers.add(size[0] * triangles_of(visual)[:, :3])
     places, turns = np.asarray(visual.position), quaternions_of(np.asarray(visual.orientation))
-    return shape | {"p": numbers.add(_still(places)), "q": numbers.add(_still(turns)), "turns": [0], "size": size[0].ravel().tolist()}
+    return shape | {
+        "p": numbers.add(_still(places)),
+        "q": numbers.add(_still(turns)),
+        "turns": [0],
+        "size": size[0].ravel().tolist(),
+    }
 
 
 def _ground(numbers: Numbers, ground: dict) -> dict:
     if ground["kind"] == "plane":
-        return {"kind": "plane", "p": ground["origin"].tolist(), "q": quaternions_of(ground["axes"][None])[0].tolist()}
+        return {
+            "kind": "plane",
+            "p": ground["origin"].tolist(),
+            "q": quaternions_of(ground["axes"][None])[0].tolist(),
+        }
     return {"kind": "mesh", "size": [], "mesh": numbers.add(ground["triangles"])}
 
 
@@ -163,7 +190,9 @@ def _still(values: np.ndarray) -> np.ndarray:
 
 def _at_rest(drawn: Drawn) -> bool:
     """Return whether the scene has fixed visuals in the inertial frame, such as a table."""
-    return "" in drawn.bodies and any(len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks)
+    return "" in drawn.bodies and any(
+        len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks
+    )
 
 
 def _moves(body: DrawnBody) -> bool:
@@ -177,8 +206,12 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
     points = []
     for one in drawn:
         moving = [body for name, body in one.bodies.items() if name and _moves(body)]
-        middle = np.mean([body.positions for body in moving], axis=0) if moving else np.zeros((len(one.ts), 3))
-        points += [(body.extents() - middle[:, None]).reshape(-1, 3) for body in moving or one.bodies.values()]
+        middle = (
+            np.mean([body.positions for body in moving], axis=0) if moving else np.zeros((len(one.ts), 3))
+        )
+        points += [
+            (body.extents() - middle[:, None]).reshape(-1, 3) for body in moving or one.bodies.values()
+        ]
     return np.concatenate(points)
 
 
@@ -194,18 +227,31 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
         own = []
         for name, force in (motion.contact_forces() if one.contacts else {}).items():
             contact = one.contacts[name]
-            normal, tangential = np.asarray(force.normal)[one.reached], np.asarray(force.tangential)[one.reached]
-            vectors = normal[:, None] * np.asarray(contact.plane.normal) + np.einsum("tk,tkj->tj", tangential, np.asarray(contact.plane.tangents))
+            normal, tangential = (
+                np.asarray(force.normal)[one.reached],
+                np.asarray(force.tangential)[one.reached],
+            )
+            vectors = normal[:, None] * np.asarray(contact.plane.normal) + np.einsum(
+                "tk,tkj->tj", tangential, np.asarray(contact.plane.tangents)
+            )
             own.append((name, np.asarray(contact.point), np.where(np.isfinite(vectors), vectors, 0.0)))
         found.append(own)
-    sizes = np.concatenate([np.zeros(1), *(np.linalg.norm(vectors, axis=1) for own in found for _, _, vectors in own)])
+    sizes = np.concatenate(
+        [np.zeros(1), *(np.linalg.norm(vectors, axis=1) for own in found for _, _, vectors in own)]
+    )
     strongest = float(sizes.max())
     usual = 2.0 * float(np.quantile(sizes[1:], 0.9)) if strongest else 0.0
     longest = usual if 0.0 < 2.0 * usual <= strongest else strongest
-    told = f"longest arrow: {longest:.3g} N" + (
-        f" and more, up to {strongest:.3g} N" if longest < strongest else "") if strongest else ""
+    told = (
+        f"longest arrow: {longest:.3g} N"
+        + (f" and more, up to {strongest:.3g} N" if longest < strongest else "")
+        if strongest
+        else ""
+    )
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
-        return 0.4 * size * vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest or 1.0)
+        return (
+            0.4 * size * vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest or 1.0)
+        )
 
     return [[(name, points, scaled(vectors)) for name, points, vectors in own] for own in found], told

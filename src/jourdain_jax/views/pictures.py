@@ -55,7 +55,9 @@ def animate(
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     drawn = looks_of(trajectory, "animate", frames)
-    traces = _traces(trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths)
+    traces = _traces(
+        trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths
+    )
     bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
     boxes = np.stack([box_of(faces[:1]) for faces in bodies])
     whole = box_of([*boxes, *traces])
@@ -75,7 +77,9 @@ def animate(
         return [clock]
 
     count, seconds = len(drawn.ts), float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
-    FuncAnimation(figure, draw_frame, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
+    FuncAnimation(figure, draw_frame, frames=count, blit=False).save(
+        path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80
+    )
     plt.close(figure)
 
 
@@ -99,12 +103,24 @@ def draw_still(
     """
     _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
     if isinstance(view, str) and view not in VIEWS:
-        raise ValueError(f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
-            "or elevation and azimuth in degrees")
+        raise ValueError(
+            f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
+            "or elevation and azimuth in degrees"
+        )
     plt, drawn = pyplot(), looks_of(trajectory)
-    wanted = np.asarray(at, float) if not isinstance(at, int) else np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
+    wanted = (
+        np.asarray(at, float)
+        if not isinstance(at, int)
+        else np.linspace(drawn.ts[0], drawn.ts[-1], at)
+        if at > 1
+        else drawn.ts[-1:]
+    )
     chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
-    traces = _traces(trajectory, drawn, [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths)
+    traces = _traces(
+        trajectory,
+        drawn,
+        [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths,
+    )
     strengths = np.linspace(1.0, 0.35, len(chosen))[::-1]
     faces, colours = zip(*map(painted, [drawn] * len(chosen), chosen, strengths), strict=True)
     figure = plt.figure(figsize=(6.4, 4.2), dpi=100)
@@ -126,13 +142,17 @@ def scene_picture(scene) -> str:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
     except Exception:  # user methods may raise anything, and the parameters may be traced
         return ""
-    return figure_in_html(lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200)
+    return figure_in_html(
+        lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200
+    )
 
 
 def _check_one(trajectory, where: str, example: str) -> None:
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
-        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a "
-            f"rollout pass one lane: {example}")
+        raise ValueError(
+            f"{where} was given {described(trajectory)}, expected one motion; for a "
+            f"rollout pass one lane: {example}"
+        )
 
 
 def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:

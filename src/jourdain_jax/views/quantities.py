@@ -1,5 +1,4 @@
-"""Plots of named quantities over time, with quantile bands for rollouts, and of families against a parameter.
-"""
+"""Plots of named quantities over time, with quantile bands for rollouts, and of families against a parameter."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -20,8 +19,26 @@ from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 UNITS = {  # size in SI units, by kind of quantity
     "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
-    "coordinate": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi},
-    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "rad/s": 1.0, "deg/s": np.pi / 180, "turn/s": 2 * np.pi, "rpm": np.pi / 30},
+    "coordinate": {
+        "m": 1.0,
+        "km": 1e3,
+        "cm": 1e-2,
+        "mm": 1e-3,
+        "rad": 1.0,
+        "mrad": 1e-3,
+        "deg": np.pi / 180,
+        "turn": 2 * np.pi,
+    },
+    "speed": {
+        "m/s": 1.0,
+        "km/h": 1 / 3.6,
+        "cm/s": 1e-2,
+        "mm/s": 1e-3,
+        "rad/s": 1.0,
+        "deg/s": np.pi / 180,
+        "turn/s": 2 * np.pi,
+        "rpm": np.pi / 30,
+    },
     "energy": {"J": 1.0, "kJ": 1e3, "mJ": 1e-3},
 }
 
@@ -32,8 +49,10 @@ def check_format(path: FilePath) -> None:
     check_place(path)
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
-        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file; matplotlib cannot "
-            f"write `{suffix or 'file without suffix'}`")
+        raise ValueError(
+            f"cannot write `{path}`: a plot is a .png, .svg or .pdf file; matplotlib cannot "
+            f"write `{suffix or 'file without suffix'}`"
+        )
 
 
 @of_known_numbers
@@ -77,14 +96,18 @@ def plot(
         figure, axes = _plot_family(motion, names, units, title, axes)
     else:
         motions = _checked_motions(motion)
-        figure, axes = _plot_motions(motions, names, units, _checked_labels(labels, len(motions)), _checked_bands(bands), title, axes)
+        figure, axes = _plot_motions(
+            motions, names, units, _checked_labels(labels, len(motions)), _checked_bands(bands), title, axes
+        )
     if path is not None:
         figure.savefig(path, dpi=150)
         pyplot().close(figure)
     return figure, axes
 
 
-def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands: list[float], title: str | None, axes):
+def _plot_motions(
+    motions: list, names: Labels, units, labels: list[str], bands: list[float], title: str | None, axes
+):
     scenes = [_scene(one) for one in motions]
     names = names or scenes[0].coordinate_names.entries
     values = [[_values(one, name, bands) for name in names] for one in motions]
@@ -105,7 +128,10 @@ def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands:
     handles, texts = axes[0].get_legend_handles_labels()
     # legend above all panels of a new figure: one column per motion, or per entry for a single motion
     if texts:
-        row: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(motions) if len(motions) > 1 else len(texts), 4)}
+        row: dict[str, Any] = {
+            "loc": "outside upper left",
+            "ncols": min(len(motions) if len(motions) > 1 else len(texts), 4),
+        }
         (axes[0].figure if own else axes[0]).legend(handles, texts, fontsize="small", **(row if own else {}))
     return axes[0].figure, axes
 
@@ -113,21 +139,35 @@ def _plot_motions(motions: list, names: Labels, units, labels: list[str], bands:
 def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
     """Draw every further name against the first: stable parts solid, others dashed, special points marked."""
     if len(names) < 2:
-        raise ValueError("`plot` of a family needs a name for the horizontal axis and at least one for the "
-            f"vertical axis, got {len(names)} names")
+        raise ValueError(
+            "`plot` of a family needs a name for the horizontal axis and at least one for the "
+            f"vertical axis, got {len(names)} names"
+        )
     scene = family.equations.scene
     sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
     label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
     axes = _panels(axes, names[1:], 2.4)
-    marks = {"fold": ("d", family.folds), "branch point": ("s", family.branches), "eigenvalues meet or cross": (".", family.changes)}
+    marks = {
+        "fold": ("d", family.folds),
+        "branch point": ("s", family.branches),
+        "eigenvalues meet or cross": (".", family.changes),
+    }
     x = family[names[0]] / sizes[names[0]][1]
     for axis, name in zip(axes, names[1:], strict=True):
         y = family[name] / sizes[name][1]
         axis.plot(x, y, "C0--", lw=1.0, label=None if family.stable.all() else "unstable")
-        axis.plot(x, np.where(family.stable, y, np.nan), "C0-", lw=2.0, label="stable" if family.stable.any() else None)
+        axis.plot(
+            x,
+            np.where(family.stable, y, np.nan),
+            "C0-",
+            lw=2.0,
+            label="stable" if family.stable.any() else None,
+        )
         for kind, (mark, points) in marks.items():
             xy = [[point[k] / sizes[k][1] for point in points] for k in (names[0], name)]
-            axis.plot(*xy, f"k{mark}", label=kind if points else None, ms=6, mfc="white" if mark == "d" else "black")
+            axis.plot(
+                *xy, f"k{mark}", label=kind if points else None, ms=6, mfc="white" if mark == "d" else "black"
+            )
         axis.set_ylabel(label[name])
     axes[-1].set_xlabel(label[names[0]])
     axes[0].legend(fontsize="x-small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
@@ -139,11 +179,14 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
     """Return one panel per name in a column, or the user's axes if given."""
     if axes is None:
         size = 7.0, 1.2 + height * len(names)
-        axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
+        axes = pyplot().subplots(
+            len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained"
+        )[1][:, 0]
     axes = np.atleast_1d(axes)
     if len(axes) != len(names):
         raise ValueError(
-            f"`axes` holds {len(axes)} axes for {len(names)} names; pass one for each of {', '.join(names)}")
+            f"`axes` holds {len(axes)} axes for {len(names)} names; pass one for each of {', '.join(names)}"
+        )
     for axis in axes:
         axis.grid(alpha=0.3)
     return axes
@@ -154,7 +197,12 @@ def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
     unsuitable unit.
     """
     check_kind(units, Mapping | None, "`units`", 'a dictionary from names to units, such as {"lean": "deg"}')
-    kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
+    kinds = {
+        name: kind
+        for scene in scenes
+        for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names))
+        for name in of.entries
+    }
     kinds |= dict.fromkeys(ENERGIES, "energy") | {"t": "time"}
     found = {"t": ("s", 1.0)}
     for name, unit in (units or {}).items():
@@ -171,8 +219,9 @@ def _checked_motions(given) -> list[Trajectory | Rollout]:
     for k, one in enumerate(motions):
         if not isinstance(one, Rollout | Trajectory):
             where = f" in place {k}" if several else ""
-            raise ValueError(f"`plot` was given {described(one)}{where}, expected a motion from "
-                "`jj.simulate` or a rollout")
+            raise ValueError(
+                f"`plot` was given {described(one)}{where}, expected a motion from `jj.simulate` or a rollout"
+            )
     if not motions:
         raise ValueError("`plot` was given an empty list, expected motions from `jj.simulate` or rollouts")
     return motions
@@ -200,16 +249,19 @@ def _scene(motion: Trajectory | Rollout):
     return motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
 
 
-def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """Draw a line, or for a rollout the bands (widest and palest first) and the median. `y`: from `_values`.
-    """
+def _draw(
+    axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str
+) -> None:
+    """Draw a line, or for a rollout the bands (widest and palest first) and the median. `y`: from `_values`."""
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
     if many:
         named = f"{label}, " if label else ""
         for k, part in reversed(list(enumerate(bands))):
             band = f"{named}{100 * part:.3g} % of lanes"
-            axis.fill_between(ts, y[2 * k], y[2 * k + 1], color=colour, alpha=0.2 if k else 0.4, lw=0, label=band)
+            axis.fill_between(
+                ts, y[2 * k], y[2 * k + 1], color=colour, alpha=0.2 if k else 0.4, lw=0, label=band
+            )
         y, label = y[-1], f"{named}median"
     axis.plot(ts, y, color=colour, lw=1.5, label=label)
 
@@ -220,8 +272,16 @@ def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> 
     valid = (*scene.coordinate_names, *scene.speed_names, *(() if many else ENERGIES))
     check_name(name, valid, f"`{name}` cannot be plotted", UnknownNameError)
     if isinstance(motion, Rollout):
-        return motion.quantiles(name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5])
+        return motion.quantiles(
+            name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5]
+        )
     if name in ENERGIES:
         energies = motion.energies()
-        return np.asarray({"energy": energies.kinetic + energies.potential, "kinetic energy": energies.kinetic, "potential energy": energies.potential}[name])
+        return np.asarray(
+            {
+                "energy": energies.kinetic + energies.potential,
+                "kinetic energy": energies.kinetic,
+                "potential energy": energies.potential,
+            }[name]
+        )
     return np.asarray(motion[name])

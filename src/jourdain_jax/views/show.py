@@ -37,14 +37,22 @@ class View:
 
     def _repr_html_(self) -> str:
         page = html.escape(self.html, quote=True)
-        return f'<iframe srcdoc="{page}" title="{html.escape(self.title)}" style="width:100%;height:{self.height}px;border:1px solid #ddd"></iframe>'
+        return (
+            f'<iframe srcdoc="{page}" title="{html.escape(self.title)}"'
+            f' style="width:100%;height:{self.height}px;border:1px solid #ddd"></iframe>'
+        )
 
     def __repr__(self) -> str:
-        return f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; a notebook displays it, .save('view.html') writes it to a file"
+        return (
+            f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; a notebook displays it,"
+            " .save('view.html') writes it to a file"
+        )
 
 
 @of_known_numbers
-def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath | None = None, **how: Any) -> View:
+def show(
+    motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath | None = None, **how: Any
+) -> View:
     """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
     - `motion`: from `jj.simulate`; or a list of motions, or a rollout (at most 12 samples, evenly spaced),
@@ -69,12 +77,16 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: FilePath |
     if path is not None:
         _check_suffix(path)
     motions = _motions(motion)
-    display = Display(**{"title": type(motions[0].scene).__name__} | {name: value for name, value in how.items() if value is not None})
+    display = Display(
+        **{"title": type(motions[0].scene).__name__}
+        | {name: value for name, value in how.items() if value is not None}
+    )
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
     check_names(display.colours, names, "`colours` names `{}`, which is not a body")
     if np.shape(display.view) != (2,):
         raise ValueError(
-            f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
+            f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)"
+        )
     description, numbers = page_data(motions, display)
     shown = View(_page(display.title, description, numbers.bytes()), display.title, display.height)
     if path is not None:
@@ -92,8 +104,10 @@ def _motions(given) -> list[Trajectory]:
         return [given]
     if isinstance(given, list | tuple) and given:
         return [one for several in given for one in _motions(several)]
-    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a "
-        "rollout, or a list of these")
+    raise ValueError(
+        f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a "
+        "rollout, or a list of these"
+    )
 
 
 def _page(title: str, description: dict, numbers: bytes) -> str:
@@ -120,6 +134,8 @@ def _file(name: str) -> str:
 
 def _check_suffix(path: FilePath) -> None:
     if not name_of(path).lower().endswith((".html", ".htm")):
-        raise ValueError(f"cannot write `{shortened(path)}`: a 3D view is a .html file; for a .gif use "
-            "`jj.animate`, for figures `jj.plot`")
+        raise ValueError(
+            f"cannot write `{shortened(path)}`: a 3D view is a .html file; for a .gif use "
+            "`jj.animate`, for figures `jj.plot`"
+        )
     check_place(path)

@@ -20,7 +20,9 @@ def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarr
     size, dark = np.asarray(visual.size)[0], np.zeros(())
     if visual.kind == "line":
         points, radius = np.asarray(visual.size)[k], radius_of(visual) or thin
-        found = np.concatenate([_bar(a, b, radius) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
+        found = np.concatenate(
+            [_bar(a, b, radius) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))]
+        )
     elif visual.kind == "ellipsoid":  # alternate octants are dark, so that rolling is visible
         found = size * quads(revolved(arc(np.pi, 13), 24))
         dark = np.kron(0.35 * np.eye(2)[[0, 1, 0, 1]].T, np.ones((6, 6))).ravel()
@@ -30,7 +32,9 @@ def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarr
         found = size * _box()
     elif visual.kind == "capsule":
         bow = arc(np.pi / 2, 5) * size[0]
-        found = quads(revolved(np.concatenate([bow - [0, size[1] / 2], [1, -1] * bow[::-1] + [0, size[1] / 2]]), 24))
+        found = quads(
+            revolved(np.concatenate([bow - [0, size[1] / 2], [1, -1] * bow[::-1] + [0, size[1] / 2]]), 24)
+        )
     else:
         around = 40 if visual.kind == "wheel" else 24
         found = quads(revolved(_cylinder(size[0], size[1]), around))
@@ -60,7 +64,9 @@ def revolved(profile: Float[np.ndarray, "rows 2"], around: int) -> Float[np.ndar
 def triangles_of(mesh: Visual) -> Quads:
     """Return the faces of a mesh, each polygon split into a fan of triangles."""
     assert mesh.faces is not None
-    return mesh.faces.corners[[(p[0], p[k], p[k + 1], p[k + 1]) for p in mesh.faces.polygons for k in range(1, len(p) - 1)]]
+    return mesh.faces.corners[
+        [(p[0], p[k], p[k + 1], p[k + 1]) for p in mesh.faces.polygons for k in range(1, len(p) - 1)]
+    ]
 
 
 def arc(last: float, count: int) -> Float[np.ndarray, "rows 2"]:
@@ -76,7 +82,10 @@ def _cylinder(radius: float, length: float) -> Float[np.ndarray, "4 2"]:
 def _box() -> Quads:
     """Return the faces of a cube of side 1."""
     square = np.array([[[-1.0, -1.0], [1.0, -1.0]], [[-1.0, 1.0], [1.0, 1.0]]]) / 2
-    ends = [(side, np.concatenate([np.full((2, 2, 1), side), square * [2 * side, 1.0]], axis=-1)) for side in (-0.5, 0.5)]
+    ends = [
+        (side, np.concatenate([np.full((2, 2, 1), side), square * [2 * side, 1.0]], axis=-1))
+        for side in (-0.5, 0.5)
+    ]
     return np.concatenate([quads(np.roll(end, k, axis=-1)) for k in range(3) for _, end in ends])
 
 
@@ -92,7 +101,9 @@ def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"],
     """
     # edge k runs from corner k - 1 to corner k
     edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)
-    rows, columns = np.clip(np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20).astype(int)
+    rows, columns = np.clip(
+        np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20
+    ).astype(int)
     r, s = np.linspace(0, 1, rows + 1)[:, None], np.linspace(0, 1, columns + 1)
     weights = np.stack([(1 - r) * (1 - s), (1 - r) * s, r * s, r * (1 - s)], axis=-1)
     parts = [quads(weights @ face) for face in faces]

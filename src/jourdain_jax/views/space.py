@@ -62,7 +62,9 @@ def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, 
     axes.view_init(*view)
     axes.set_autoscale_on(False)
     axes.tick_params(labelsize=8, pad=0)
-    for axis, name, along in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", np.abs(towards(*view)), strict=True):
+    for axis, name, along in zip(
+        (axes.xaxis, axes.yaxis, axes.zaxis), "xyz", np.abs(towards(*view)), strict=True
+    ):
         axis.set_pane_color("#f4f4f1" if name == "z" else "white")
         axis._axinfo["grid"].update(color="#d9d9d4", linewidth=0.6)
         axis.line.set_visible(place is not None and along < 0.99)
@@ -88,10 +90,17 @@ def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarr
     fallen[..., :2] = np.clip(fallen[..., :2], *box[:, :2])
     axes.add_collection3d(Poly3DCollection(fallen, facecolors="#d3d3ce", zorder=1))
     seen = (normals_of(corners) @ towards(axes.elev, axes.azim) > 0) | (colours[:, 3] < 1)
-    lines = np.concatenate([np.zeros((0, 4, 3)), *(path[:-1, None] + np.diff(path, axis=0)[:, None] * [[0], [1], [1], [0]] for path in paths)])
+    lines = np.concatenate(
+        [
+            np.zeros((0, 4, 3)),
+            *(path[:-1, None] + np.diff(path, axis=0)[:, None] * [[0], [1], [1], [0]] for path in paths),
+        ]
+    )
     corners = np.concatenate([corners[seen], lines])
     colours = np.concatenate([colours[seen], np.tile([*rgb(_INK), 1.0], (len(lines), 1))])
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.9, zorder=2))
+    axes.add_collection3d(
+        Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.9, zorder=2)
+    )
     axes.set(xlim=box[:, 0], ylim=box[:, 1], zlim=box[:, 2])
     sides = box[1] - box[0]
     axes.set_box_aspect(sides)
@@ -115,4 +124,12 @@ def legend(figure, drawn: Drawn, paths: int = 0) -> None:
     handles = [plt.Rectangle((0, 0), 1, 1, color=colours[name], label=name) for name in names]
     if paths:
         handles.append(plt.Line2D([], [], color=_INK, lw=0.9, label="path" if paths == 1 else "paths"))
-    figure.legend(handles=handles, loc="upper center", ncols=len(handles), frameon=False, fontsize=9, handlelength=1.4, columnspacing=1.6)
+    figure.legend(
+        handles=handles,
+        loc="upper center",
+        ncols=len(handles),
+        frameon=False,
+        fontsize=9,
+        handlelength=1.4,
+        columnspacing=1.6,
+    )

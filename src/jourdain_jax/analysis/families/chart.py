@@ -28,7 +28,9 @@ class StabilityChart(Printed):
     values: Float[np.ndarray, "values"]  # of the first number, equidistant
     # mode, and a point for each value: NaN, with a code, if there is none
     boundaries: tuple[tuple[str, CriticalPoint], ...]
-    bands: tuple[Float[np.ndarray, "values"], ...]  # standard deviations of the second number; NaN without a prior
+    bands: tuple[
+        Float[np.ndarray, "values"], ...
+    ]  # standard deviations of the second number; NaN without a prior
     middle: Family  # along the second number, at the middle of the first: it shows the stable side
 
     def _text(self) -> str:
@@ -55,9 +57,9 @@ def stability_chart(
     - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
     - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
       parameter, at least 3.
-    - `prior`: parameter (one number) -> `jj.studies.Normal`, such as `measured_bicycle(...).prior`. `chart.bands`
-      then has the standard deviations of the second number on each boundary, to first order, for independent
-      parameters.
+    - `prior`: parameter (one number) -> `jj.studies.Normal`, such as `measured_bicycle(...).prior`.
+      `chart.bands` then has the standard deviations of the second number on each boundary, to first order,
+      for independent parameters.
     - `asked`: arguments of `family`: `held`, `inputs`, `names`.
 
     A family along the second number, at the middle value of the first, finds the boundaries. Each is then a
@@ -68,8 +70,10 @@ def stability_chart(
     axes, or for a prior that is no `jj.studies.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
-        raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, "
-            "each with its first and its last value")
+        raise ValueError(
+            f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, "
+            "each with its first and its last value"
+        )
     (first, ends), (second, (begin, end)) = axes.items()
     values = np.linspace(*ends, points)
     # the ends are checked as values of the parameter
@@ -83,8 +87,8 @@ def stability_chart(
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
         raise ValueError(
-            f"`prior` is {given}, expected `jj.studies.Normal(mean, sigma)` for each name, a parameter that is one "
-            "number"
+            f"`prior` is {given}, expected `jj.studies.Normal(mean, sigma)` for each name, a parameter that"
+            " is one number"
         ) from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []
@@ -93,7 +97,11 @@ def stability_chart(
             special, curve = special_at(known, change), []
             for x in values:  # compiled faster than a batch
                 point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
-                by_all = np.asarray(special.program.pulled(numbers, inverse[k])) if given else np.full(len(numbers), np.nan)
+                by_all = (
+                    np.asarray(special.program.pulled(numbers, inverse[k]))
+                    if given
+                    else np.full(len(numbers), np.nan)
+                )
                 curve.append((point, np.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]))
             found, band = jax.tree.map(lambda *x: np.stack(x), *curve)
             boundaries.append((change.modes[0], found))

@@ -6,13 +6,24 @@ from itertools import pairwise
 
 import numpy as np
 
-from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, along, located, reversed_at, solved, traced
+from jourdain_jax.analysis.families.curve import (
+    CLOSED,
+    Point,
+    Targets,
+    along,
+    located,
+    reversed_at,
+    solved,
+    traced,
+)
 from jourdain_jax.analysis.families.equations import Motions, Vector
 from jourdain_jax.analysis.families.special_points import Test, dip, tangents_across, tests_between
 from jourdain_jax.calculus.reals import all_finite, largest
 
 
-def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
+def followed(
+    equations: Motions, begin: Point, targets: Targets, most: int
+) -> tuple[list[Point], tuple[str, str]]:
     """Return all points of a curve in order, and the reasons why it ends at either side. With targets, the
     curve is followed only towards them.
     """
@@ -26,15 +37,18 @@ def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> t
     return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
 
 
-def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Test, Point]]:
+def special(
+    equations: Motions, points: Sequence[Point], turning: dict[str, int]
+) -> Iterator[tuple[Test, Point]]:
     """Yield special points between the points, in order."""
     for here, there in pairwise(_with_dips(equations, points, turning)):
         found = []
         for test in tests_between(equations, here, there, turning):
             if test.changes(here, there):
                 point = located(equations, here, there, test.of, bool(test.columns))
-                found.append((test, point) if point else (replace(test, kind=f"{test.kind}, before this "
-                    "point"), there))
+                found.append(
+                    (test, point) if point else (replace(test, kind=f"{test.kind}, before this point"), there)
+                )
         branch = next((point for test, point in found if test.kind == "branch point"), None)
         # near a branch point tangents lose digits, so points this close count as the branch point
         if branch is not None:
@@ -50,9 +64,16 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
     while k < len(points) - 1:
         _, here, there = three = points[k - 1 : k + 2]
         at = tuple(float(here.tangent @ (point.z - here.z)) for point in three)
-        branch, *tests = ((tuple(map(test.of, three)), test.least) for test in tests_between(equations, here, there, turning))
+        branch, *tests = (
+            (tuple(map(test.of, three)), test.least)
+            for test in tests_between(equations, here, there, turning)
+        )
         beside = min(branch[0]) * max(branch[0]) < 0
-        s = None if beside else next((s for one in (branch, *tests) if (s := dip(at, *one)) is not None), None)
+        s = (
+            None
+            if beside
+            else next((s for one in (branch, *tests) if (s := dip(at, *one)) is not None), None)
+        )
         new = None if s is None else along(equations, here, s)
         if s is None or new is None:
             k += 1
@@ -81,10 +102,16 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
     sigma, V = np.linalg.svd(look.J)[1:]
     count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
     if count == 0:
-        raise ValueError(f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold "
-            "fewer quantities, or name a parameter by `vary`")
+        raise ValueError(
+            f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold "
+            "fewer quantities, or name a parameter by `vary`"
+        )
     if count > 1:
-        free = [f"`{name}`" for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True) if share > 1e-3]
+        free = [
+            f"`{name}`"
+            for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True)
+            if share > 1e-3
+        ]
         raise ValueError(
             f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: "
             f"name {count - 1} of {', '.join(free)} in `held`, or start next to a branch point"
@@ -94,5 +121,11 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
 
 def across(equations: Motions, tangent: Vector) -> Point:
     """Return the branch point at the guess, with the tangent of the other curve through it."""
-    other, look = min(tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent)), equations(equations.start)
+    other, look = (
+        min(
+            tangents_across(equations, equations.start),
+            key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent),
+        ),
+        equations(equations.start),
+    )
     return Point(equations.start, other, look, equations.eigenvalues(look, other))

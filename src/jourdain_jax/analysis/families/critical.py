@@ -44,7 +44,11 @@ MEANINGS = (
     "not found: the family's point does not continue to these parameters",
     "not a smooth function of the parameters here: eigenvalues or special points coincide",
 )
-SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0))}  # S = w (first) + (second), by rows
+SHAPES = {
+    PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)),
+    ZERO: ((0, 0, 0, 0),) * 2,
+    DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0)),
+}  # S = w (first) + (second), by rows
 
 
 class Sensitivities(Printed, eqx.Module):
@@ -64,24 +68,36 @@ class Sensitivities(Printed, eqx.Module):
         return self.by_parameter[name]
 
     def _text(self) -> str:
-        head = f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g}, {MEANINGS[self.code]}"
-        rows = [(name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()]
-        return "\n".join([head, " derivatives at constant "
-                                f"{', '.join(self.held) or 'nothing'}:", *table(rows)])
+        head = (
+            f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g},"
+            f" {MEANINGS[self.code]}"
+        )
+        rows = [
+            (name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()
+        ]
+        return "\n".join(
+            [head, f" derivatives at constant {', '.join(self.held) or 'nothing'}:", *table(rows)]
+        )
 
 
 @of_known_numbers
-def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels) -> Sensitivities:
+def sensitivities(
+    small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels
+) -> Sensitivities:
     """Return derivatives of the eigenvalue s of small motions about a steady state with respect to all
     parameters, by two reverse passes.
     """
     scene, state, f = small
-    equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f))
+    equations = SteadyEquations(
+        scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f)
+    )
     z = equations.start
     look = equations(z)
     if not largest(look.R) < 1e-6:
-        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no "
-            "derivatives; find a steady one by `jj.steady`")
+        raise ValueError(
+            f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no "
+            "derivatives; find a steady one by `jj.steady`"
+        )
     fixed = _held(equations, look, as_names(held))
     (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
     apart = np.abs(values - s)
@@ -105,8 +121,18 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     if not single:
         by_all = by_all * np.nan
     at = numbered(scene)
-    by_parameter = {name: np.reshape(by_all[getattr(at, name) :][: np.size(value)], np.shape(value)) for name, value, _ in parameters_of(scene)}
-    return Sensitivities(mode, s, condition, by_parameter, FOUND if single else SINGULAR, tuple(equations.unknowns[k] for k in fixed))
+    by_parameter = {
+        name: np.reshape(by_all[getattr(at, name) :][: np.size(value)], np.shape(value))
+        for name, value, _ in parameters_of(scene)
+    }
+    return Sensitivities(
+        mode,
+        s,
+        condition,
+        by_parameter,
+        FOUND if single else SINGULAR,
+        tuple(equations.unknowns[k] for k in fixed),
+    )
 
 
 def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
@@ -120,8 +146,10 @@ def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
         if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
             chosen.append(k)
     if not len(chosen) == count >= len(named):
-        raise ValueError(f"the steady motions near this one have {count} freedoms; name {count} quantities "
-            f"in `held` that distinguish them ({', '.join(named)} do not)")
+        raise ValueError(
+            f"the steady motions near this one have {count} freedoms; name {count} quantities "
+            f"in `held` that distinguish them ({', '.join(named)} do not)"
+        )
     return chosen
 
 
@@ -131,7 +159,9 @@ class CriticalPoint(Printed, eqx.Module):
     state: State
     parameters: dict[str, Float[Array, "*batch"]]  # the parameters that vary along the family
     eigenvalue: Complex[Array, "*batch"]  # 1/s, crossing the axis or double
-    condition: Float[Array, "*batch"]  # least pivot of the equations over the largest; near zero, special points are close together
+    condition: Float[
+        Array, "*batch"
+    ]  # least pivot of the equations over the largest; near zero, special points are close together
     code: Int[Array, "*batch"]
     kind: str = static()
 
@@ -153,7 +183,10 @@ class CriticalPoint(Printed, eqx.Module):
         if self.code.ndim:
             return f"{self.kind}: {int((self.code == FOUND).sum())} of {self.code.size} found"
         varied = "".join(f", {name} = {value:.6g}" for name, value in self.parameters.items())
-        return f"{self.kind}{varied}: {self.message}; eigenvalue {complex_numbers(self.eigenvalue[None])[0]} 1/s\n{self.state}"
+        return (
+            f"{self.kind}{varied}: {self.message}; eigenvalue {complex_numbers(self.eigenvalue[None])[0]}"
+            f" 1/s\n{self.state}"
+        )
 
 
 class _Program:
@@ -169,12 +202,17 @@ class _Program:
         moved, nodes, beside = [instant.v[k] for k in (*rates, *of_states)], [instant.v[k] for k in rows], []
         for direction, p, q in ((a, S[0], S[2]), (b, S[1], S[3])):
             found = derivatives(graph, moved, dict(zip(x, direction, strict=True)))
-            nodes += [graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d))) for f, c, d in zip(found, a, b, strict=False)]
+            nodes += [
+                graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d)))
+                for f, c, d in zip(found, a, b, strict=False)
+            ]
             beside += found[m:]
         nodes, variables = [*nodes, *beside], [*instant.given, *given]
         self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
         self.values, self.rows = differentiable(graph, nodes, variables), len(nodes)
-        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows))[: self.rows])[0])
+        self.pulled = jax.jit(
+            lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows))[: self.rows])[0]
+        )
 
     @cached_property
     def of(self) -> Sloped:
@@ -268,7 +306,9 @@ def _solution(special: Special, scene: Scene) -> CriticalPoint:
     """Return the point of a scene, differentiable twice."""
     # one by one, since each takes a different number of steps
     lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)
-    X, inverse, condition, code = jax.lax.stop_gradient(lane_by_lane(*jax.lax.stop_gradient((special, scene))))
+    X, inverse, condition, code = jax.lax.stop_gradient(
+        lane_by_lane(*jax.lax.stop_gradient((special, scene)))
+    )
     near = X
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
@@ -295,12 +335,20 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
         X, ((first, second, third), inverses, conditions) = jax.lax.scan(corrected, near, length=3)
         good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
         found = (done == 1) & (third < 1e-8), X, inverses[-1], conditions[-1]
-        return jnp.where(good, special.normal(X), near), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1, *found
+        return (
+            jnp.where(good, special.normal(X), near),
+            jnp.where(good, share, done),
+            jnp.where(good, 2 * step, step / 4),
+            count + 1,
+            *found,
+        )
 
     X, zero = special.normal(special.X), jnp.zeros(())
     inverse = jnp.zeros((len(X), special.program.rows + len(special.linear(X)[1])))
     start = X, zero, jnp.ones(()), jnp.zeros((), jnp.int32), jnp.array(False), X, inverse, zero
-    *_, found, X, inverse, condition = jax.lax.while_loop(lambda c: ~c[4] & (c[2] > 1e-3) & (c[3] < 100), once, start)
+    *_, found, X, inverse, condition = jax.lax.while_loop(
+        lambda c: ~c[4] & (c[2] > 1e-3) & (c[3] < 100), once, start
+    )
     code = jnp.where(found, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
     return X * jnp.where(code == FOUND, 1.0, jnp.nan), inverse, condition, code
 
@@ -330,11 +378,14 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
-        raise ValueError("`critical` needs a family of steady motions, but this is a family of periodic "
-            "motions")
+        raise ValueError(
+            "`critical` needs a family of steady motions, but this is a family of periodic motions"
+        )
     if type(scene) is not type(equations.scene):
-        raise ValueError(f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
-            f"`{type(scene).__name__}`")
+        raise ValueError(
+            f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
+            f"`{type(scene).__name__}`"
+        )
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
     return _solution(special, scene)
@@ -342,12 +393,18 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     """Return the point of the family selected by `what`."""
-    known = {point: [point.kind, *(point.modes if point.kind != DOUBLE else ())] for point in curve.changes if point.kind in SHAPES}
+    known = {
+        point: [point.kind, *(point.modes if point.kind != DOUBLE else ())]
+        for point in curve.changes
+        if point.kind in SHAPES
+    }
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
         names = ", ".join(sorted(set().union(*known.values())))
-        raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; "
-            f"it has: {names or 'none'}")
+        raise ValueError(
+            f"the family of `{type(curve.equations.scene).__name__}` has no such special point; "
+            f"it has: {names or 'none'}"
+        )
     start = curve.equations.start
     return min(found, key=lambda point: largest(curve.equations.place(point) - start))
 

@@ -35,7 +35,12 @@ class Point:
 
 
 def solved(
-    equations: Motions, z: Vector, rows: Float[np.ndarray, "fixed unknowns"], targets: Float[np.ndarray, "fixed"], most: int = 8, longest: float = np.inf
+    equations: Motions,
+    z: Vector,
+    rows: Float[np.ndarray, "fixed unknowns"],
+    targets: Float[np.ndarray, "fixed"],
+    most: int = 8,
+    longest: float = np.inf,
 ) -> tuple[Vector, Look, int] | None:
     """Return z with R = 0 and `rows z = targets`, the equations there, and the number of corrections; None if
     Newton's method does not converge.
@@ -44,7 +49,9 @@ def solved(
         look = equations(z)
         if not (all_finite(look.R) and all_finite(look.J)):
             return None
-        step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[0]
+        step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[
+            0
+        ]
         # of R: near a branch point it leads to large steps
         noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))
         z = z + step * min(1.0, longest / max(largest(step), 1e-300))
@@ -53,7 +60,9 @@ def solved(
     return None
 
 
-def along(equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True) -> Point | None:
+def along(
+    equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True
+) -> Point | None:
     """Return the point of the curve at a given distance along the tangent of another point; None if none is
     found. Unless `with_modes`, the modes of that point are copied.
     """
@@ -82,17 +91,23 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
         if there is None:
             step /= 2
             if step < SHORTEST:
-                return points, "no further point is found: the equations are undefined, or lose rank, beyond it"
+                return (
+                    points,
+                    "no further point is found: the equations are undefined, or lose rank, beyond it",
+                )
             continue
         points.append(there)
         for k, target in targets:
-            past = lambda point, k=k, target=target: point.z[k] - target  # noqa: E731
+            past = lambda point, k=k, target=target: point.z[k] - target
             if past(here) * past(there) <= 0:
                 if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
                     points[-1] = end
                 left = _left(equations, points[-1])
-                return (points[:-1], left) if left else (points, f"{equations.unknowns[k]} is "
-                    f"{target * equations.size[k]:g}")
+                return (
+                    (points[:-1], left)
+                    if left
+                    else (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
+                )
         if left := _left(equations, there):
             return points[:-1], left
         if _closed(equations, start, here, there):
@@ -112,8 +127,14 @@ def _left(equations: Motions, point: Point) -> str | None:
     """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):
-        if name in equations.vary and ((declared["positive"] and values[name] <= 0) or (declared["non_negative"] and values[name] < -1e-12)):
-            return f"`{name}` is declared {'positive' if declared['positive'] else 'non-negative'}, and is {values[name]:.3g} at the next point"
+        if name in equations.vary and (
+            (declared["positive"] and values[name] <= 0)
+            or (declared["non_negative"] and values[name] < -1e-12)
+        ):
+            return (
+                f"`{name}` is declared {'positive' if declared['positive'] else 'non-negative'}, and is"
+                f" {values[name]:.3g} at the next point"
+            )
     return None
 
 
@@ -141,7 +162,9 @@ def reversed_at(point: Point) -> Point:
     return replace(point, tangent=-point.tangent)
 
 
-def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
+def located(
+    equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False
+) -> Point | None:
     """Return the point between two neighbours at which a smooth `test` changes its sign; None if the curve is
     lost or undefined.
 
@@ -163,7 +186,9 @@ def located(equations: Motions, here: Point, there: Point, test: Callable[[Point
         else:
             high, b, at_b = middle, c, value
     part = at_a / (at_a - at_b)
-    z, tangent = (getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent"))
+    z, tangent = (
+        getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent")
+    )
     look, tangent = equations(z), tangent / np.linalg.norm(tangent)
     if not all_finite(look.J):
         return None

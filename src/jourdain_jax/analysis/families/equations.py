@@ -59,8 +59,11 @@ class Motions(ABC):
 
     def index(self, name: str) -> int:
         """Return the index of an unknown. Raises ValueError, with the nearest names, if there is none."""
-        check_name(name, self.unknowns, f"`{name}` is not an unknown of the {self.what} of "
-            f"`{type(self.scene).__name__}`")
+        check_name(
+            name,
+            self.unknowns,
+            f"`{name}` is not an unknown of the {self.what} of `{type(self.scene).__name__}`",
+        )
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:
@@ -92,7 +95,11 @@ class Motions(ABC):
         """Return the equations, with a row for each unknown that keeps its value."""
         if not len(self.held):
             return Look(R, J * self.size, small)
-        return Look(np.append(R, (z - self.start)[self.held]), np.vstack([J * self.size, np.eye(len(z))[self.held]]), small)
+        return Look(
+            np.append(R, (z - self.start)[self.held]),
+            np.vstack([J * self.size, np.eye(len(z))[self.held]]),
+            small,
+        )
 
 
 class SteadyEquations(Motions):
@@ -102,14 +109,22 @@ class SteadyEquations(Motions):
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
 
     def __init__(
-        self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: Labels = (), held: Labels = ()
+        self,
+        scene: Scene,
+        guess: tuple[float, np.ndarray, np.ndarray],
+        inputs: np.ndarray,
+        vary: Labels = (),
+        held: Labels = (),
     ) -> None:
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
         names, at, program = state_names(scene), places_of(scene), lower(scene)
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
         varied = [getattr(numbered(scene), name) for name in vary]
         self.instant = by_program(scene, program, (), tuple(varied))
-        matters, bound = np.array([name not in program.held for name in program.coordinates], bool), on_rows(scene)
+        matters, bound = (
+            np.array([name not in program.held for name in program.coordinates], bool),
+            on_rows(scene),
+        )
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([self.instant.states[0] - 1 + columns, varied]).astype(int)
@@ -117,13 +132,22 @@ class SteadyEquations(Motions):
         self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
         self.start = self.given[self.places] / self.size
         self.held = np.array([self.index(name) for name in held], int)
-        self.by_name = dict(zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True))
+        self.by_name = dict(
+            zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True)
+        )
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
-        self.rates, self.states = np.concatenate([at.qdot[kept], at.udot[y]]), np.concatenate([at.q[kept], at.u[y]])
+        self.rates, self.states = (
+            np.concatenate([at.qdot[kept], at.udot[y]]),
+            np.concatenate([at.q[kept], at.u[y]]),
+        )
         self.of_states = np.concatenate([at.g, at.phi if len(y) == len(at.u) else []]).astype(int)
         columns = np.append(columns, np.arange(-len(vary), 0))
-        self.slopes = np.ix_(self.rows, columns), np.ix_(self.rates, self.states), np.ix_(self.of_states, self.states)
+        self.slopes = (
+            np.ix_(self.rows, columns),
+            np.ix_(self.rates, self.states),
+            np.ix_(self.of_states, self.states),
+        )
 
     def __call__(self, z: Vector) -> Look:
         """Return the equations at z."""
@@ -138,7 +162,9 @@ class SteadyEquations(Motions):
         count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
         return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
 
-    def _in_states(self, directions: Float[np.ndarray, "unknowns directions"]) -> Float[np.ndarray, "states directions"]:
+    def _in_states(
+        self, directions: Float[np.ndarray, "unknowns directions"]
+    ) -> Float[np.ndarray, "states directions"]:
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
@@ -158,7 +184,11 @@ class SteadyEquations(Motions):
     def split(self, numbers):
         """Return q, u and varying quantities, by name."""
         first, n, m = self.instant.states
-        return numbers[first : first + n], numbers[first + n : first + n + m], {name: numbers[self.by_name[name]] for name in self.vary}
+        return (
+            numbers[first : first + n],
+            numbers[first + n : first + n + m],
+            {name: numbers[self.by_name[name]] for name in self.vary},
+        )
 
 
 def numbered(scene: Scene) -> Scene:

@@ -1,5 +1,4 @@
-"""Families of steady and of periodic motions: the whole curve through one of them, with its special points.
-"""
+"""Families of steady and of periodic motions: the whole curve through one of them, with its special points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +18,14 @@ from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest
 from jourdain_jax.integrate.state_projection import State, state_of
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_scene, of_known_numbers, shown_from_users_lines
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    as_input_vector,
+    as_rolling,
+    as_scene,
+    of_known_numbers,
+    shown_from_users_lines,
+)
 from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_name, check_names
 from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
@@ -51,7 +57,10 @@ class FamilyPoint(Printed):
 
     def _text(self) -> str:
         concerned = f" ({', '.join(dict.fromkeys(self.modes))})" if self.modes else ""
-        return f"{self.kind or 'point of a family'}{concerned}\n{self.state}\n{self.about}: {', '.join(complex_numbers(self.eigenvalues))}"
+        return (
+            f"{self.kind or 'point of a family'}{concerned}\n{self.state}\n{self.about}:"
+            f" {', '.join(complex_numbers(self.eigenvalues))}"
+        )
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -74,8 +83,12 @@ class Family(Printed):
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
         """Return values of a coordinate, a speed, or the parameter that varies, at all points."""
-        check_name(name, self.equations.by_name, f"a family of `{type(self.equations.scene).__name__}` has "
-            f"no `{name}`", UnknownNameError)
+        check_name(
+            name,
+            self.equations.by_name,
+            f"a family of `{type(self.equations.scene).__name__}` has no `{name}`",
+            UnknownNameError,
+        )
         return np.array([self.equations.values(point.z)[name] for point in self.points])
 
     @property
@@ -88,7 +101,9 @@ class Family(Printed):
     @property
     def stable(self) -> Bool[np.ndarray, "points"]:
         """Return whether no small motion about a point grows."""
-        return np.all(self.equations.growth(self.eigenvalues) <= SURE * (1 + np.abs(self.eigenvalues)), axis=1)
+        return np.all(
+            self.equations.growth(self.eigenvalues) <= SURE * (1 + np.abs(self.eigenvalues)), axis=1
+        )
 
     @property
     def folds(self) -> tuple[FamilyPoint, ...]:
@@ -116,18 +131,35 @@ class Family(Printed):
             raise ValueError(f"`at` takes one name with its value, but {len(named)} were given; give one")
         ((name, value),) = named.items()
         k = self.equations.index(name)
-        past = lambda p: p.z[k] - float(value) / self.equations.size[k]  # noqa: E731
-        found = [located(self.equations, here, there, past) for here, there in pairwise(self.points) if past(here) * past(there) < 0]
-        exact = [point for point in self.points[: -1 if self.ends[1] == CLOSED else None] if past(point) == 0.0]
+        past = lambda p: p.z[k] - float(value) / self.equations.size[k]
+        found = [
+            located(self.equations, here, there, past)
+            for here, there in pairwise(self.points)
+            if past(here) * past(there) < 0
+        ]
+        exact = [
+            point for point in self.points[: -1 if self.ends[1] == CLOSED else None] if past(point) == 0.0
+        ]
         return tuple(self.point(point) for point in (*exact, *found) if point)
 
     def point(self, point: Point, kind: str = "", columns: Indices = ()) -> FamilyPoint:
         """Return a point of the curve with its state and eigenvalues."""
         known = self.equations
-        values, entries = known.values(point.z), (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
+        values, entries = (
+            known.values(point.z),
+            (known.scene.coordinate_names.entries, known.scene.speed_names.entries),
+        )
         q, u = (jnp.array([values[name] for name in names]) for names in entries)
         state = state_of(known.scene, known.t, q, u, residual=largest(point.look.R))
-        return FamilyPoint(kind, state, point.modes, tuple(self.mode_names[k] for k in columns), values, point.tangent * known.size, known.modes)
+        return FamilyPoint(
+            kind,
+            state,
+            point.modes,
+            tuple(self.mode_names[k] for k in columns),
+            values,
+            point.tangent * known.size,
+            known.modes,
+        )
 
     def to_xarray(self):
         """Return points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their
@@ -136,29 +168,51 @@ class Family(Printed):
         xarray = needed("xarray", "a family as labelled arrays")
         values = {name: ("point", self[name]) for name in self.equations.unknowns}
         about = dict(zip(("long_name", "units"), self.equations.modes.split(", "), strict=False))
-        spectrum = {"eigenvalues": (("point", "mode"), self.eigenvalues, about), "stable": ("point", self.stable)}
-        return xarray.Dataset(values | spectrum, {"mode": list(self.mode_names)}, {"scene": type(self.equations.scene).__name__})
+        spectrum = {
+            "eigenvalues": (("point", "mode"), self.eigenvalues, about),
+            "stable": ("point", self.stable),
+        }
+        return xarray.Dataset(
+            values | spectrum, {"mode": list(self.mode_names)}, {"scene": type(self.equations.scene).__name__}
+        )
 
     def _text(self) -> str:
         known, ends = self.equations, self.ends
-        moved = {name: float(np.ptp(self[name])) / size for name, size in zip(known.unknowns, known.size, strict=True)}
-        shown = [name for name in dict.fromkeys((*known.vary, *known.unknowns)) if moved[name] > SHOWN and " in piece " not in name][:8]
-        lines = [f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, "
-            f"{int(self.stable.sum())} of them stable"]
+        moved = {
+            name: float(np.ptp(self[name])) / size
+            for name, size in zip(known.unknowns, known.size, strict=True)
+        }
+        shown = [
+            name
+            for name in dict.fromkeys((*known.vary, *known.unknowns))
+            if moved[name] > SHOWN and " in piece " not in name
+        ][:8]
+        lines = [
+            f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, "
+            f"{int(self.stable.sum())} of them stable"
+        ]
         lines += ["  " + ends[0]] if ends[0] == ends[1] else [f"  begins: {ends[0]}", f"  ends: {ends[1]}"]
         rows = [("", *shown, "modes")]
-        points = [self.point(self.points[0], "first point"), *self.special, self.point(self.points[-1], "last point")]
+        points = [
+            self.point(self.points[0], "first point"),
+            *self.special,
+            self.point(self.points[-1], "last point"),
+        ]
         least = dict(zip(known.unknowns, SHOWN * known.size, strict=True))
         for point in points:
-            values = in_digits(np.array([0.0 if abs(point[name]) < least[name] else point[name] for name in shown]))
+            values = in_digits(
+                np.array([0.0 if abs(point[name]) < least[name] else point[name] for name in shown])
+            )
             rows.append((point.kind, *values, ", ".join(dict.fromkeys(point.modes))))
         eigenvalues = zip(self.mode_names, complex_numbers(self.points[0].modes), strict=True)
         return "\n".join(
             [
                 *lines,
                 *table(rows),
-                f"  {known.modes}, at the first point: "
-                f"{', '.join(f'{name} {value}' for name, value in eigenvalues)}",
+                (
+                    f"  {known.modes}, at the first point: "
+                    f"{', '.join(f'{name} {value}' for name, value in eigenvalues)}"
+                ),
             ]
         )
 
@@ -214,8 +268,11 @@ def family(
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
     numbers = [name for name, value, _ in parameters_of(scene) if np.ndim(value) == 0]
-    check_names(varied, numbers, f"`vary` names `{{}}`, expected a parameter of `{type(scene).__name__}` "
-        "that is one number")
+    check_names(
+        varied,
+        numbers,
+        f"`vary` names `{{}}`, expected a parameter of `{type(scene).__name__}` that is one number",
+    )
     equations: Motions
     if isinstance(guess, PeriodicMotion):
         equations = OrbitEquations(scene, guess, varied, held)
@@ -223,13 +280,22 @@ def family(
         as_rolling(scene, "family")
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
         scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
-        equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
-    known = {name: checked_known(value, f"`until` of `{name}`", (), advice="give the value at which the "
-        "curve ends") for name, value in until.items()}
+        equations = SteadyEquations(
+            scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held
+        )
+    known = {
+        name: checked_known(
+            value, f"`until` of `{name}`", (), advice="give the value at which the curve ends"
+        )
+        for name, value in until.items()
+    }
     if not_numbers := [name for name, value in known.items() if not np.isfinite(value)]:
-        raise ValueError(f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite "
-            "number")
-    targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in known.items()]
+        raise ValueError(
+            f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite number"
+        )
+    targets = [
+        (k := equations.index(name), float(value) / equations.size[k]) for name, value in known.items()
+    ]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:
         begin = first_point(equations, named, [*until])
@@ -245,4 +311,9 @@ def family(
     labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)
     found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, labels)
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}
-    return replace(found, special=tuple(found.point(at, test.kind, test.columns) for test, at in special(equations, found.points, turning)))
+    return replace(
+        found,
+        special=tuple(
+            found.point(at, test.kind, test.columns) for test, at in special(equations, found.points, turning)
+        ),
+    )

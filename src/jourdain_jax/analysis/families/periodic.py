@@ -30,7 +30,19 @@ from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.spectrum import Modes
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, instant_of, places_of, unseen
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, all_finite, checked_real, checked_whole, compiled_quickly, known_numbers, largest, static
+from jourdain_jax.calculus.reals import (
+    Flag,
+    Indices,
+    Number,
+    Scalar,
+    all_finite,
+    checked_real,
+    checked_whole,
+    compiled_quickly,
+    known_numbers,
+    largest,
+    static,
+)
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.scene_parts import names_of_events
@@ -80,13 +92,29 @@ class PeriodicMotion(Printed, eqx.Module):
 
     def _text(self) -> str:
         if self.residual.ndim:
-            return f"{int(self.converged.sum())} of {self.converged.size} periodic motions found\n{self.state}"
-        head = f"periodic motion of {float(self.period):.9g} s" if self.converged else "no periodic motion found near the guess"
+            return (
+                f"{int(self.converged.sum())} of {self.converged.size} periodic motions found\n{self.state}"
+            )
+        head = (
+            f"periodic motion of {float(self.period):.9g} s"
+            if self.converged
+            else "no periodic motion found near the guess"
+        )
         shifts = ", ".join(f"{name} by {float(value):.6g}" for name, value in self.shift.items())
-        lines = [f"{head}: residual {float(self.residual):.1e}", *(["in a period, it shifts "
-            f"{shifts}"] if shifts else []), str(self.state)]
-        return "\n".join([*lines, f"multipliers: {', '.join(complex_numbers(self.multipliers))} "
-            f"({'stable' if self.stable else 'unstable'})"])
+        lines = [
+            f"{head}: residual {float(self.residual):.1e}",
+            *([f"in a period, it shifts {shifts}"] if shifts else []),
+            str(self.state),
+        ]
+        return "\n".join(
+            [
+                *lines,
+                (
+                    f"multipliers: {', '.join(complex_numbers(self.multipliers))} "
+                    f"({'stable' if self.stable else 'unstable'})"
+                ),
+            ]
+        )
 
 
 @shown_from_users_lines
@@ -132,8 +160,17 @@ def periodic(
     built, scene = scene, as_scene(scene)
     inputs = as_inputs(scene, by_name.pop("inputs", None))
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
-    beside = "it finds a motion whose length is `period`, which no stop event ends, by runs without work and retries"
-    options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
+    beside = (
+        "it finds a motion whose length is `period`, which no stop event ends, by runs without work and"
+        " retries"
+    )
+    options = as_options(
+        options,
+        {**tolerances, **by_name},
+        "periodic",
+        dict.fromkeys((*SPAN, "events", "work", "retry"), beside),
+        built,
+    )
     # tolerances are traced below
     options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)
     period = checked_real(period, "`period`", (), advice="give a time in s")
@@ -146,8 +183,10 @@ def periodic(
     if until is not None:
         check_name(until, events, f"`until` names `{until}`, which is not an event of {who}")
         if timed := structure_of(scene).timed:
-            raise ValueError(f"`until` needs a scene in which nothing depends on time, but in {who} "
-                f"{' and '.join(timed)} do; omit `until`")
+            raise ValueError(
+                f"`until` needs a scene in which nothing depends on time, but in {who} "
+                f"{' and '.join(timed)} do; omit `until`"
+            )
     for given, valid in ((held, names), (shift, entries)):
         check_names(given, valid, f"{who} has no `{{}}` to hold or to shift")
     start = as_state(modelled(built), guess, what="guess", inputs=inputs_at(inputs, 0.0))
@@ -157,7 +196,18 @@ def periodic(
     free = tuple(k for k in kept if names[k] not in held)
     shifts = (checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names)
     shifted = jnp.stack([*shifts]).astype(start.q.dtype)
-    problem = _Shooting(scene, inputs, options, shifted, instant, pieces, None if until is None else events.index(until), kept, free, tuple(shift))
+    problem = _Shooting(
+        scene,
+        inputs,
+        options,
+        shifted,
+        instant,
+        pieces,
+        None if until is None else events.index(until),
+        kept,
+        free,
+        tuple(shift),
+    )
     return _found(problem, start, period.astype(start.q.dtype))
 
 
@@ -196,7 +246,9 @@ class _Shooting(eqx.Module):
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """Return the motion from a state."""
         start = state_of(self.scene, t0, *self.split(z))
-        return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options).nan_if_failed()
+        return simulate(
+            self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options
+        ).nan_if_failed()
 
     def moved(self, k, z: States, t, period) -> States:
         """Return f_k."""
@@ -232,7 +284,9 @@ class _Shooting(eqx.Module):
         there = jnp.roll(zs, -1, axis=0)
         changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
         found = [self.constraints(t, zs[0])[0], jnp.ravel(changes[:-1]), changes[-1][np.array(self.kept)]]
-        return jnp.concatenate([*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])])
+        return jnp.concatenate(
+            [*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])]
+        )
 
     def ends(self, t, x: Unknowns) -> Float[Array, "pieces states"]:
         """Return all f_k."""
@@ -262,11 +316,18 @@ class _Shooting(eqx.Module):
 
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
-    def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
+    def multipliers(
+        self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends
+    ) -> Complex[Array, "multipliers"]:
         """Return the eigenvalues of the product M_n .. M_1, largest first, from df_k/dz_k and f_k. If the
         period is unknown, the eigenvalue of motion along the orbit is omitted.
         """
-        (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
+        (zs, period), kept, known, n = (
+            self.pieces_of(x),
+            np.array(self.kept),
+            structure_of(self.scene),
+            self.pieces,
+        )
         places = kept[kept < len(self.scene.coordinate_names.entries)]
         rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
         count = len(places) - int(rank) + known.degrees_of_freedom
@@ -297,7 +358,10 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
     guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
     size = jnp.where(problem.is_unknown, jnp.append(jnp.tile(problem.sizes, problem.pieces), given), 0.0)
-    rows, tolerance = lambda x: problem.rows(t, x, problem.ends(t, x)), 10.0 * jnp.asarray(problem.options.rtol)
+    rows, tolerance = (
+        lambda x: problem.rows(t, x, problem.ends(t, x)),
+        10.0 * jnp.asarray(problem.options.rtol),
+    )
     x = smooth_root(lambda x: still.look(t, x)[:2], rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
     D, _, ends = problem.slopes(t, x)
@@ -309,9 +373,22 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
         values = jax.vmap(problem.events)(whole.ts, jnp.concatenate([whole.q, whole.u], axis=1))
         goes_on = jnp.all(values[:, np.array(others)] >= 0)
     names = problem.scene.coordinate_names.entries
-    shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
+    shifts = {
+        name: ends[-1, k] - zs[0, k]
+        for k, name in enumerate(names)
+        if k not in problem.kept or name in problem.shifted
+    }
     state = state_of(problem.scene, t, *problem.split(zs[0]), start.moved_q, start.moved_u, residual)
-    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on, problem, x)
+    return PeriodicMotion(
+        state,
+        period,
+        shifts,
+        problem.multipliers(t, x, D, ends),
+        residual,
+        (residual < 1e-8) & goes_on,
+        problem,
+        x,
+    )
 
 
 class OrbitEquations(Motions):
@@ -321,10 +398,17 @@ class OrbitEquations(Motions):
 
     what, modes = "periodic motions", "multipliers"
     growth = staticmethod(lambda modes: np.abs(modes) - 1)
-    crossing = staticmethod(lambda mode: "pair on the unit circle" if mode.imag else f"multiplier {np.sign(mode.real):.0f}")
+    crossing = staticmethod(
+        lambda mode: "pair on the unit circle" if mode.imag else f"multiplier {np.sign(mode.real):.0f}"
+    )
 
     def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: Labels, held: Labels) -> None:
-        self.scene, self.vary, self.problem, self.t = scene, vary, replace(orbit.by, scene=scene), orbit.state.t
+        self.scene, self.vary, self.problem, self.t = (
+            scene,
+            vary,
+            replace(orbit.by, scene=scene),
+            orbit.state.t,
+        )
         names = state_names(scene)
         pieces = [f"{name} in piece {k + 1}" if k else name for k in range(orbit.by.pieces) for name in names]
         self.given = np.append(np.asarray(orbit.unknowns), [float(getattr(scene, name)) for name in vary])
@@ -351,7 +435,9 @@ class OrbitEquations(Motions):
 def _looked(problem: _Shooting, vary: Labels, t, numbers: Unknowns) -> tuple[Array, Array, Array]:
     """Return R, its derivatives with respect to all numbers, and the multipliers."""
     x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
-    moved = lambda values: replace(problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True))))  # noqa: E731
+    moved = lambda values: replace(
+        problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True)))
+    )
     R, J, (D, ends) = moved(parameters).look(t, x)
     by_parameters = jax.jacfwd(lambda values: moved(values).rows(t, x, moved(values).ends(t, x)))(parameters)
     return R, jnp.concatenate([J, by_parameters], axis=1), moved(parameters).multipliers(t, x, D, ends)

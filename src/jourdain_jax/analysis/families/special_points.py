@@ -53,7 +53,11 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
     slope = low - curvature * before
     s = -slope / (2 * curvature) if curvature * b > 0 else after
     near = min(abs(s - x) for x in at) < 1e-4 * (after - before)
-    return s if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b) else None
+    return (
+        s
+        if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b)
+        else None
+    )
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
@@ -74,10 +78,20 @@ def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[
     for k, s in enumerate(before):
         if s.imag >= 0 and (s.imag == 0) == (now[k].imag == 0):
             columns = tuple(np.flatnonzero(np.isin(before, (s, np.conj(s)))).tolist())
-            yield Test(equations.crossing(s), lambda p, k=k: float(equations.growth(p.modes)[k]), SURE * (1 + abs(s)), columns)
+            yield Test(
+                equations.crossing(s),
+                lambda p, k=k: float(equations.growth(p.modes)[k]),
+                SURE * (1 + abs(s)),
+                columns,
+            )
     for a, b in combinations(range(len(before)), 2):
         if are_partners(before, now, a, b):
-            yield Test(DOUBLE, lambda p, a=a, b=b: float(((p.modes[a] - p.modes[b]) ** 2).real), (SURE * (1 + abs(before[a]))) ** 2, (a, b))
+            yield Test(
+                DOUBLE,
+                lambda p, a=a, b=b: float(((p.modes[a] - p.modes[b]) ** 2).real),
+                (SURE * (1 + abs(before[a]))) ** 2,
+                (a, b),
+            )
 
 
 def tangents_across(equations: Motions, z: Vector) -> list[Vector]:

@@ -44,7 +44,11 @@ def are_partners(before, now, k: int, j: int) -> bool:
 def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
     """Return names of the columns: the user's, the scene's, or numbers."""
     named = getattr(scene, "mode_names", None)
-    names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
+    names = (
+        tuple(names)
+        if names is not None
+        else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
+    )
     if len(names) != len(values):
         raise ValueError(
             f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes"

@@ -28,7 +28,18 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Shape, Vector3, array_module, check_kind, checked_known, checked_real, is_traced, real_type, static
+from jourdain_jax.calculus.reals import (
+    Scalar,
+    Shape,
+    Vector3,
+    array_module,
+    check_kind,
+    checked_known,
+    checked_real,
+    is_traced,
+    real_type,
+    static,
+)
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -80,7 +91,9 @@ def _kept(function: Callable) -> dict:
 
 def _traced(function: Callable, scene: Scene) -> Channel:
     try:
-        closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
+        closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(
+            motion_shape(scene)
+        )
     except TypeError as error:
         advice = (
             "write it with `jax.numpy`, without `if` on numbers of the motion, and return one array of "
@@ -90,11 +103,15 @@ def _traced(function: Callable, scene: Scene) -> Channel:
             f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}"
         ) from error
     if not hasattr(shape, "shape"):
-        raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of "
-            "numbers; return one array")
+        raise ValueError(
+            f"a function of `sensors` returned {type(shape).__name__}, expected an array of "
+            "numbers; return one array"
+        )
     jaxpr = closed.jaxpr
     operations = ClosedJaxpr(jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars]), [])
-    return Channel(Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
+    return Channel(
+        Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape
+    )
 
 
 def _kind(scene: Scene):
@@ -106,7 +123,10 @@ def _kind(scene: Scene):
 def motion_shape(scene: Scene) -> Motion:
     """Return the shapes of a motion of this scene."""
     scene = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), scene)
-    q, u = (jax.ShapeDtypeStruct((len(names),), real_type()) for names in (scene.coordinate_names, scene.speed_names))
+    q, u = (
+        jax.ShapeDtypeStruct((len(names),), real_type())
+        for names in (scene.coordinate_names, scene.speed_names)
+    )
     return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
 
 
@@ -145,19 +165,30 @@ class Accelerometer(Instrument):
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
         check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
-        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice=
-            "give three components in the body's frame, m")
-        self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
+        self.point = checked_real(
+            point, "`point` of `Accelerometer`", (3,), advice="give three components in the body's frame, m"
+        )
+        self.gravity = checked_real(
+            gravity,
+            "`gravity` of `Accelerometer`",
+            (3,),
+            advice="give three components in the inertial frame, m/s^2",
+        )
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
         """Raise ValueError, naming the `channel` and the run (`where`), if the scene has no such body."""
         bodies = motion_shape(scene).bodies
-        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} is on body `{self.body}`, "
-                                      "which does not exist")
+        check_name(
+            self.body,
+            bodies,
+            f"the accelerometer `{channel}` of {where} is on body `{self.body}`, which does not exist",
+        )
 
     def over_times(self, motion: Trajectory) -> OverTimes:
         """Return the readings at all times of one motion."""
-        return jax.vmap(lambda *state: self._felt(motion.scene, *state))(motion.ts, motion.q, motion.u, motion.accelerations().udot)
+        return jax.vmap(lambda *state: self._felt(motion.scene, *state))(
+            motion.ts, motion.q, motion.u, motion.accelerations().udot
+        )
 
     def _felt(self, scene: Scene, t, q, u, udot) -> Vector3:
         def velocity(t, q, u):
@@ -194,8 +225,11 @@ class LoadCell(Instrument):
         its force is not determined.
         """
         determined = _determined(scene)
-        check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact "
-                                             f"`{self.contact}`, which does not exist")
+        check_name(
+            self.contact,
+            determined,
+            f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which does not exist",
+        )
         if not determined[self.contact]:
             raise ValueError(
                 f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not "
@@ -212,7 +246,10 @@ class LoadCell(Instrument):
 def _determined(scene: Scene) -> dict[str, bool]:
     """Map each contact to whether its force is determined at a state of the scene."""
     t, q, u = (x[0] for x in sample_states(scene, 1))
-    return {name: bool(force.determined) for name, force in contact_forces(scene, t, q, u, accelerations(scene, t, q, u)).items()}
+    return {
+        name: bool(force.determined)
+        for name, force in contact_forces(scene, t, q, u, accelerations(scene, t, q, u)).items()
+    }
 
 
 LATEST = 4.0  # times the observed time: a motion fails if it reaches the event later, or another event first
@@ -250,15 +287,22 @@ def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
         )
     ((name, given),) = events.items()
     if name in values:
-        raise ValueError(f"`{name}` is both a channel and an event; give the channel another name, with a "
-            "sensor")
+        raise ValueError(
+            f"`{name}` is both a channel and an event; give the channel another name, with a sensor"
+        )
     if not isinstance(given, tuple | list) or len(given) != 2:
-        raise ValueError(f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as "
-            "(1.83, 0.005)")
-    at, spread = (checked_known(x, f"{what} of event `{name}`", advice="give a number in s") for x, what in zip(given, ("the time", "sigma"), strict=True))
+        raise ValueError(
+            f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as (1.83, 0.005)"
+        )
+    at, spread = (
+        checked_known(x, f"{what} of event `{name}`", advice="give a number in s")
+        for x, what in zip(given, ("the time", "sigma"), strict=True)
+    )
     if is_traced((ts, t0)) or at.ndim > 1 or not np.all(at > t0):
-        raise ValueError(f"the time of event `{name}` is {at} s, expected a time after the start at t0 = "
-            f"{t0} s (for `fit_batch` a vector with one time per repeat)")
+        raise ValueError(
+            f"the time of event `{name}` is {at} s, expected a time after the start at t0 = "
+            f"{t0} s (for `fit_batch` a vector with one time per repeat)"
+        )
     last = min(int(np.searchsorted(ts, at.max())), len(ts) - 1)
     kept, axis = slice(last + 1), at.ndim
     after = ts[kept] > at[..., None]
@@ -275,5 +319,6 @@ def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
     return (
         ts[kept],
         {channel: until(x) for channel, x in values.items()} | {name: of_event},
-        {channel: x[kept] if x.ndim and x.shape[0] == len(ts) else x for channel, x in sigma.items()} | {name: spread},
+        {channel: x[kept] if x.ndim and x.shape[0] == len(ts) else x for channel, x in sigma.items()}
+        | {name: spread},
     )

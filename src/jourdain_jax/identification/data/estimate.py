@@ -70,7 +70,9 @@ class Range:
 
     def not_below(self, low: float) -> "Range":
         """Return the part of the range above a lower bound, which is zero or slightly more."""
-        return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
+        return replace(
+            self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low)
+        )
 
     def constrain(self, x: Numbers) -> Numbers:
         """Return the unknown, in its unit, for a real number."""
@@ -99,7 +101,10 @@ class Range:
             return ""
         if self.kind == "positive":
             return "expected a first guess above zero; or let it change sign with `unbounded()`"
-        return f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen the bounds"
+        return (
+            f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen"
+            " the bounds"
+        )
 
 
 def positive() -> Range:
@@ -118,8 +123,10 @@ def bounds(low: Number, high: Number) -> Range:
     for name, end in (("low end", low), ("high end", high)):
         checked_known(end, f"{name} of `bounds`", ())
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero "
-            "use `positive()`, for none `unbounded()`")
+        raise ValueError(
+            f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero "
+            "use `positive()`, for none `unbounded()`"
+        )
     return Range("bounds", float(low), float(high))
 
 
@@ -133,8 +140,9 @@ def unbounded(scale: Number | None = None) -> Range:
         return Range("unbounded")
     number = float(checked_known(scale, "`scale` of `unbounded`", ()))
     if not (np.isfinite(number) and number > 0):
-        raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of "
-            "the unknown")
+        raise ValueError(
+            f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown"
+        )
     return Range("unbounded", scale=number)
 
 
@@ -151,15 +159,16 @@ class Correlated:
 
 
 def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
-    """Return priors of several parameters with correlated errors: `free=jj.identification.joint_normal({"mass": 20.9,
-    "inertia": 1.64}, covariance)`.
+    """Return priors of several parameters with correlated errors:
+    `free=jj.identification.joint_normal({"mass": 20.9, "inertia": 1.64}, covariance)`.
 
     **Arguments**
     - `mean`: name -> mean, one number in the unit of the parameter.
     - `covariance`: (n, n), in the order of the names. It may be singular: a combination without variance gets
       a standard deviation of a ten thousandth of the others.
 
-    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.identification.joint_normal(...)
+    **Returns** name -> prior, for `free` of `fit`, alone or together with others:
+    `free=jj.identification.joint_normal(...)
     | {"gain": None}`. If only some of the names are free, their block of the covariance counts.
     `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
@@ -168,25 +177,38 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     (2013), chapter 14 (prior information as further data).
     """
     if not isinstance(mean, Mapping) or not mean:
-        raise ValueError(f'`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> '
-            'mean, such as {"mass": 20.9, "inertia": 1.64}')
-    means = [float(checked_known(x, f"the mean of `{name}`", (), advice="give one number")) for name, x in mean.items()]
+        raise ValueError(
+            f"`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> "
+            'mean, such as {"mass": 20.9, "inertia": 1.64}'
+        )
+    means = [
+        float(checked_known(x, f"the mean of `{name}`", (), advice="give one number"))
+        for name, x in mean.items()
+    ]
     n, names = len(means), list(mean)
-    C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice="one row and one column "
-        f"for each of {', '.join(names)}")
+    C = checked_known(
+        covariance,
+        "`covariance` of `joint_normal`",
+        (n, n),
+        advice=f"one row and one column for each of {', '.join(names)}",
+    )
     if not (all_finite(C) and all_finite(means)):
         raise ValueError("mean and covariance of `joint_normal` must be finite; omit unknown quantities")
     for name, variance in zip(names, variances := np.diag(C), strict=True):
         if variance <= 0:
-            raise ValueError(f"the variance of `{name}` is {variance:g}, expected a number above zero; omit "
-                "known quantities")
+            raise ValueError(
+                f"the variance of `{name}` is {variance:g}, expected a number above zero; omit "
+                "known quantities"
+            )
     sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
     if largest(correlations - correlations.T) > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
-        raise ValueError("`covariance` of `joint_normal` is not a covariance matrix: its correlations have "
-            f"the eigenvalue {least:.3g}, expected none below zero")
+        raise ValueError(
+            "`covariance` of `joint_normal` is not a covariance matrix: its correlations have "
+            f"the eigenvalue {least:.3g}, expected none below zero"
+        )
     return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
 
 
@@ -237,10 +259,20 @@ class Estimate:
             guess = checked_known(self.guess, "`guess` of `Estimate`", advice="give a number")
             if not all_finite(guess):
                 raise ValueError(f"`guess` of `Estimate` is {self.guess}, expected a finite number")
-            object.__setattr__(self, "guess", tuple(guess.tolist()) if guess.ndim == 1 else float(checked_known(guess, "`guess` of `Estimate`", ())))
+            object.__setattr__(
+                self,
+                "guess",
+                (
+                    tuple(guess.tolist())
+                    if guess.ndim == 1
+                    else float(checked_known(guess, "`guess` of `Estimate`", ()))
+                ),
+            )
         check_kind(
-            self.range, Range | None, "`range` of `Estimate`",
-            "`bounds(low, high)`, `positive()` or `unbounded()`"
+            self.range,
+            Range | None,
+            "`range` of `Estimate`",
+            "`bounds(low, high)`, `positive()` or `unbounded()`",
         )
         check_kind(self.per_run, bool, "`per_run` of `Estimate`", "True or False")
         if self.prior is not None:
@@ -251,8 +283,11 @@ def _check_prior(prior) -> None:
     try:
         mean, sigma = float(prior.mean), float(prior.sigma)
     except (AttributeError, TypeError):
-        raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.studies.Normal(mean, "
-            "sigma)`") from None
+        raise ValueError(
+            f"`prior` of `Estimate` is {described(prior)}, expected `jj.studies.Normal(mean, sigma)`"
+        ) from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
-        raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give "
-            "known numbers without `Estimate`")
+        raise ValueError(
+            f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; give "
+            "known numbers without `Estimate`"
+        )

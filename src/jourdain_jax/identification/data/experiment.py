@@ -10,10 +10,30 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Number, Shape, array_module, check_kind, checked_unless_traced, holds, is_traced, static
+from jourdain_jax.calculus.reals import (
+    Entries,
+    Number,
+    Shape,
+    array_module,
+    check_kind,
+    checked_unless_traced,
+    holds,
+    is_traced,
+    static,
+)
 from jourdain_jax.identification.data.channels import Instrument, StopEvent, channel, cut
 from jourdain_jax.identification.data.estimate import Estimate, Range
-from jourdain_jax.identification.data.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
+from jourdain_jax.identification.data.sensors import (
+    Actuator,
+    Drive,
+    Numbers,
+    Reading,
+    Sensor,
+    Times,
+    ideal,
+    latest,
+    response,
+)
 from jourdain_jax.integrate.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import Labels, as_names, check_names, nearest
@@ -91,21 +111,42 @@ class Experiment(eqx.Module):
     ):
         self.ts = vector_of_times(ts)
         _check_times(self.ts)
-        for what, part in (("values", values), ("start", start), ("sensors", sensors or {}), ("events", events or {})):
+        for what, part in (
+            ("values", values),
+            ("start", start),
+            ("sensors", sensors or {}),
+            ("events", events or {}),
+        ):
             check_kind(part, Mapping, f"`{what}` of `Experiment`", 'a dictionary by name, such as {"x": ...}')
-        masked = {name for name, x in values.items() if isinstance(x, np.ma.MaskedArray) and x.dtype.kind in "iuf"}
-        filled = {name: np.ma.filled(x.astype(float), np.nan) if name in masked else x for name, x in values.items()}
+        masked = {
+            name for name, x in values.items() if isinstance(x, np.ma.MaskedArray) and x.dtype.kind in "iuf"
+        }
+        filled = {
+            name: np.ma.filled(x.astype(float), np.nan) if name in masked else x for name, x in values.items()
+        }
         self.values = _reals("values of channel", filled, "give numbers, NaN where a sample is missing")
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
-        self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
-        memory = correlation_time if isinstance(correlation_time, Mapping) else dict.fromkeys(self.values, correlation_time)
+        self.sigma = _reals(
+            "sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()}
+        )
+        memory = (
+            correlation_time
+            if isinstance(correlation_time, Mapping)
+            else dict.fromkeys(self.values, correlation_time)
+        )
         self.unknown_correlation = tuple(sorted(name for name, value in memory.items() if value is None))
         self.correlation_time = _correlation_times(memory)
         self.start = _reals("start value", start)
-        self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
+        self.unknown_start = (
+            dict(unknown_start)
+            if isinstance(unknown_start, Mapping)
+            else dict.fromkeys(as_names(unknown_start))
+        )
         self.inputs = inputs
-        self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
+        self.sensors = {
+            name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()
+        }
         self.readings, self.drives, self.estimates = {}, {}, {}
         self.t0 = self.ts[:1].reshape(()) if t0 is None else one_time(t0, "t0")
         self.ended_by = next(iter(events or {}), "")
@@ -119,21 +160,31 @@ class Experiment(eqx.Module):
                 f"before the last one ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
-            raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the "
-                "time of an event, in `events`")
+            raise ValueError(
+                "`values` is empty; give at least one channel: name -> measured values; or the "
+                "time of an event, in `events`"
+            )
         for names, what, known in (
             (self.sigma, "`sigma` names channel `{}`, which has no values", self.values),
-            (self.correlation_time, "`correlation_time` names channel `{}`, which has no "
-                "values", self.values),
+            (
+                self.correlation_time,
+                "`correlation_time` names channel `{}`, which has no values",
+                self.values,
+            ),
             (self.sensors, "sensor `{}` has no measured values", self.values),
-            (self.unknown_start, "unknown start value `{}` has no first guess; give one in "
-                "`start`", self.start),
+            (
+                self.unknown_start,
+                "unknown start value `{}` has no first guess; give one in `start`",
+                self.start,
+            ),
         ):
             check_names(names, known, what)
         for name in self.values:
             if name not in self.sigma:
-                raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one "
-                    "number for all channels")
+                raise ValueError(
+                    f"channel `{name}` has no sigma; give `sigma` a number for it, or one "
+                    "number for all channels"
+                )
         if self.ended_by in (*self.sensors, *self.correlation_time):
             raise ValueError(
                 f"`{self.ended_by}` is an event, whose time has no sensor or correlation time; omit them, or "
@@ -149,8 +200,10 @@ class Experiment(eqx.Module):
                 raise ValueError(f"channel `{name}` holds only NaN; omit the channel")
         for name, value in self.sigma.items():
             if not holds(lambda x: x > 0, value):
-                raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the "
-                    "standard deviation of its noise")
+                raise ValueError(
+                    f"sigma of channel `{name}` must be above zero (and not NaN); give the "
+                    "standard deviation of its noise"
+                )
 
     # Equinox's own costs a microsecond per access, and a fit reads a hundred fields
     __getattribute__ = object.__getattribute__
@@ -171,25 +224,35 @@ class Experiment(eqx.Module):
         xp = array_module(sigma)
         aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
         return xp.broadcast_to(aligned, values.shape)
+
+
 Data = Experiment | Sequence[Experiment]
 
 
-def _reals(what: str, given: Mapping, advice: str = "check how it is put together", shape: tuple[()] | None = None) -> dict[str, Array | np.ndarray]:
-    return {name: checked_unless_traced(value, f"{what} `{name}`", shape, advice=advice) for name, value in given.items()}
+def _reals(
+    what: str, given: Mapping, advice: str = "check how it is put together", shape: tuple[()] | None = None
+) -> dict[str, Array | np.ndarray]:
+    return {
+        name: checked_unless_traced(value, f"{what} `{name}`", shape, advice=advice)
+        for name, value in given.items()
+    }
 
 
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
     """Return the nonzero correlation times; zero for unknown ones."""
     numbers = {name: 0.0 if value is None else value for name, value in given.items()}
-    found = _reals("correlation time of channel", numbers, "give a time in s, or None where it is not "
-        "known", ())
+    found = _reals(
+        "correlation time of channel", numbers, "give a time in s, or None where it is not known", ()
+    )
     for name, time in found.items():
         if not holds(lambda x: np.isfinite(x) & (x >= 0), time):
             raise ValueError(
                 f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None "
                 "if unknown"
             )
-    return {name: time for name, time in found.items() if given[name] is None or holds(lambda x: x != 0, time)}
+    return {
+        name: time for name, time in found.items() if given[name] is None or holds(lambda x: x != 0, time)
+    }
 
 
 def _check_times(ts) -> None:
@@ -222,7 +285,9 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
         if name == run.ended_by:
             readings[name], shape = ideal("", StopEvent.of(scene, name, where)), ()
         else:
-            quantity, shape = _quantity(scene, run.sensors[name].quantity if name in run.sensors else None, name, where)
+            quantity, shape = _quantity(
+                scene, run.sensors[name].quantity if name in run.sensors else None, name, where
+            )
         if name in run.sensors:
             readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
             _check_begin(run, name, where, repeats)
@@ -231,16 +296,25 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
             hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
             hint = "; take its only column, `[:, 0]`" if values.shape == (*shape, 1) else hint
-            raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for "
-                f"{times} times{hint}")
+            raise ValueError(
+                f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for "
+                f"{times} times{hint}"
+            )
         if run.sigma[name].shape not in ((), (times,), shape):
-            raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, "
-                f"expected (), {(times,)} or {shape}")
+            raise ValueError(
+                f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, "
+                f"expected (), {(times,)} or {shape}"
+            )
     inputs, drives = _inputs(scene, run, where, estimates)
-    by_name = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
+    by_name = {
+        field: getattr(run, field)
+        for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")
+    }
     by_name |= {"readings": readings, "drives": drives, "estimates": estimates}
     # sorted as JAX orders them
-    return run.changed(inputs=inputs, **{field: dict(sorted(value.items())) for field, value in by_name.items()})
+    return run.changed(
+        inputs=inputs, **{field: dict(sorted(value.items())) for field, value in by_name.items()}
+    )
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
@@ -261,8 +335,10 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: Shape, esti
     numbers, unknown, used = response(sensor)
     for number in ("gain", "bias"):
         if numbers[number].shape not in ((), shape):
-            raise ValueError(f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, "
-                f"expected () or {shape}")
+            raise ValueError(
+                f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, "
+                f"expected () or {shape}"
+            )
     estimates |= {f"{name}.{number}": getattr(sensor, number) for number in unknown}
     named = isinstance(quantity, str)
     return Reading(numbers, unknown, used, None if named else quantity, quantity if named else "")
@@ -286,8 +362,7 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
 
 
 def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
-    """Return all inputs, with first guesses for estimated numbers, and the actuators with estimated numbers.
-    """
+    """Return all inputs, with first guesses for estimated numbers, and the actuators with estimated numbers."""
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}
@@ -302,10 +377,14 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
         drive = Drive(*response(actuator), actuator.command, scene.inputs.entries.index(name), actuator.hold)
         for number in drive.unknown:
             if f"{name}.{number}" in estimates:
-                raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated "
-                    f"{number}; give the channel another name")
+                raise ValueError(
+                    f"{where} has a channel and an input `{name}`, both with an estimated "
+                    f"{number}; give the channel another name"
+                )
             estimates[f"{name}.{number}"] = getattr(actuator, number)
-        if drive.has_filter and not holds(lambda command, ts: command[-1] >= ts[-1], actuator.command.ts, run.ts):
+        if drive.has_filter and not holds(
+            lambda command, ts: command[-1] >= ts[-1], actuator.command.ts, run.ts
+        ):
             raise ValueError(
                 f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, "
                 f"before the last sample at {float(run.ts[-1]):g} s, and its lag ends there; repeat the last "
@@ -319,11 +398,14 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
 
 def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
     """Raise ValueError if all samples of a varying input are before the run, or all after it."""
+
     def overlaps(knots, x, ts, t0):
         return np.ptp(x) == 0 or (knots[0] < ts[-1] and knots[-1] > t0)
 
     if isinstance(signal, Sampled) and not holds(overlaps, signal.ts, signal.values, run.ts, run.t0):
-        first, last, begin, end = (f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1]))
+        first, last, begin, end = (
+            f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1])
+        )
         raise ValueError(
             f"input `{name}` of {where} is sampled from {first} to {last} s, but the run is from {begin} to "
             f"{end} s, where the input would be constant; take both from one clock, or give a number"
@@ -338,7 +420,13 @@ def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> Shap
         return ()
     groups = {group: length for names in both for group, _, length in names.groups}
     if name not in groups:
-        unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities "
-            "give a function of the motion in `sensors`.")
+        unknown = (
+            f"unknown channel `{name}`"
+            if name == channel_name
+            else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
+        )
+        raise ValueError(
+            f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities "
+            "give a function of the motion in `sensors`."
+        )
     return (groups[name],)

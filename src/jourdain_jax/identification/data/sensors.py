@@ -28,7 +28,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Number, Scalar, array_module, check_kind, checked_real, described, holds, is_traced, real_type, static
+from jourdain_jax.calculus.reals import (
+    Entries,
+    Number,
+    Scalar,
+    array_module,
+    check_kind,
+    checked_real,
+    described,
+    holds,
+    is_traced,
+    real_type,
+    static,
+)
 from jourdain_jax.identification.data.channels import Channel, Instrument, StopEvent
 from jourdain_jax.identification.data.estimate import Estimate, positive, unbounded
 from jourdain_jax.integrate.inputs import Inputs, Sampled
@@ -121,12 +133,16 @@ def read(
             return _relaxed(y, polynomial, begin, jnp.ones((), flat.dtype), rho), y
 
         end, at_begins = jax.lax.scan(next_one, flat[0] if begin is None else begin, (polynomials, left))
-        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(at_begins[interval], polynomials[interval], left[interval], since, rho)
+        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(
+            at_begins[interval], polynomials[interval], left[interval], since, rho
+        )
         y = jnp.concatenate([at_begins, end[None]])
     return found.reshape(ts.shape[0], *values.shape[1:]), y
 
 
-def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho) -> Float[Array, "channel"]:
+def _relaxed(
+    y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho
+) -> Float[Array, "channel"]:
     """Return the filter's output `since` intervals after the time `begin`, at which it was `y`."""
     small = rho < 0.2
     quick, slow = jnp.where(small, rho, 0.1), jnp.where(small, 1.0, rho)
@@ -138,8 +154,15 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
         particular = particular + (-quick) ** order * derivative
     decay = jnp.exp(-since / jnp.maximum(quick, _LEAST))
     by_formula = jnp.polyval(particular, begin + since) + (y - jnp.polyval(particular, begin)) * decay
-    weights = since / slow * jnp.asarray(_WEIGHTS, polynomial.dtype) * jnp.exp(-since * (1 - _NODES.astype(polynomial.dtype)) / slow)
-    inside = jax.vmap(lambda node: jnp.polyval(polynomial, begin + since * node))(jnp.asarray(_NODES, polynomial.dtype))
+    weights = (
+        since
+        / slow
+        * jnp.asarray(_WEIGHTS, polynomial.dtype)
+        * jnp.exp(-since * (1 - _NODES.astype(polynomial.dtype)) / slow)
+    )
+    inside = jax.vmap(lambda node: jnp.polyval(polynomial, begin + since * node))(
+        jnp.asarray(_NODES, polynomial.dtype)
+    )
     by_quadrature = y * jnp.exp(-since / slow) + weights @ inside
     return jnp.where(small, by_formula, by_quadrature)
 
@@ -150,7 +173,9 @@ def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Ar
     """
     half = 0.5e-3 * jnp.min(jnp.diff(ts))
     late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
-    return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
+    return jnp.concatenate([ts[:1], late]), jnp.concatenate(
+        [values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)]
+    )
 
 
 def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
@@ -223,10 +248,14 @@ class Sensor(eqx.Module):
         lag: Stated = 0.0,
     ):
         if not (quantity is None or isinstance(quantity, str | Instrument) or callable(quantity)):
-            raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a "
-                "speed, or a function of a motion")
+            raise ValueError(
+                f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a "
+                "speed, or a function of a motion"
+            )
         self.quantity = quantity
-        self.gain, self.bias, self.delay, self.lag = _checked("Sensor", gain=gain, bias=bias, delay=delay, lag=lag)
+        self.gain, self.bias, self.delay, self.lag = _checked(
+            "Sensor", gain=gain, bias=bias, delay=delay, lag=lag
+        )
 
 
 class Actuator(eqx.Module):
@@ -256,48 +285,70 @@ class Actuator(eqx.Module):
     lag: Scalar | Estimate  # s
     hold: bool = static()
 
-    def __init__(self, command: Sampled, *, gain: Stated = 1.0, bias: Stated = 0.0, delay: Stated = 0.0, lag: Stated = 0.0, hold: bool = False):
+    def __init__(
+        self,
+        command: Sampled,
+        *,
+        gain: Stated = 1.0,
+        bias: Stated = 0.0,
+        delay: Stated = 0.0,
+        lag: Stated = 0.0,
+        hold: bool = False,
+    ):
         check_kind(command, Sampled, "`command` of `Actuator`", "`jj.Sampled(ts, values)`")
         check_kind(
-            hold, bool, "`hold` of `Actuator`",
-            "True (each value until the next) or False (linear between samples)"
+            hold,
+            bool,
+            "`hold` of `Actuator`",
+            "True (each value until the next) or False (linear between samples)",
         )
         self.command, self.hold = command, hold
-        self.gain, self.bias, self.delay, self.lag = _checked("Actuator", gain=gain, bias=bias, delay=delay, lag=lag)
+        self.gain, self.bias, self.delay, self.lag = _checked(
+            "Actuator", gain=gain, bias=bias, delay=delay, lag=lag
+        )
 
 
 def _checked(owner: str, **numbers) -> list:
-    return [_checked_number(f"`{name}` of `{owner}`", name, value, owner == "Actuator") for name, value in numbers.items()]
+    return [
+        _checked_number(f"`{name}` of `{owner}`", name, value, owner == "Actuator")
+        for name, value in numbers.items()
+    ]
 
 
 def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array, '...'] | Estimate":
     if isinstance(value, Estimate):
         _check_estimate(where, name, value)
         return value
-    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or "
-        "an `Estimate`").astype(real_type())
+    number = checked_real(
+        value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`"
+    ).astype(real_type())
     if not holds(np.isfinite, number):
         raise ValueError(f"{where} is {number}, expected a finite number")
     if name in OF_TIME and not holds(lambda x: x >= 0, number):
-        raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a "
-            "channel is ahead, shift its times")
+        raise ValueError(
+            f"{where} is {float(number):g} s, expected zero or more; where the clock of a "
+            "channel is ahead, shift its times"
+        )
     return number
 
 
 def _check_estimate(where: str, name: str, value: Estimate) -> None:
     if value.guess is None:
-        raise ValueError(f"{where} is to be estimated, but has no first guess; give one: "
-            f"`jj.Estimate({NUMBERS[name]})`")
+        raise ValueError(
+            f"{where} is to be estimated, but has no first guess; give one: `jj.Estimate({NUMBERS[name]})`"
+        )
     if name not in OF_TIME:
         return
     if isinstance(value.guess, tuple):
         raise ValueError(f"{where} has {len(value.guess)} guesses, expected one number")
     if name == "delay" and (value.range is None or not np.isfinite(value.range.high)):
-        raise ValueError(f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, "
-            "high)`, in s")
+        raise ValueError(
+            f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, high)`, in s"
+        )
     if value.range is not None and value.range.low < 0:
-        raise ValueError(f"{where} may fall to {value.range.low:g} s, expected a range that begins at zero "
-            "or above")
+        raise ValueError(
+            f"{where} may fall to {value.range.low:g} s, expected a range that begins at zero or above"
+        )
 
 
 def default_range(name: str):
@@ -340,15 +391,23 @@ class Reading(Response):
         """
         if self.operation is None:
             return motion[self.name]
-        return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
+        return (
+            self.operation.over_times(motion)
+            if isinstance(self.operation, Instrument)
+            else jax.vmap(self.operation)(states)
+        )
 
-    def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
+    def shown(
+        self, x, grid, ts, begin=None
+    ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
         """Return the reading at `ts` of a quantity with values `x` at these times or on a grid, and y on the
         grid. `begin`: initial output of the filter (None: its steady value).
         """
         y = None
         if grid is not None:
-            x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
+            x, y = read(
+                x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin
+            )
         return self.scaled(x), y
 
 
@@ -371,7 +430,9 @@ class Drive(Response):
             values = filtered(ts, values, self.numbers["lag"], self.hold)
         elif self.hold and ts.shape[0] > 1:
             ts, values = held(ts, values)
-        return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values)))
+        return eqx.tree_at(
+            lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values))
+        )
 
     def put_into(self, inputs) -> Inputs:
         """Return `inputs` with this signal."""
@@ -386,13 +447,25 @@ def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
     numbers = {name: array_module(x).asarray(x, real_type()) for name, x in numbers.items()}
-    return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or holds(lambda x, n=n: np.any(x != NUMBERS[n]), x))
+    return (
+        numbers,
+        unknown,
+        tuple(
+            n for n, x in numbers.items() if n in unknown or holds(lambda x, n=n: np.any(x != NUMBERS[n]), x)
+        ),
+    )
 
 
 def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:
     """Return readings or drives with these numbers (`gyro.gain` -> number) in place of the estimated ones."""
-    numbers = {label: part.numbers | {name: known[f"{label}.{name}"] for name in part.unknown} for label, part in parts.items()}
-    return {label: eqx.tree_at(lambda p: p.numbers, part, numbers[label]) if part.unknown else part for label, part in parts.items()}
+    numbers = {
+        label: part.numbers | {name: known[f"{label}.{name}"] for name in part.unknown}
+        for label, part in parts.items()
+    }
+    return {
+        label: eqx.tree_at(lambda p: p.numbers, part, numbers[label]) if part.unknown else part
+        for label, part in parts.items()
+    }
 
 
 def latest(delay: Array | Estimate) -> float:

@@ -30,7 +30,9 @@ from jourdain_jax.identification.solve.arrow import Arrow, PerMember, eliminated
 SHORTEST = 0.1  # in shortest intervals: below this tau, the noise is white
 
 
-def chain(weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+def chain(
+    weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np
+) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Return two arrays for a channel: the index of the previous sample that is not missing (the sample's own
     index if there is none), and the time since that sample in s.
 
@@ -69,7 +71,11 @@ class Chains:
 
     @staticmethod
     def of(
-        weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], unknown: list[slice]
+        weights: Mapping[str, np.ndarray],
+        ts: np.ndarray,
+        taus: Mapping[str, np.ndarray],
+        channels: Mapping[str, slice],
+        unknown: list[slice],
     ) -> "Chains":
         """Return the chains of samples of some channels. Shapes: weights (runs, members, times, *channel),
         times (runs, times), correlation times (runs,).
@@ -78,10 +84,17 @@ class Chains:
         for name, where in channels.items():
             count = (where.stop - where.start) // times
             apart = weights[name].reshape(runs, -1, times, count)
-            place, gap = (np.stack(x) for x in zip(*(chain(np.moveaxis(one, 1, 0), t) for one, t in zip(apart, ts, strict=True)), strict=True))
+            place, gap = (
+                np.stack(x)
+                for x in zip(
+                    *(chain(np.moveaxis(one, 1, 0), t) for one, t in zip(apart, ts, strict=True)), strict=True
+                )
+            )
             both = where.start + place * count + np.arange(count), gap
             parts.append([np.moveaxis(x, 1, 2).reshape(runs, -1, times * count) for x in both])
-            known.append(np.repeat(np.asarray(taus.get(name, np.zeros(runs)))[:, None], times * count, axis=1))
+            known.append(
+                np.repeat(np.asarray(taus.get(name, np.zeros(runs)))[:, None], times * count, axis=1)
+            )
         before, gap = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
         return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
@@ -96,14 +109,18 @@ class Chains:
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
-    """Return `log det(J'J) / 2` for unknowns divided by `size`. Each undetermined direction adds a constant.
-    """
+    """Return `log det(J'J) / 2` for unknowns divided by `size`. Each undetermined direction adds a constant."""
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts
     members = len(size)
     upper, rest = eliminated(scaled.local, np.full((members, runs, m), tiny))
-    whole = np.concatenate([scaled.shared[..., :p], rest[..., :p], np.broadcast_to(tiny * np.eye(p), (members, p, p))], axis=1)
-    diagonals = np.einsum("bkii->bki", upper[..., :m]).reshape(members, -1), np.einsum("bii->bi", np.linalg.qr(whole, mode="r"))
+    whole = np.concatenate(
+        [scaled.shared[..., :p], rest[..., :p], np.broadcast_to(tiny * np.eye(p), (members, p, p))], axis=1
+    )
+    diagonals = (
+        np.einsum("bkii->bki", upper[..., :m]).reshape(members, -1),
+        np.einsum("bii->bi", np.linalg.qr(whole, mode="r")),
+    )
     return sum((np.sum(np.log(np.abs(d)), axis=1) for d in diagonals), np.zeros(members))
 
 
@@ -119,7 +136,9 @@ def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) 
         a, b = np.where(left, a, inner[0]), np.where(left, inner[1], b)
         kept = [np.where(left, *pair) for pair in (inner, values)]
         new = np.where(left, b - golden * (b - a), a + golden * (b - a))
-        inner, values = ([np.where(left, n, k), np.where(left, k, n)] for n, k in zip((new, f(new)), kept, strict=True))
+        inner, values = (
+            [np.where(left, n, k), np.where(left, k, n)] for n, k in zip((new, f(new)), kept, strict=True)
+        )
     return np.asarray((a + b) / 2)
 
 
@@ -129,8 +148,10 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
     """
     ts = [np.asarray(run.ts) for run in runs if channel in run.values and len(run.ts) > 1]
     if not ts:
-        raise ValueError("a correlation time is None, but each run has only one sample, which cannot "
-            "determine it; give a number in s, or 0 for white noise")
+        raise ValueError(
+            "a correlation time is None, but each run has only one sample, which cannot "
+            "determine it; give a number in s, or 0 for white noise"
+        )
     # beyond ten spans it is hardly distinguishable from a bias
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 

@@ -46,7 +46,12 @@ _NODES, _WEIGHTS = gauss_legendre(5)
 
 @shown_from_users_lines
 def filtered_log_likelihood(
-    scene: Scene | BuiltFor, data: Data, *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
+    scene: Scene | BuiltFor,
+    data: Data,
+    *,
+    process_noise: Mapping,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> Scalar:
     """Return the log-likelihood for a motion with process noise, by an extended Kalman filter. Process noise
     disturbs the motion itself, as a rider or rough ground does.
@@ -86,7 +91,9 @@ def filtered_log_likelihood(
         intensities = _intensities(scene, speeds, process_noise)
         names = tuple(dict.fromkeys(name for i in numbers for name in runs[i].unknown_start))
 
-        def one(run: Run, begun: Float[Array, "2 unknown"], names=names, known=(speeds, intensities)) -> Scalar:
+        def one(
+            run: Run, begun: Float[Array, "2 unknown"], names=names, known=(speeds, intensities)
+        ) -> Scalar:
             mean, sigma = begun
             run = run._replace(start=run.start | dict(zip(names, mean, strict=True)))
             return _Filter(scene, run, settled, *known).log_likelihood(names, sigma)
@@ -105,7 +112,10 @@ class _Filter:
         self.begin = self._start(run.start)
         count = len(scene.coordinate_names)
         self.coordinates = others(dependent_coordinates(scene, self.begin, (), None), count)
-        self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
+        self.held = (
+            *(scene.coordinate_names.entries[i] for i in self.coordinates),
+            *(scene.speed_names.entries[i] for i in speeds),
+        )
 
     def log_likelihood(self, unknown: Labels, sigma: Float[Array, "unknown"]) -> Scalar:
         """Return the log-likelihood of all samples; `sigma`: standard deviations of start values."""
@@ -121,7 +131,9 @@ class _Filter:
             J = jax.jacfwd(begun)(jnp.stack([run.start[name] for name in unknown]))
             P = (J * sigma**2) @ J.T
         names = sorted(run.weights)
-        flat = lambda parts: jnp.concatenate([parts[name].reshape(run.ts.shape[0], -1) for name in names], axis=1)  # noqa: E731
+        flat = lambda parts: jnp.concatenate(
+            [parts[name].reshape(run.ts.shape[0], -1) for name in names], axis=1
+        )
 
         def step(carry, sample):
             t, q, x, P, total = carry
@@ -155,7 +167,9 @@ class _Filter:
         times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
 
         def later(x):
-            motion = simulate(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, options=self.options)
+            motion = simulate(
+                self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, options=self.options
+            )
             found = self._independent(motion.q, motion.u)
             return found, (found[-1], motion.q[-1])
 
@@ -182,7 +196,11 @@ class _Filter:
         K = jax.scipy.linalg.cho_solve((L, True), H @ P).T
         rest = jnp.eye(x.size) - K @ H
         white = jax.scipy.linalg.solve_triangular(L, r, lower=True)
-        more = -0.5 * white @ white - jnp.sum(jnp.log(jnp.diagonal(L))) - 0.5 * jnp.sum(there) * jnp.log(2 * jnp.pi)
+        more = (
+            -0.5 * white @ white
+            - jnp.sum(jnp.log(jnp.diagonal(L)))
+            - 0.5 * jnp.sum(there) * jnp.log(2 * jnp.pi)
+        )
         return x + K @ r, rest @ P @ rest.T + (K * R) @ K.T, more
 
     def _shown(self, t, state: State) -> Float[Array, "channels"]:
@@ -190,15 +208,21 @@ class _Filter:
         for name in sorted(self.run.weights):
             sensor = self.run.sensors.get(name, ideal(name))
             operation = sensor.operation
-            x = operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t))) if isinstance(operation, Channel) else state[sensor.name]
+            x = (
+                operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t)))
+                if isinstance(operation, Channel)
+                else state[sensor.name]
+            )
             found.append(jnp.ravel(sensor.shown(x[None], None, None)[0]))
         return jnp.concatenate(found)
 
 
 def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     if scene.coordinates.quaternions:
-        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose covariance the filter does not "
-            "support; use a scene with angles as coordinates")
+        raise ValueError(
+            f"`{type(scene).__name__}` has quaternions, whose covariance the filter does not "
+            "support; use a scene with angles as coordinates"
+        )
     check_known(runs, "a filter")
     for index, run in enumerate(runs):
         for name in (*run.correlation_time, *run.unknown_correlation):
@@ -208,15 +232,21 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
             )
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):
-                raise ValueError(f"run {index} gives the time of its event `{name}`, which the filter does "
-                    "not use; omit it, and the samples after it")
+                raise ValueError(
+                    f"run {index} gives the time of its event `{name}`, which the filter does "
+                    "not use; omit it, and the samples after it"
+                )
             which = f"sensor `{name}` of run {index}"
             if reading.is_late:
-                raise ValueError(f"{which} has a delay or a lag, which the filter does not support; shift "
-                    "its times by the delay, or use `fit`")
+                raise ValueError(
+                    f"{which} has a delay or a lag, which the filter does not support; shift "
+                    "its times by the delay, or use `fit`"
+                )
             if isinstance(reading.operation, Instrument):
-                raise ValueError(f"{which} measures accelerations, which contain the white disturbance "
-                    "itself; omit it, or use `fit`")
+                raise ValueError(
+                    f"{which} measures accelerations, which contain the white disturbance "
+                    "itself; omit it, or use `fit`"
+                )
         for name, given in run.unknown_start.items():
             if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):
                 raise ValueError(
@@ -235,15 +265,19 @@ def _independent_speeds(scene: Scene, run: Experiment) -> Indices:
     def at_start() -> Indices:
         return privileged_at(scene, begin, inputs_at(inputs, run.t0), usual)
 
-    determined = scene.privileged is not None or holds(lambda *_: at_start() == usual, *jax.tree.leaves((scene, begin)))
+    determined = scene.privileged is not None or holds(
+        lambda *_: at_start() == usual, *jax.tree.leaves((scene, begin))
+    )
     return usual if determined else at_start()
 
 
 def _intensities(scene: Scene, speeds: Indices, given: Mapping) -> Speeds:
     names = [scene.speed_names.entries[i] for i in speeds]
     if not isinstance(given, Mapping):
-        raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> "
-            "intensity in (unit of the speed)^2 / s")
+        raise ValueError(
+            f"`process_noise` is {given!r}, expected a dictionary: independent speed -> "
+            "intensity in (unit of the speed)^2 / s"
+        )
     found = dict.fromkeys(names, jnp.zeros(()))
     for name, value in given.items():
         if name not in names:
@@ -262,5 +296,8 @@ def _intensities(scene: Scene, speeds: Indices, given: Mapping) -> Speeds:
 def _begun(run: Experiment, names: Labels) -> Float[Array, "2 unknown"]:
     """Return means and standard deviations of these start values."""
     given: dict[str, Any] = dict(run.unknown_start)  # estimates with priors
-    known = [(given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0) for name in names]
+    known = [
+        (given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0)
+        for name in names
+    ]
     return jnp.array(known, real_type()).reshape(-1, 2).T

@@ -72,7 +72,13 @@ class Information:
     def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
         """Return the covariance of all unknowns, in their units, along the determined directions."""
         runs, m, p = self.follow.shape[-3:]
-        G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)], axis=-2)
+        G = np.concatenate(
+            [
+                np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)),
+                -self.follow.reshape(*self.follow.shape[:-3], runs * m, p),
+            ],
+            axis=-2,
+        )
         whole = G @ self.shared @ np.swapaxes(G, -1, -2)
         for i in range(runs):
             block = slice(p + i * m, p + (i + 1) * m)
@@ -81,7 +87,14 @@ class Information:
 
     def only(self) -> "Information":
         """Return the values of the only member, without the axis of members."""
-        return replace(self, **{name: np.asarray(x[0]) for name, x in vars(self).items() if name not in ("hidden", "estimated")})
+        return replace(
+            self,
+            **{
+                name: np.asarray(x[0])
+                for name, x in vars(self).items()
+                if name not in ("hidden", "estimated")
+            },
+        )
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Return the information with the covariance of the shared unknowns from the differences between
@@ -93,14 +106,21 @@ class Information:
         runs = scores.shape[-2]
         shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
         variance = variances(shared, self.own, self.follow)[..., self.estimated]
-        return replace(self, standard_errors=np.where(self.identifiable, np.sqrt(variance), np.nan), shared=shared)
+        return replace(
+            self, standard_errors=np.where(self.identifiable, np.sqrt(variance), np.nan), shared=shared
+        )
 
 
-def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[np.ndarray, "*members places"]:
-    """Return variances of shared unknowns and of the runs' own unknowns, from the blocks of an `Information`.
-    """
-    of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", follow, shared, follow)
-    return np.concatenate([np.diagonal(shared, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)
+def variances(
+    shared: np.ndarray, own: np.ndarray, follow: np.ndarray
+) -> Float[np.ndarray, "*members places"]:
+    """Return variances of shared unknowns and of the runs' own unknowns, from the blocks of an `Information`."""
+    of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum(
+        "...kij,...jl,...kil->...ki", follow, shared, follow
+    )
+    return np.concatenate(
+        [np.diagonal(shared, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:-2], -1)], axis=-1
+    )
 
 
 def students_t_95(degrees):
@@ -110,7 +130,14 @@ def students_t_95(degrees):
     return stdtrit(np.clip(degrees, 1.0, 1e7), 0.975)
 
 
-def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float) -> Information:
+def information(
+    arrow: Arrow,
+    size: Float[np.ndarray, "members places"],
+    estimated: np.ndarray,
+    bound,
+    fails,
+    cutoff: float,
+) -> Information:
     """Return the information of an arrow in units of sigma.
 
     `size`: magnitude of each unknown, in its unit; `estimated`: indices of unknowns; `bound`: (members,
@@ -134,7 +161,10 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     shows_s = cutoff * largest[:, None] < S_s
     squares = np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)
     covariance = np.swapaxes(Vt_s, 1, 2) @ (squares[..., None] * Vt_s)
-    hidden = [_hidden_directions(Vt[b], shows[b], Vt_s[b, ~shows_s[b]], follow[b], held[b]) for b in range(len(size))]
+    hidden = [
+        _hidden_directions(Vt[b], shows[b], Vt_s[b, ~shows_s[b]], follow[b], held[b])
+        for b in range(len(size))
+    ]
     variance = variances(covariance, own, follow)
     least_part = np.minimum(np.sqrt(cutoff), np.sqrt(variance) * least_move(cutoff, largest)[:, None])
     has_part = np.stack([np.linalg.norm(rows, axis=0) for rows in hidden]) > least_part
@@ -164,7 +194,9 @@ def least_move(cutoff: float, largest):
     return np.maximum(0.1, cutoff * largest)
 
 
-def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _hidden_directions(
+    own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray
+) -> np.ndarray:
     """Return orthonormal undetermined directions that leave held unknowns unchanged. `own`: V' of each run,
     possibly with determined directions.
     """
@@ -172,7 +204,9 @@ def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, f
     apart = np.zeros((len(runs), count, m))
     apart[range(len(runs)), runs] = own[runs, places]
     of_own = np.pad(apart.reshape(len(runs), count * m), ((0, 0), (p, 0)))
-    of_shared = np.concatenate([shared, -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), count * m)], axis=1)
+    of_shared = np.concatenate(
+        [shared, -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), count * m)], axis=1
+    )
     _, S, Vt = np.linalg.svd(np.where(held, 0.0, np.concatenate([of_own, of_shared])), full_matrices=False)
     return Vt[S > 1e-6]  # directions of held unknowns alone are excluded
 
@@ -191,7 +225,9 @@ def hidden_combinations(directions, least_part, size, values, labels: Labels) ->
     return tuple(_in_words(row, relative, relative & ~shared, values, labels) for row in basis)
 
 
-def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels) -> str:
+def _in_words(
+    row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: Labels
+) -> str:
     """Return a sentence on the direction. `power`: whether an unknown may occur in a product of powers that
     is constant along all directions.
     """
@@ -225,7 +261,9 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
     """
     rows, free = rows.copy(), list(range(len(rows)))
     for _ in range(len(rows)):
-        i, k = max(((i, k) for i in free for k in range(rows.shape[1])), key=lambda place: round(abs(rows[place]), 6))
+        i, k = max(
+            ((i, k) for i in free for k in range(rows.shape[1])), key=lambda place: round(abs(rows[place]), 6)
+        )
         rows[i] /= rows[i, k]
         others = [j for j in range(len(rows)) if j != i]
         rows[others] -= np.outer(rows[others, k], rows[i])
@@ -233,7 +271,12 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
     return np.where(np.abs(rows) > least_part * np.linalg.norm(rows, axis=1, keepdims=True), rows, 0.0)
 
 
-def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], shared: Float[np.ndarray, "*repeats shared"]):
+def derived(
+    scene: Scene,
+    layout: Layout,
+    function: Callable[[Scene], Array],
+    shared: Float[np.ndarray, "*repeats shared"],
+):
     """Return y and its derivatives with respect to the shared unknowns, for one fit or each fit of a batch.
     Raises ValueError unless the function returns numbers.
     """
@@ -243,8 +286,9 @@ def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], sh
         try:
             return jnp.asarray(value, real_type())
         except (TypeError, ValueError):
-            raise ValueError(f"the function returns {described(value)}, expected a number or an array of "
-                "numbers") from None
+            raise ValueError(
+                f"the function returns {described(value)}, expected a number or an array of numbers"
+            ) from None
 
     def with_slopes(shared):
         return of(shared), jax.jacfwd(of)(shared)
@@ -268,13 +312,22 @@ def standard_errors(
     They are NaN for numbers that depend on an undetermined direction or on an unknown at a bound.
     """
     shared = slopes.shape[-1]
-    parts = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0), known.rank, slopes, sizes, at_bound
+    parts = (
+        known.whole_covariance[..., :shared, :shared],
+        np.max(known.singular_values, axis=-1, initial=0.0),
+        known.rank,
+        slopes,
+        sizes,
+        at_bound,
+    )
 
     def of_one(hidden, C, largest, rank, slopes, sizes, at_bound):
         error = np.sqrt(np.einsum("...i,ij,...j->...", slopes, C, slopes))
         scaled = slopes * sizes  # with respect to theta / size
         part = np.linalg.norm(scaled @ hidden[:, :shared].T, axis=-1)
-        most = np.minimum(np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest))
+        most = np.minimum(
+            np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest)
+        )
         lost = np.any((slopes != 0) & (at_bound | (rank == 0)), axis=-1)
         return np.where((part <= most) & ~lost, error, np.nan)
 
@@ -283,9 +336,11 @@ def standard_errors(
     return np.stack([of_one(*one) for one in zip(known.hidden, *parts, strict=True)])
 
 
-
 def weak_combinations(
-    covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: Labels
+    covariance: Float[np.ndarray, "unknowns unknowns"],
+    values: Float[np.ndarray, "unknowns"],
+    sizes: Float[np.ndarray, "unknowns"],
+    labels: Labels,
 ) -> Labels:
     """Return the directions with a relative standard error of at least 0.1, weakest first, one sentence each.
 
@@ -302,11 +357,15 @@ def weak_combinations(
         spread = float(np.sqrt(max(squares[k], 0.0)))
         if spread < 0.1:
             break
-        change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
+        change = (
+            spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)
+        )  # d theta / |theta|, or d theta
         # relative to the largest entry of a direction: smaller ones are omitted
         parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * largest(directions[:, k]))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
-        *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
+        *others, last = [
+            _by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts
+        ]
         if others:
             said = "together are one standard error: the data determine this combination poorly"
             found.append(f"{', '.join(others)} and {last} {said}")
@@ -316,5 +375,9 @@ def weak_combinations(
 
 
 def _by(name: str, change: float, is_relative: bool) -> str:
-    how = f"{100 * change:.2g} %" if is_relative and abs(change) < 0.995 else f"{change:.2g}{' times its value' if is_relative else ''}"
+    how = (
+        f"{100 * change:.2g} %"
+        if is_relative and abs(change) < 0.995
+        else f"{change:.2g}{' times its value' if is_relative else ''}"
+    )
     return f"a change of `{name}` by {how}"

@@ -25,7 +25,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, check_kind, compiled, described, holds, is_traced, largest, static
+from jourdain_jax.calculus.reals import (
+    Entries,
+    Indices,
+    Scalar,
+    array_module,
+    check_kind,
+    compiled,
+    described,
+    holds,
+    is_traced,
+    largest,
+    static,
+)
 from jourdain_jax.identification.data.estimate import Estimate, Range
 from jourdain_jax.identification.data.experiment import Data, Experiment, checked
 from jourdain_jax.identification.inference.correlated_noise import log_density
@@ -50,12 +62,25 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentenc
     """
     found: list[str] = []
     for index, run in enumerate(runs):
-        for name, signal in zip(scene.inputs, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
-            if isinstance(signal, Sampled) and not holds(lambda x, *_: np.ptp(x) == 0, signal.values, signal.ts, run.ts, run.t0):
-                found += _of_input(f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1]))
+        for name, signal in zip(
+            scene.inputs, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False
+        ):
+            if isinstance(signal, Sampled) and not holds(
+                lambda x, *_: np.ptp(x) == 0, signal.values, signal.ts, run.ts, run.t0
+            ):
+                found += _of_input(
+                    f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1])
+                )
         for name, values in run.values.items():
-            quantity, shown = run.sensors[name].quantity if name in run.sensors else name, values[0] if repeats else values
-            is_angle = quantity in scene.coordinate_names.entries if isinstance(quantity, str) else callable(quantity)
+            quantity, shown = (
+                run.sensors[name].quantity if name in run.sensors else name,
+                values[0] if repeats else values,
+            )
+            is_angle = (
+                quantity in scene.coordinate_names.entries
+                if isinstance(quantity, str)
+                else callable(quantity)
+            )
             if is_angle and shown.ndim == 1 and not is_traced((shown, run.ts)):
                 found += _of_angle(f"channel `{name}` of run {index}", shown, run.ts)
     return tuple(found)
@@ -68,7 +93,11 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
     """
     intervals, beyond = np.diff(ts), 1.5  # allowed distance of the ends from the run's, in intervals
     spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
-    spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > beyond * max(intervals[-2:]) else []
+    spans += (
+        [f"its last value from {ts[-1]:.6g} to {end:.6g} s"]
+        if end - ts[-1] > beyond * max(intervals[-2:])
+        else []
+    )
     if spans:
         yield (
             f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "
@@ -105,12 +134,14 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
 
 _REFUSED = dict.fromkeys(
     ("start", "t0", "t1", "ts", "inputs", "events", "work"),
-        "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
+    "each `Experiment` states start, times and inputs, and its motion ends with its last sample",
 )
 _REFUSED["retry"] = "its motions are compiled, in one way"
 
 
-def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str) -> AllOptions:
+def as_fit_options(
+    scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str
+) -> AllOptions:
     """Return the options of the motions of a fit, or of a likelihood."""
     found = as_options(options, by_name, function, _REFUSED, scene)
     return replace(found, work=False, retry=False)
@@ -125,7 +156,11 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
     as_scene(scene)
     check_kind(data, Experiment | Iterable, "`data`", "an `Experiment` or a sequence of at least one")
     runs = (data,) if isinstance(data, Experiment) else tuple(data)
-    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)] if runs else ["`data` is empty"]
+    wrong = (
+        [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)]
+        if runs
+        else ["`data` is empty"]
+    )
     if wrong:
         raise ValueError(f"{wrong[0]}, expected an `Experiment` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
@@ -141,8 +176,10 @@ def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Exp
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
         if any(name in run.values and name not in unknown(run) for run in runs):
-            raise ValueError(f"{what} of channel `{name}` is None in one run and given in another; give it "
-                "in all runs, or in none")
+            raise ValueError(
+                f"{what} of channel `{name}` is None in one run and given in another; give it "
+                "in all runs, or in none"
+            )
     return names
 
 
@@ -150,14 +187,20 @@ def check_known(runs: Sequence[Experiment], what: str) -> None:
     """Raise ValueError if a sigma, or a number of a sensor or an actuator, is unknown."""
     for run in runs:
         for name in run.unknown_sigma:
-            raise ValueError(f"sigma of channel `{name}` is None, but {what} needs the standard deviation of "
-                "its noise; give a number")
+            raise ValueError(
+                f"sigma of channel `{name}` is None, but {what} needs the standard deviation of "
+                "its noise; give a number"
+            )
         for label in run.estimates:
-            raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, "
-                "which may be traced, in place of the `Estimate`")
+            raise ValueError(
+                f"`{label}` is to be estimated, but {what} needs its value; give a number, "
+                "which may be traced, in place of the `Estimate`"
+            )
 
 
-def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]) -> Scalar:
+def log_likelihood(
+    scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]
+) -> Scalar:
     """Return the logarithm of the probability density of the measurements `data` (one run or several): `- sum
     r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
@@ -179,7 +222,11 @@ def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | No
             "number in s, or 0 for white noise"
         )
     check_known(runs, "a likelihood")
-    return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]))
+    return jnp.sum(
+        jnp.stack(
+            [jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]
+        )
+    )
 
 
 def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
@@ -226,8 +273,7 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def standard_errors(self) -> dict[str, Scalar]:
-        """Return lower bounds of standard errors of unbiased estimates, by name, in the unit of the unknown.
-        """
+        """Return lower bounds of standard errors of unbiased estimates, by name, in the unit of the unknown."""
         return dict(zip(self.labels, jnp.sqrt(jnp.diagonal(self.covariance)), strict=True))
 
     def log_det(self, names: str | Iterable[str] = ()) -> Scalar:
@@ -256,7 +302,10 @@ class PlannedInformation(Printed, eqx.Module):
 
     def _text(self) -> str:
         shows = np.linalg.norm(self._hidden[0], axis=0) < np.sqrt(_CUTOFF)
-        errors = [f"{float(e):.3g}" if one else "-" for e, one in zip(self.standard_errors.values(), shows, strict=True)]
+        errors = [
+            f"{float(e):.3g}" if one else "-"
+            for e, one in zip(self.standard_errors.values(), shows, strict=True)
+        ]
         rows = [("unknown", "unit", "std. error"), *zip(self.labels, self.units, errors, strict=True)]
         lines = [f"Planned: {len(self.sensitivities)} runs, {len(self.labels)} unknowns", *table(rows)]
         return "\n".join(lines + [f"  {sentence}" for sentence in self.not_identifiable])
@@ -319,9 +368,18 @@ def planned_information(
                 "give a number"
             )
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, which a plan does not "
-                "support; omit it")
-    numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
+            raise ValueError(
+                f"the noise of channel `{name}` has a correlation time, which a plan does not "
+                "support; omit it"
+            )
+    numbers = [
+        eqx.tree_at(
+            lambda r: r.start,
+            run,
+            {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()},
+        )
+        for run in runs
+    ]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places = unknowns.estimated
     ready = tuple(run_of(run, array_module((run.values, run.sigma))) for run in runs)
@@ -333,7 +391,13 @@ def planned_information(
 
 @compiled
 def _sensitivities(
-    scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], options: AllOptions, layout: Layout, places: tuple, reference: Reference
+    scene: Scene,
+    runs: tuple[Run, ...],
+    theta: Float[Array, "places"],
+    options: AllOptions,
+    layout: Layout,
+    places: tuple,
+    reference: Reference,
 ):
     """Return F without priors, and the sensitivities, for unknowns with these indices."""
     some, count = np.array(places, int), layout.sizes[0]
@@ -341,7 +405,10 @@ def _sensitivities(
     def residuals(free_ones: Float[Array, "unknowns"]):
         every = theta.at[some].set(free_ones)
         moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
-        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate, options) for run, own in zip(runs, local, strict=True))
+        return tuple(
+            run.at(layout, every[:count], own).residuals(moved, simulate, options)
+            for run, own in zip(runs, local, strict=True)
+        )
 
     with reference.stands_in():
         J = jax.jacfwd(residuals)(theta[some])
@@ -352,12 +419,18 @@ def _sensitivities(
 def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Entries, "places"]:
     """Return all unknowns at the values of the scene and the runs; parameters and starts may be traced."""
     (shared, local), layout = unknowns.split(unknowns.guess), unknowns.layout
-    of_bodies = {label: x for body in layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
+    of_bodies = {
+        label: x for body in layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)
+    }
 
     def value(place: Place, run: Experiment, numbers):
         if place.kind == "start":
             return run.start.get(place.name, place.of(numbers))
-        return {"scene": getattr(scene, place.name, None), "inertia": of_bodies.get(place.name), "sensor": place.of(numbers)}[place.kind]
+        return {
+            "scene": getattr(scene, place.name, None),
+            "inertia": of_bodies.get(place.name),
+            "sensor": place.of(numbers),
+        }[place.kind]
 
     rows = [value(place, runs[0], shared) for place in layout.shared]
     rows += [value(place, run, own) for run, own in zip(runs, local, strict=True) for place in layout.local]

@@ -22,7 +22,13 @@ from jourdain_jax.calculus.reals import Indices, Scalar, compiled, holds, is_tra
 from jourdain_jax.identification.data.estimate import Estimate, Range, positive
 from jourdain_jax.identification.data.experiment import Data
 from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.identification.inference.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
+from jourdain_jax.identification.inference.likelihood import (
+    as_fit_options,
+    as_runs,
+    in_all_or_none,
+    mapped,
+    of_run,
+)
 from jourdain_jax.identification.report.fit_result import Fit
 from jourdain_jax.identification.solve.layout import Layout, PossibleInertia
 from jourdain_jax.identification.solve.runs import Run, equal_runs
@@ -76,19 +82,38 @@ class LogDensity(eqx.Module):
         count, end = len(self.places), len(self.places) + len(self.sigmas)
         known = self.prior_rows @ (theta[:count] - self.prior_mean)
         # the prior of a sigma is flat in its logarithm, which is x
-        logs = jnp.sum(slopes[:count]) + jnp.sum(slopes[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + self.prior_height - 0.5 * known @ known
+        logs = (
+            jnp.sum(slopes[:count])
+            + jnp.sum(slopes[end:])
+            + jnp.sum(jnp.log(jnp.diagonal(self.factor)))
+            + self.prior_height
+            - 0.5 * known @ known
+        )
         shared, local = self._split(theta)
-        scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
+        scene, sigma = (
+            self.layout.scene(self.scene, shared),
+            dict(zip(self.sigmas, theta[count:end], strict=True)),
+        )
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
 
         def one(run: Run, local: Float[Array, "local"]) -> Scalar:
             here = run.at(self.layout, shared, local)
-            weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
-            memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
-            return of_run(scene, here._replace(weights=weights, correlation_time=memory), options=self.options)
+            weights = {
+                name: weight / sigma[name] if name in sigma else weight
+                for name, weight in here.weights.items()
+            }
+            memory = here.correlation_time | {
+                name: tau[name] for name in here.correlation_time if name in tau
+            }
+            return of_run(
+                scene, here._replace(weights=weights, correlation_time=memory), options=self.options
+            )
 
         with reference.stands_in():
-            return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
+            return logs + sum(
+                jnp.sum(mapped(one, group, local[np.array(runs)]))
+                for group, runs in zip(self.groups, self.runs, strict=True)
+            )
 
     @property
     def initial(self) -> Point:
@@ -111,12 +136,19 @@ class LogDensity(eqx.Module):
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
         """
         check_names(values, self.labels, "`{}` is not among the unknowns")
-        theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), real_type()) for i, label in enumerate(self.labels)])
+        theta = jnp.stack(
+            [
+                jnp.asarray(values.get(label, self.guess[i]), real_type())
+                for i, label in enumerate(self.labels)
+            ]
+        )
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):
             off = int(np.argmin(np.isfinite(x)))
-            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound; "
-                "give a value between the bounds")
+            raise ValueError(
+                f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound; "
+                "give a value between the bounds"
+            )
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
     def scene_at(self, z: Point) -> Scene:
@@ -143,7 +175,9 @@ class LogDensity(eqx.Module):
                     f"`{label}` has no standard error in the fit, so its scale is unknown; give it a prior, "
                     "or omit it from `free`"
                 )
-        noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
+        noise = [float(fit.sigma[name]) for name in self.sigmas] + [
+            float(fit.correlation_time[name]) for name in self.with_memory
+        ]
         theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
         x = np.array(self._each(Range.unconstrain, jnp.asarray(theta)))
         x[end:] = np.clip(x[end:], -4.0, 4.0)  # a correlation time may be at an end of its range
@@ -151,17 +185,23 @@ class LogDensity(eqx.Module):
         covariance = np.zeros((len(theta), len(theta)))
         covariance[: fit.values.size, : fit.values.size] = fit.covariance
         for i, name in enumerate((*self.sigmas, *self.with_memory), fit.values.size):
-            samples = np.concatenate([np.ravel(run[name][np.isfinite(run[name])]) for run in fit.whitened if name in run])
+            samples = np.concatenate(
+                [np.ravel(run[name][np.isfinite(run[name])]) for run in fit.whitened if name in run]
+            )
             # sum of squares in units of sigma: degrees of freedom
-            covariance[i, i] = theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < end else 1 / samples.size
+            covariance[i, i] = (
+                theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < end else 1 / samples.size
+            )
         factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
 
     def _checked(self, z) -> Array:
         z = jnp.asarray(z, real_type())
         if z.shape[-1:] != (len(self.labels),):
-            raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number "
-                f"for each of {', '.join(self.labels)}")
+            raise ValueError(
+                f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number "
+                f"for each of {', '.join(self.labels)}"
+            )
         return z
 
     def _spread(self, z: Points) -> Points:
@@ -174,7 +214,9 @@ class LogDensity(eqx.Module):
     def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
         shared, local = self.layout.sizes
         every = jnp.asarray(self.fixed).at[np.array(self.places, int)].set(theta[: len(self.places)])
-        return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
+        return every[:shared], (
+            every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
+        )
 
 
 _density = compiled(LogDensity._at)
@@ -221,13 +263,19 @@ def log_density(
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
     limits = [correlation_limits(runs, name) for name in with_memory]
     intervals = np.array([low / SHORTEST for low, _ in limits])
-    angles = [Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h)) for h, ends in zip(intervals, limits, strict=True)]
+    angles = [
+        Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h))
+        for h, ends in zip(intervals, limits, strict=True)
+    ]
     unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene, unknowns.layout.parameters):
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)
-        guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
+        guesses = [
+            _rms(scene, [group for _, group in grouped if name in group.weights], name, settled)
+            for name in sigmas
+        ]
     guesses += (intervals / np.log(2)).tolist()  # neighbouring samples have a correlation of one half
     places = unknowns.estimated
     size, weights = len(places) + len(guesses), unknowns.prior_weight[unknowns.prior_weight > 0]
@@ -239,10 +287,16 @@ def log_density(
         guess=np.concatenate([unknowns.guess[places], guesses]),
         prior_mean=unknowns.prior_mean[places],
         prior_rows=unknowns.prior_rows,
-        prior_height=float(np.sum(np.log(weights / np.sqrt(2 * np.pi))) + np.linalg.slogdet(unknowns.whitening)[1]),
+        prior_height=float(
+            np.sum(np.log(weights / np.sqrt(2 * np.pi))) + np.linalg.slogdet(unknowns.whitening)[1]
+        ),
         centre=np.zeros(size),
         factor=np.eye(size),
-        labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas), *(f"{name}.correlation_time" for name in with_memory)),
+        labels=(
+            *unknowns.labels,
+            *(f"{name}.sigma" for name in sigmas),
+            *(f"{name}.correlation_time" for name in with_memory),
+        ),
         units=(*unknowns.units, *("" for _ in sigmas), *("s" for _ in with_memory)),
         layout=unknowns.layout,
         runs=tuple(numbers for numbers, _ in grouped),

@@ -47,7 +47,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jourdain_jax.identification.inference.information import Information, information, students_t_95, variances
+from jourdain_jax.identification.inference.information import (
+    Information,
+    information,
+    students_t_95,
+    variances,
+)
 from jourdain_jax.identification.solve.arrow import Arrow, ByUnknown
 from jourdain_jax.identification.solve.levenberg_marquardt import LEAST, Linearised, Minimum
 from jourdain_jax.identification.solve.problem import LEAST_SQUARES, Problem
@@ -97,7 +102,11 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
     All other unknowns start from their values at the previous point. The end is found by the secant method
     for the square root of the rise, which is nearly linear.
     """
-    close, origin, theta = 0.01, float(found.theta[b, place]), found.theta[b : b + 1]  # close: of the rise at the end
+    close, origin, theta = (
+        0.01,
+        float(found.theta[b, place]),
+        found.theta[b : b + 1],
+    )  # close: of the rise at the end
     bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])
     room = min(abs(bound - origin), 1e6 * first)
     inner, outer, note = (0.0, 0.0), (np.inf, np.inf), ""  # distance and rise on either side
@@ -107,8 +116,10 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         rise, where = float(at.at.cost[0] - found.at.cost[b]), f"near {origin + way * delta:.6g}"
         if np.isfinite(rise):
             points.append((origin + way * delta, rise))
-            note = note if at.converged[0] else (
-                f"no minimum over the others was found {where}, so the interval may be too narrow"
+            note = (
+                note
+                if at.converged[0]
+                else (f"no minimum over the others was found {where}, so the interval may be too narrow")
             )
         if rise < -2 * close * end:
             return Side(bound, False, at, points, f"a lower minimum lies {where}; fit again from there")
@@ -130,9 +141,12 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         else:
             delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + close) if inner[1] else 4.0, 4.0), room)
     if not np.isfinite(outer[1]):
-        return Side(bound, False, None, points, "the motion fails "
-            f"{where}" if np.isfinite(outer[0]) else note)
-    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: other unknowns change")
+        return Side(
+            bound, False, None, points, f"the motion fails {where}" if np.isfinite(outer[0]) else note
+        )
+    return Side(
+        origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: other unknowns change"
+    )
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
@@ -140,7 +154,9 @@ def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
     again.
     """
     theta, bound = found.theta, problem.unknowns.reached(found.theta)
-    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free(problem, found, bound))
+    told = AtBounds(
+        np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free(problem, found, bound)
+    )
     for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
         _look_inward(problem, found, told, b, place)
     return told
@@ -158,7 +174,9 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
     if told.beyond[b, place] > FAR_BEYOND:  # the bound is decisive: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
-    first = _root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place])
+    first = (
+        _root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place])
+    )
     inner = side(problem, found, b, place, inward, first, end)
     if inner.is_closed and inner.at is not None:
         told.at_limit[b, place] = inner.at.theta[0]
@@ -167,13 +185,19 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
     told.limit[b, place] = inner.end
 
 
-def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
+def moved_from_bounds(
+    told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]
+) -> list[str]:
     """Return a sentence on each unknown of the first member that leaves its interval (`reach`) when an
     unknown at a bound moves to its limit.
     """
     sentences = []
     for (_, place), there in told.at_limit.items():
-        far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
+        far = [
+            f"`{name}`"
+            for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True)
+            if shift > most
+        ]
         if far:
             bounded = labels[int(np.searchsorted(places, place))]
             sentences.append(
@@ -183,7 +207,9 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
     return sentences
 
 
-def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
+def too_narrow_near_bounds(
+    problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]
+) -> list[str]:
     """Return sentences on intervals of the first member that are too narrow: the squares rise less than
     predicted by `errors`, the standard errors of all free unknowns.
 
@@ -197,7 +223,11 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
         return float(problem.beside(found.theta, 0, place, theta[place] + step).at.cost[0] - found.at.cost[0])
 
     def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
-        return [f"`{labels[k]}`" for k in some if any(2 * rise(int(places[k]), step) < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
+        return [
+            f"`{labels[k]}`"
+            for k in some
+            if any(2 * rise(int(places[k]), step) < 0.5 * (step / errors[k]) ** 2 for step in steps(k))
+        ]
 
     def to_bounds(k: int) -> list[float]:
         steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
@@ -205,22 +235,33 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
 
     def to_ends(k: int) -> list[float]:
         at, reach = theta[places[k]], float(np.sqrt(RISE_95) * errors[k])
-        return [step for step in (-reach, reach) if limits.low[places[k]] < at + step < limits.high[places[k]]]
+        return [
+            step for step in (-reach, reach) if limits.low[places[k]] < at + step < limits.high[places[k]]
+        ]
 
     sentences = []
     if names := named(range(len(labels)), to_bounds):
         why = "and others may be: up to a nearby bound, the squares rise less than standard errors predict"
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
-    shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
+    shared = [
+        k
+        for k, name in enumerate(labels)
+        if bounded and np.isfinite(errors[k]) and not name.startswith("run ")
+    ]
     if names := named(shared[:8], to_ends):
-        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to "
-            f"the ends than standard errors predict; {ADVICE}")
+        sentences.append(
+            f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to "
+            f"the ends than standard errors predict; {ADVICE}"
+        )
     return sentences
 
 
 def _too_narrow(names: list[str]) -> str:
-    return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
+    return (
+        f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)}"
+        f" {'are' if len(names) > 1 else 'is'} too narrow"
+    )
 
 
 def _root(slope: float, curvature: float, end: float) -> float:
@@ -240,7 +281,13 @@ class NoiseLevels:
     untold: Bool[np.ndarray, "members channels"]
 
 
-def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
+def noise_levels(
+    problem: Problem,
+    theta: np.ndarray,
+    at: Linearised,
+    told_by: Callable,
+    of_loss: Callable[[np.ndarray, float], float],
+) -> NoiseLevels:
     """Return sigmas and their statistics at theta. `told_by` returns the information of an arrow matrix.
     `of_loss` returns the inflation of variances by a loss; its arguments are the residuals of one member and
     the number of unknowns that they determined.
@@ -251,15 +298,29 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     if count == 1 and problem.loss == LEAST_SQUARES:
         return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
     by_run = [problem.by_channel(run, at) for run in range(len(problem.runs))]
-    residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
-    samples = np.concatenate([[[r.size] for r in residuals], problem.counted(problem.estimated, members)], axis=1)
+    residuals = [
+        r[np.isfinite(r)]
+        for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)
+    ]
+    samples = np.concatenate(
+        [[[r.size] for r in residuals], problem.counted(problem.estimated, members)], axis=1
+    )
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
     fewest = 0.5  # degrees of freedom that a channel needs to determine its sigma
     for _ in range(50):
         left, before = samples - determined, widths.copy()
         untold[:, 1:] |= left[:, 1:] < fewest
-        widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], fewest)), problem.least_sigma)
-        widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
+        widths[:, 1:] = np.maximum(
+            np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], fewest)), problem.least_sigma
+        )
+        widths[:, 0] = (
+            [
+                np.sqrt(of_loss(r, p)) if r.size else 1.0
+                for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)
+            ]
+            if unsure
+            else 1.0
+        )
         widths[untold] = np.inf
         if np.allclose(widths, before, rtol=1e-8, atol=0):
             break
@@ -269,12 +330,18 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = added[..., places] / variances(known.shared, known.own, known.follow)[:, None, places]
     counts = np.s_[:, 0 if unsure else 1 :]
-    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], fewest)[..., None], axis=1)
+    doubt = 2 * np.sum(
+        np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], fewest)[..., None], axis=1
+    )
     at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
     more, change = 0 * doubt, 0.03  # of sigma^2: increment for the second derivative of C
     for k in range(1, count):
         other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-change, change)]
-        ends = [(told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
+        ends = [
+            (told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors)
+            ** 2
+            for some in other
+        ]
         more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / change**2
     return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
 
@@ -285,14 +352,23 @@ def _told_by_kind(
     """Return p_c (members, kinds) and (C A_c C)_ii (members, kinds, places), from triangles in units of
     sigma.
     """
-    m, S, G, own = known.follow.shape[-2], known.shared[:, None, None], known.follow[:, :, None], known.own[:, :, None]
+    m, S, G, own = (
+        known.follow.shape[-2],
+        known.shared[:, None, None],
+        known.follow[:, :, None],
+        known.own[:, :, None],
+    )
     T_o, T_s = T[..., :m], T[..., m:-1]
     X = T_s - T_o @ G  # unknowns of a run follow the shared ones, x = - G s
     p = np.einsum("brkij,brkij->bk", X @ S, X) + np.einsum("brkij,brkij->bk", T_o @ own, T_o)
     Q = np.sum(S @ np.swapaxes(X, -1, -2) @ X @ S, axis=1)  # of all runs
     direct, through = T_o @ own, X @ S @ np.swapaxes(G, -1, -2)
-    of_own = np.einsum("brij,bkjl,bril->bkri", known.follow, Q, known.follow) + np.swapaxes(np.sum(direct**2 - 2 * direct * through, axis=-2), 1, 2)
-    return p, np.concatenate([np.diagonal(Q, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:2], -1)], axis=-1)
+    of_own = np.einsum("brij,bkjl,bril->bkri", known.follow, Q, known.follow) + np.swapaxes(
+        np.sum(direct**2 - 2 * direct * through, axis=-2), 1, 2
+    )
+    return p, np.concatenate(
+        [np.diagonal(Q, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:2], -1)], axis=-1
+    )
 
 
 @dataclass(frozen=True)
@@ -307,13 +383,20 @@ class Spread:
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
     """Return the uncertainties of estimates; unknowns at a `bound` are held there."""
-    unknowns, theta, scores, cutoff = problem.unknowns, found.theta, found.at.arrow.scores, problem.asked.control.cutoff
+    unknowns, theta, scores, cutoff = (
+        problem.unknowns,
+        found.theta,
+        found.at.arrow.scores,
+        problem.asked.control.cutoff,
+    )
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=cutoff)
 
     def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
         norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
-        moved = arrow.step(np.full(len(theta), LEAST), norms, unknowns.fixed | bound, np.zeros_like(theta), cutoff)
+        moved = arrow.step(
+            np.full(len(theta), LEAST), norms, unknowns.fixed | bound, np.zeros_like(theta), cutoff
+        )
         return told_by(arrow).standard_errors, moved[:, places]
 
     levels = noise_levels(problem, theta, found.at, told_by, problem.loss.inflation)
@@ -321,10 +404,18 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
     more, of_memory = problem.doubt(theta, elsewhere)
     quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more + levels.more)
     if problem.asked.errors == "runs":
-        of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
-        known = replace(of_runs.known, own=known.own).between_runs(levels.at.arrow.scores if problem.estimated else scores)
+        of_runs = (
+            levels
+            if problem.estimated
+            else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
+        )
+        known = replace(of_runs.known, own=known.own).between_runs(
+            levels.at.arrow.scores if problem.estimated else scores
+        )
         quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
-    quantiles, degrees = (np.broadcast_to(x, plain.shape) for x in (quantiles, 2 / np.maximum(of_sigmas, 1e-12)))
+    quantiles, degrees = (
+        np.broadcast_to(x, plain.shape) for x in (quantiles, 2 / np.maximum(of_sigmas, 1e-12))
+    )
     wider = known.standard_errors / plain
     return Spread(levels, known, quantiles, Rise(plain, _of_rise(wider, quantiles, degrees), wider, degrees))
 
@@ -349,7 +440,9 @@ def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     # an estimated correlation time leaves at least four degrees of freedom
     of_memory = np.minimum(of_memory, 0.5)
     doubt = of_memory + of_sigmas
-    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), 1.959963984540054)
+    return np.where(
+        doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), 1.959963984540054
+    )
 
 
 def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> ByUnknown:

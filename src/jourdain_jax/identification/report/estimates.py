@@ -22,9 +22,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.calculus.reals import Entries, described, largest, static
 from jourdain_jax.identification.data.channels import LATEST, StopEvent
-from jourdain_jax.identification.inference.information import Information, derived, hidden_combinations, standard_errors, variances, weak_combinations
+from jourdain_jax.identification.inference.information import (
+    Information,
+    derived,
+    hidden_combinations,
+    standard_errors,
+    variances,
+    weak_combinations,
+)
 from jourdain_jax.identification.inference.likelihood import oddities
-from jourdain_jax.identification.inference.standard_errors import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
+from jourdain_jax.identification.inference.standard_errors import (
+    AtBounds,
+    moved_from_bounds,
+    spread,
+    too_narrow_near_bounds,
+)
 from jourdain_jax.identification.solve.levenberg_marquardt import Minimum
 from jourdain_jax.identification.solve.piecewise import Shot
 from jourdain_jax.identification.solve.problem import Asked, Problem
@@ -52,7 +64,11 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         scene = layout.scene(problem.scene, shared)
         motion = partial(one.motion, scene, simulate, options=options)
         jumps = partial(moving_jumps, modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
-        if jumps(False) and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings)) and jumps(met > 0):
+        if (
+            jumps(False)
+            and (met := int(one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings))
+            and jumps(met > 0)
+        ):
             found.append(
                 f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: "
                 "derivatives and standard errors omit the shift of jump times; make the jumps gradual"
@@ -60,7 +76,9 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
         if type(scene).events is Scene.events:
             continue
         if run.ended_by:
-            if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
+            if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(
+                one.stops(StopEvent(run.ended_by), run.ended_by, motion)
+            ):
                 found.append(
                     f"the motion of run {index} does not reach `{run.ended_by}` before {LATEST:g} times the "
                     "observed time; use a closer first guess"
@@ -82,6 +100,8 @@ Counts = Int[np.ndarray, "*repeats"]
 Marks = Bool[np.ndarray, "*repeats"]
 PerRepeat = Float[np.ndarray, "*repeats"]
 PerUnknown = Float[np.ndarray, "*repeats unknowns"]
+
+
 @dataclass(frozen=True, eq=False)
 class Statistics:
     """Statistics of a minimum, apart from its position."""
@@ -118,15 +138,23 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
     """Return the statistics of the minimum."""
     unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
-    here = lambda x: one(x[:, places])  # noqa: E731
+    here = lambda x: one(x[:, places])
     low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
     limit = here(at_bounds.limit)
     about = spread(problem, found, bound)
-    levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
-    residuals, white = (
-        tuple({name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()} for run in range(len(problem.runs))) for flag in (False, True)
+    levels, known, reach = (
+        about.levels,
+        about.known.only() if single else about.known,
+        one(about.quantiles * about.known.standard_errors),
     )
-    over = lambda r: tuple(range(0 if single else 1, r.ndim))  # noqa: E731
+    residuals, white = (
+        tuple(
+            {name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()}
+            for run in range(len(problem.runs))
+        )
+        for flag in (False, True)
+    )
+    over = lambda r: tuple(range(0 if single else 1, r.ndim))
     samples = sum(np.sum(np.isfinite(r), axis=over(r)) for run in residuals for r in run.values())
     determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
 
@@ -139,10 +167,17 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
     if not single:
-        scene = jax.tree.map(lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))), scene, problem.scene)
+        scene = jax.tree.map(
+            lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))),
+            scene,
+            problem.scene,
+        )
     return Statistics(
         scene=scene,
-        starts=tuple(unknowns.layout.start(run.start, one(shared), one(local[:, i])) for i, run in enumerate(problem.runs)),
+        starts=tuple(
+            unknowns.layout.start(run.start, one(shared), one(local[:, i]))
+            for i, run in enumerate(problem.runs)
+        ),
         sizes=here(size),
         standard_errors=known.standard_errors,
         low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
@@ -154,8 +189,12 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
         whitened=white,
         sigma={name: one(levels.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
         correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
-        untold=tuple(name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()),
-        chi_square=np.where(one(fails), np.nan, sum(np.nansum(r**2, axis=over(r)) for run in white for r in run.values())),
+        untold=tuple(
+            name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()
+        ),
+        chi_square=np.where(
+            one(fails), np.nan, sum(np.nansum(r**2, axis=over(r)) for run in white for r in run.values())
+        ),
         samples=np.asarray(samples),
         degrees_of_freedom=np.asarray(samples - one(determined)),
         of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.rise.of_rise)),
@@ -186,10 +225,17 @@ class Estimated(Printed, eqx.Module):
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         if self.value.ndim:
-            return f"{described(self.value)}{unit}: its fields `value`, `standard_error`, `low`, `high` have that shape"
+            return (
+                f"{described(self.value)}{unit}: its fields `value`, `standard_error`, `low`, `high` have"
+                " that shape"
+            )
         if np.isnan(self.low + self.high):
             return f"{self.value:.6g}{unit}, not determined by the measurements"
-        error = f"standard error {self.standard_error:.2g}" if np.isfinite(self.standard_error) else "at its bound"
+        error = (
+            f"standard error {self.standard_error:.2g}"
+            if np.isfinite(self.standard_error)
+            else "at its bound"
+        )
         return f"{self.value:.6g}{unit}, {error}, 95 % interval [{self.low:.6g}, {self.high:.6g}]"
 
 
@@ -215,11 +261,11 @@ class ChannelResiduals(Printed, eqx.Module):
         return f"residuals of `{self.channel}` of run {self.run}, in sigmas: {of}"
 
 
-
-
 GONE = {
-    "bootstrap": "`Fit.profiles` gives intervals of nonlinear scenes; for repeats, draw data about "
-                 "`simulate` of `scene` and `starts`, and pass them to `fit_batch`"
+    "bootstrap": (
+        "`Fit.profiles` gives intervals of nonlinear scenes; for repeats, draw data about "
+        "`simulate` of `scene` and `starts`, and pass them to `fit_batch`"
+    )
 }
 
 
@@ -261,16 +307,29 @@ class Estimates(Printed):
         """Return an entry of `statistics`, such as `standard_errors`, of the arguments of the fit, or of the
         unknowns.
         """
-        parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
+        parts = {
+            "statistics": Statistics.__dataclass_fields__,
+            "asked": ("guesses", "errors"),
+            "unknowns": ("labels", "units", "layout"),
+        }
         for part in (part for part, names in parts.items() if name in names):
             return getattr(getattr(self, part), name)
-        raise AttributeError(f"`{name}` was removed: {GONE[name]}" if name in GONE else "`Fit` has no "
-            f"`{name}`; {nearest(name, dir(self))}")
+        raise AttributeError(
+            f"`{name}` was removed: {GONE[name]}"
+            if name in GONE
+            else f"`Fit` has no `{name}`; {nearest(name, dir(self))}"
+        )
 
     def __getitem__(self, name: str) -> Estimated:
         check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
         i = self.labels.index(name)
-        return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
+        return Estimated(
+            self.values[..., i],
+            self.standard_errors[..., i],
+            self.low[..., i],
+            self.high[..., i],
+            self.units[i],
+        )
 
     @property
     def estimates(self) -> dict[str, Estimated]:
@@ -294,7 +353,9 @@ class Estimates(Printed):
         """Return the sum of squared residuals per degree of freedom. It is near 1 for a correct scene and
         correct sigmas, and NaN without degrees of freedom.
         """
-        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
+        return np.asarray(
+            self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan)
+        )
 
     # For a single fit, not a batch.
     # ------------------------------------------------------------------------------------
@@ -302,14 +363,19 @@ class Estimates(Printed):
     @property
     def agreement(self) -> str:
         """Return a text with the number of first guesses that led to the minimum."""
-        return f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to {'this' if self.agreeing else 'a'} minimum"
+        return (
+            f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to"
+            f" {'this' if self.agreeing else 'a'} minimum"
+        )
 
     @property
     def not_identifiable(self) -> Sentences:
         """Return undetermined combinations of unknowns, one sentence each."""
         if not np.isfinite(self.chi_square):
             return ()
-        return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
+        return hidden_combinations(
+            self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels
+        )
 
     @property
     def correlated(self) -> Sentences:
@@ -351,14 +417,21 @@ class Estimates(Printed):
             runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
             products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
             squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
-            pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
+            pairs, size = (
+                np.isfinite(products).sum(),
+                np.nanmean(squares) if np.isfinite(squares).any() else 0.0,
+            )
             if pairs and size > 0:
                 found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
         return found
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Return count, mean, rms and largest residual per run and channel."""
-        return tuple(ChannelResiduals.of(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+        return tuple(
+            ChannelResiduals.of(run, name, np.asarray(r))
+            for run, found in enumerate(self.residuals)
+            for name, r in found.items()
+        )
 
     def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
         """Return a number, or an array of them, that depends on the parameters, with its standard error and
@@ -380,7 +453,9 @@ class Estimates(Printed):
         """
         shared = self.layout.sizes[0]
         value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
-        sizes, at_bound, quantiles = (x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles))
+        sizes, at_bound, quantiles = (
+            x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles)
+        )
         error = standard_errors(self.information, slopes, sizes, at_bound, self.asked.control.cutoff)
         of_numbers = quantiles.reshape(*quantiles.shape[:-1], *(1,) * (slopes.ndim - quantiles.ndim), shared)
         reach = error * np.max(np.where(slopes != 0, of_numbers, 0.0), axis=-1, initial=0.0)
@@ -392,4 +467,7 @@ class Estimates(Printed):
         in the form of `derived`.
         """
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
-        return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}
+        return {
+            name: self.derived(lambda scene, name=name: getattr(scene, name), units[name])
+            for name in self.layout.following
+        }

@@ -25,7 +25,9 @@ def data_and_prediction(caption: str, label: str, one: Prediction, component: in
     """Draw samples of one component with their prediction, and below them the errors in sigmas over a band of
     two sigmas.
     """
-    value, predicted, sigma = (np.asarray(x).reshape(len(one.ts), -1)[:, component] for x in (one.values, one.prediction, one.sigma))
+    value, predicted, sigma = (
+        np.asarray(x).reshape(len(one.ts), -1)[:, component] for x in (one.values, one.prediction, one.sigma)
+    )
 
     def draw(whole) -> None:
         above, below = whole.subplots(2, 1, sharex=True, height_ratios=(5, 2))
@@ -52,7 +54,9 @@ def interval_widths(fit: Estimates) -> str:
         share = 100 * half / np.abs(values)
     told, words = np.isfinite(half), ["one-sided" if bound else "not determined" for bound in fit.at_bound]
     for i in np.flatnonzero(told):
-        words[i] = f"{values[i]:.4g} {fit.units[i]}".strip() + (f" ± {half[i]:.2g}" if share[i] < 1000 else "")
+        words[i] = f"{values[i]:.4g} {fit.units[i]}".strip() + (
+            f" ± {half[i]:.2g}" if share[i] < 1000 else ""
+        )
 
     def draw(whole) -> None:
         axes = whole.add_subplot(xlabel="half of the 95 % interval, in % of the estimate", xscale="log")
@@ -64,7 +68,11 @@ def interval_widths(fit: Estimates) -> str:
         axes.invert_yaxis()
 
     notes = ["red: the interval is wider than the estimate"] if np.any(share >= 100) else []
-    notes += [f"{len(fit.labels) - len(names)} more unknowns are not drawn"] if len(fit.labels) > len(names) else []
+    notes += (
+        [f"{len(fit.labels) - len(names)} more unknowns are not drawn"]
+        if len(fit.labels) > len(names)
+        else []
+    )
     return figure(draw, 700, 20 * len(names) + 60, "; ".join(notes))
 
 
@@ -76,7 +84,9 @@ def profile(one: Profile, error: float) -> str:
     values, rise = one.values[shown], one.rise[shown]
 
     def draw(whole) -> None:
-        axes = whole.add_subplot(xlabel=f"{one.name} in {one.unit}" if one.unit else one.name, ylabel="2 (F - F_min)")
+        axes = whole.add_subplot(
+            xlabel=f"{one.name} in {one.unit}" if one.unit else one.name, ylabel="2 (F - F_min)"
+        )
         axes.plot(values, rise, ".-", color=MODEL, lw=1.2)
         axes.axhline(RISE_95, color=DATA, ls="--", lw=0.8)
         axes.axvline(one.estimate, color=QUIET, lw=0.8)
@@ -116,7 +126,12 @@ Predictions = Sequence[dict[str, Prediction]]  # by run and channel
 
 
 def fit_page(
-    fit: Estimates, fitted: Predictions, shares: Informed | None, held_out: Predictions, profiles: Mapping[str, Profile], units: Mapping[str, str]
+    fit: Estimates,
+    fitted: Predictions,
+    shares: Informed | None,
+    held_out: Predictions,
+    profiles: Mapping[str, Profile],
+    units: Mapping[str, str],
 ) -> str:
     """Return the page of a `Fit` of one experiment. `fitted`, `held_out`: predictions; `units`: units of
     channels.
@@ -142,7 +157,9 @@ def fit_page(
         )
         sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
     sections += [_whiteness(fit, fitted), _way(fit)]
-    return _PAGE.format(title=html.escape(f"Fit of {type(fit.scene).__name__}"), sections="".join(map(str, sections)))
+    return _PAGE.format(
+        title=html.escape(f"Fit of {type(fit.scene).__name__}"), sections="".join(map(str, sections))
+    )
 
 
 def _informed(shares: Informed) -> Section:
@@ -150,12 +167,24 @@ def _informed(shares: Informed) -> Section:
         "Shares of samples in the information on each unknown. They account for the estimation of all other "
         "unknowns."
     )
-    shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # of which it is drawn where they inform
-    columns = {f"run {run}": shares.of_runs[:, run] for run in shown} | shares.of_channels | {"priors": shares.of_priors}
+    shown = np.sort(
+        np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8]
+    )  # of which it is drawn where they inform
+    columns = (
+        {f"run {run}": shares.of_runs[:, run] for run in shown}
+        | shares.of_channels
+        | {"priors": shares.of_priors}
+    )
     rows = [("unknown", *columns, "half of the best run's share")]
     for i, name in enumerate(shares.labels):
         run, begin, end = shares.half(i)
-        rows.append((name, *(f"{100 * share[i]:.1f} %" for share in columns.values()), f"run {run}, {begin:.3g} to {end:.3g} s"))
+        rows.append(
+            (
+                name,
+                *(f"{100 * share[i]:.1f} %" for share in columns.values()),
+                f"run {run}, {begin:.3g} to {end:.3g} s",
+            )
+        )
     more = shares.of_runs.shape[1] - len(shown)
     note = [f"The {len(shown)} most informative runs are shown; {more} more are not."] if more else []
     return Section("What informs which unknown", about, table(rows) + note)
@@ -164,25 +193,46 @@ def _informed(shares: Informed) -> Section:
 def _correlations(fit: Estimates) -> Section:
     names = fit.labels[:30]  # unknowns in the table of correlations
     found = fit.correlation[: len(names), : len(names)]
-    rows = [("", *names), *((name, *("-" if np.isnan(c) else f"{c:.2f}" for c in row)) for name, row in zip(names, found, strict=True))]
+    rows = [
+        ("", *names),
+        *(
+            (name, *("-" if np.isnan(c) else f"{c:.2f}" for c in row))
+            for name, row in zip(names, found, strict=True)
+        ),
+    ]
     about = f"The first {len(names)} of {len(fit.labels)} unknowns." if len(fit.labels) > len(names) else ""
     return Section("Correlations", about, table(rows))
 
 
 def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, str], what: str) -> Section:
-    named = [(f"{what} {run}", name, units.get(name, "SI units"), one) for run, channels in enumerate(runs) for name, one in channels.items()]
+    named = [
+        (f"{what} {run}", name, units.get(name, "SI units"), one)
+        for run, channels in enumerate(runs)
+        for name, one in channels.items()
+    ]
     lines, panels = [f"`{name}` of {of}, in {unit}: {one}" for of, name, unit, one in named], []
     for of, name, unit, one in named:
         count = int(np.prod(one.values.shape[1:], dtype=int))
         components = [f"{name}[{k}]" for k in range(count)] if count > 1 else [name]
-        panels += [(f"{of}: {component}", f"{component} in {unit}", one, k) for k, component in enumerate(components)]
+        panels += [
+            (f"{of}: {component}", f"{component} in {unit}", one, k) for k, component in enumerate(components)
+        ]
     lines += [f"{len(panels) - 40} more are not drawn."] if len(panels) > 40 else []
     return Section(title, about, lines, [data_and_prediction(*panel) for panel in panels[:40]])
 
 
 def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
     about = "For residuals without the correlation of the noise, if that was estimated or given."
-    rows = [("channel", "correlation of neighbours", "white limit", "white", "correlation time", "intervals too narrow by")]
+    rows = [
+        (
+            "channel",
+            "correlation of neighbours",
+            "white limit",
+            "white",
+            "correlation time",
+            "intervals too narrow by",
+        )
+    ]
     for name, (rho, limit) in fit.autocorrelation.items():
         white = abs(rho) <= limit
         time = f"{float(fit.correlation_time[name]):.3g} s" if name in fit.correlation_time else "-"
@@ -192,19 +242,24 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
         narrow = "-" if white or rho < 0 else f"about {np.sqrt((1 + rho) / (1 - min(rho, 0.999))):.2g}"
         rows.append((name, f"{rho:.3f}", f"{limit:.3f}", "yes" if white else "NO", time, narrow))
     if any(row[3] == "NO" for row in rows):
-        allowed = "" if fit.errors == "sigmas" else (
-            " Those given here are based on differences between runs, and allow for it."
+        allowed = (
+            ""
+            if fit.errors == "sigmas"
+            else (" Those given here are based on differences between runs, and allow for it.")
         )
-        about = f"Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in the last column.{allowed} {about}"
+        about = (
+            "Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in"
+            f" the last column.{allowed} {about}"
+        )
     return Section("Are the residuals white?", about, table(rows))
 
 
 def _way(fit: Estimates) -> Section:
-    told = fit.agreement if fit.guesses > 1 else (
-        "one first guess was tried; `guesses=30` would show how many lead here"
+    told = (
+        fit.agreement
+        if fit.guesses > 1
+        else ("one first guess was tried; `guesses=30` would show how many lead here")
     )
     rows = [("objective", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
     return Section("The way to the minimum", told, table(rows))
-
-

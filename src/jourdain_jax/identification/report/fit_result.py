@@ -15,7 +15,15 @@ from jourdain_jax.identification.data.experiment import Data, Experiment
 from jourdain_jax.identification.inference.standard_errors import FAR_BEYOND
 from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.report.fit_page import fit_page, interval_widths
-from jourdain_jax.identification.report.resumed_fit import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
+from jourdain_jax.identification.report.resumed_fit import (
+    Prediction,
+    Profile,
+    informed,
+    of_fitted,
+    of_held_out,
+    profiles,
+    taken_up,
+)
 from jourdain_jax.identification.solve.problem import LEAST_SQUARES
 from jourdain_jax.scene.names import Labels, Sentences, as_names
 from jourdain_jax.scene.printing import table
@@ -27,9 +35,22 @@ def warnings_of(fit: Estimates) -> Sentences:
         # sigmas: the square overflows
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
-        return ("the motion fails at the first guess, so that there is nothing to fit; examine it with "
-                "`simulate`", *fit.events_met)
-    return (*_of_the_minimum(fit), *fit.impossible, *fit.events_met, *fit.oddities, *fit.too_narrow, *_of_the_data(fit), *_of_residuals(fit))
+        return (
+            (
+                "the motion fails at the first guess, so that there is nothing to fit; examine it with "
+                "`simulate`"
+            ),
+            *fit.events_met,
+        )
+    return (
+        *_of_the_minimum(fit),
+        *fit.impossible,
+        *fit.events_met,
+        *fit.oddities,
+        *fit.too_narrow,
+        *_of_the_data(fit),
+        *_of_residuals(fit),
+    )
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
@@ -50,7 +71,11 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
     elif not fit.converged:
         yield "no minimum was found; raise `max_iterations`, or use a closer first guess"
     if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
-        verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
+        verb = (
+            "lies at a bound, which decides its value"
+            if len(names) == 1
+            else "lie at bounds, which decide their values"
+        )
         yield f"{', '.join(names)} {verb}; standard errors are meaningless: widen the bounds"
     for name in fit.untold:
         yield (
@@ -71,12 +96,21 @@ def _of_the_data(fit: Estimates) -> Iterator[str]:
             there = first.setdefault(counted.tobytes(), here)
             # so many different residuals are equal in two channels only by chance
             if here != there and len(np.unique(counted)) > 3:
-                yield f"{there} and {here} hold equal numbers: counted as two measurements, they make intervals too narrow; omit one"
+                yield (
+                    f"{there} and {here} hold equal numbers: counted as two measurements, they make intervals"
+                    " too narrow; omit one"
+                )
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
-        yield f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds"
+        yield (
+            f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try"
+            " more `guesses`, or narrower bounds"
+        )
     for name, far in zip(fit.labels, fit.from_prior, strict=True):
         if abs(far) > 4.0:  # standard deviations: a larger distance from the prior is significant
-            yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: check the prior, the data and the scene"
+            yield (
+                f"`{name}` lies {abs(far):.2g} standard deviations from its prior: check the prior, the data"
+                " and the scene"
+            )
 
 
 def _of_residuals(fit: Estimates) -> Iterator[str]:
@@ -92,7 +126,9 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
         """Return the loss of information by correlated residuals: (1 + rho)/(1 - rho) for a correlation rho
         of neighbours.
         """
-        return max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels)))
+        return max(
+            (1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels))
+        )
 
     if small := [size for size in sizes if size.most * larger(size.channels) < _by_chance(size.wide, -sure)]:
         times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
@@ -104,7 +140,10 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     wide = {name for size in small for name in size.channels}
     named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
     own = [name for name in fit.labels if name.startswith("run ")]
-    start = f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals"
+    start = (
+        f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes"
+        " intervals"
+    )
     if named and fit.errors == "sigmas":
         yield (
             f"{start} too narrow: check the scene, sensors and noise; `correlation_time=None` "
@@ -112,7 +151,10 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
             'or more, errors="runs" accounts for it'
         )
     elif named and own:
-        yield f"{start} of unknowns of single runs (`{own[0]}`) too narrow: differences between runs do not show them"
+        yield (
+            f"{start} of unknowns of single runs (`{own[0]}`) too narrow: differences between runs do not"
+            " show them"
+        )
 
 
 class _Size(NamedTuple):
@@ -138,15 +180,32 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
     Under a robust loss they are based on medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
-    names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
+    names = [
+        name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma
+    ]
     found = []
     for channels in (names, *([name] for name in names)):
-        squares = np.concatenate([np.zeros(0), *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run)]) ** 2
+        squares = (
+            np.concatenate(
+                [
+                    np.zeros(0),
+                    *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run),
+                ]
+            )
+            ** 2
+        )
         squares = squares[np.isfinite(squares)]
         if squares.size:
             some = len(channels) < len(names)
             named = f" of {', '.join(f'`{name}`' for name in channels)}" if some else ""
-            found.append(_Size(channels, named, *_mean_square(squares, 0.0 if some else determined, robust), *_mean_square(squares, determined, robust)))
+            found.append(
+                _Size(
+                    channels,
+                    named,
+                    *_mean_square(squares, 0.0 if some else determined, robust),
+                    *_mean_square(squares, determined, robust),
+                )
+            )
     return found
 
 
@@ -177,17 +236,27 @@ def text(fit: Estimates) -> str:
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
     if fit.shooting is not None:
-        pieces = " + ".join(map(str, fit.shooting.pieces[:most])) + (" + ..." if len(fit.shooting.pieces) > most else "")
-        lines.append(f"found by multiple shooting in {pieces} pieces, which join to "
-            f"{float(fit.shooting.continuity):.1g} of the simulation's tolerance")
+        pieces = " + ".join(map(str, fit.shooting.pieces[:most])) + (
+            " + ..." if len(fit.shooting.pieces) > most else ""
+        )
+        lines.append(
+            f"found by multiple shooting in {pieces} pieces, which join to "
+            f"{float(fit.shooting.continuity):.1g} of the simulation's tolerance"
+        )
     if fit.guesses > 1:
         lines.append(fit.agreement)
     if fit.errors == "runs":
         lines.append(f"standard errors from the differences between the {len(fit.residuals)} runs")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
-    lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
+    lines += [
+        f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s"
+        for name, tau in fit.correlation_time.items()
+    ]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
-    rows += [_row(name, e, " (one-sided, at its bound)" if at_bound else "") for (name, e), at_bound in zip(fit.estimates.items(), fit.at_bound, strict=True)]
+    rows += [
+        _row(name, e, " (one-sided, at its bound)" if at_bound else "")
+        for (name, e), at_bound in zip(fit.estimates.items(), fit.at_bound, strict=True)
+    ]
     rows += [_row(name, e, " (tied)") for name, e in fit.tied.items() if e.value.ndim == 0]
     lines += table(rows)
     if fit.not_identifiable:
@@ -198,7 +267,9 @@ def text(fit: Estimates) -> str:
         lines += [f"  and {len(sentences) - most} more {what}"] if len(sentences) > most else []
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
-        rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
+        rows.append(
+            (str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}")
+        )
     return "\n".join(lines + table(rows))
 
 
@@ -218,8 +289,9 @@ def batch_text(fit: Estimates) -> str:
         some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
         numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
-    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} "
-        "converged", *table(rows)])
+    return "\n".join(
+        [f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)]
+    )
 
 
 class Fit(Estimates):
@@ -252,7 +324,10 @@ class Fit(Estimates):
         self._check_one()
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
         fitted = taken_up(self, data)
-        errors, of_rise = (dict(zip(self.labels, x.tolist(), strict=True)) for x in (self.standard_errors, self.statistics.of_rise))
+        errors, of_rise = (
+            dict(zip(self.labels, x.tolist(), strict=True))
+            for x in (self.standard_errors, self.statistics.of_rise)
+        )
         return profiles(*fitted, as_names(names) or of_all, errors, of_rise)
 
     def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
@@ -293,7 +368,7 @@ class Fit(Estimates):
         if not str(path).lower().endswith((".html", ".htm")):
             raise ValueError(f"cannot write `{os.fspath(path)}`: the report of a fit is a .html file")
         self._check_one()
-        shapes = lambda runs: [{name: np.shape(x) for name, x in run.items()} for run in runs]  # noqa: E731
+        shapes = lambda runs: [{name: np.shape(x) for name, x in run.items()} for run in runs]
         if runs and shapes(run.values for run in runs) != shapes(self.residuals):
             raise ValueError(
                 f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected "
@@ -301,16 +376,30 @@ class Fit(Estimates):
             )
         if not runs and profiles and not isinstance(profiles, Mapping):
             raise ValueError("profiles are computed from the fitted runs; give these as `data`")
-        along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
+        along = (
+            profiles
+            if isinstance(profiles, Mapping)
+            else self.profiles(runs, () if profiles is True else profiles)
+            if profiles
+            else {}
+        )
         shares = informed(*taken_up(self, runs), 24) if runs else None  # at most this many unknowns
-        page = fit_page(self, of_fitted(self, runs) if runs else (), shares, self.predict(others) if others else (), along, units or {})
+        page = fit_page(
+            self,
+            of_fitted(self, runs) if runs else (),
+            shares,
+            self.predict(others) if others else (),
+            along,
+            units or {},
+        )
         with open(path, "w", encoding="utf-8") as file:
             file.write(page)
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("this needs a single fit whose motion does not fail; for a batch or a failed "
-                "fit, use `print`")
+            raise ValueError(
+                "this needs a single fit whose motion does not fail; for a batch or a failed fit, use `print`"
+            )
 
     def _repr_html_(self) -> str:
         one = self.values.ndim == 1 and np.isfinite(self.chi_square)

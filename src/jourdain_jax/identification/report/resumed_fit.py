@@ -66,10 +66,13 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
     for run, residuals in enumerate(fit.residuals):
         again = problem.by_channel(run, at)
         for name, r in residuals.items():
-            here = np.nan_to_num(again[name][0] if name in again else np.nan) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
+            here = np.nan_to_num(again[name][0] if name in again else np.nan) * (
+                sigma.get(name, 1.0) / fit.sigma.get(name, 1.0)
+            )
             if here.shape != r.shape or largest(np.nan_to_num(r) - here) >= 0.01:
-                raise ValueError("`data` differ from those of the fit (the residuals disagree); give the "
-                    "runs of the fit")
+                raise ValueError(
+                    "`data` differ from those of the fit (the residuals disagree); give the runs of the fit"
+                )
     return problem, Minimum.begun(theta, at, "")
 
 
@@ -79,7 +82,9 @@ def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
     """
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
-    problem = Problem(asked, checked, unknowns) if asked.shooting is None else Piecewise(asked, checked, unknowns)
+    problem = (
+        Problem(asked, checked, unknowns) if asked.shooting is None else Piecewise(asked, checked, unknowns)
+    )
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
     return problem
@@ -118,7 +123,10 @@ class Prediction(Printed):
 
     def _text(self) -> str:
         told = f"rms of {self.rms:.3g}; R^2 {self.r_squared:.6g}"
-        return f"{np.isfinite(self.error).sum()} samples from {self.ts[0]:.6g} to {self.ts[-1]:.6g} s, predicted to an {told}"
+        return (
+            f"{np.isfinite(self.error).sum()} samples from {self.ts[0]:.6g} to {self.ts[-1]:.6g} s, predicted"
+            f" to an {told}"
+        )
 
 
 def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
@@ -132,7 +140,11 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     """
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
-    unknowns, theta, shared = problem.unknowns, problem.unknowns.guess[None].copy(), problem.unknowns.layout.sizes[0]
+    unknowns, theta, shared = (
+        problem.unknowns,
+        problem.unknowns.guess[None].copy(),
+        problem.unknowns.layout.sizes[0],
+    )
     for place, label in enumerate(unknowns.labels[:shared]):
         check_name(label, fit.labels, f"the runs held out share `{label}`, which was not estimated")
         theta[0, place] = fit[label].value
@@ -145,7 +157,10 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
     # residuals are in units of sigmas, of which the unknown ones were estimated from these runs
     ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
-    residuals = [{name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()} for k in range(len(runs))]
+    residuals = [
+        {name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()}
+        for k in range(len(runs))
+    ]
     return tuple(_by_channel(fit, run, r) for run, r in zip(runs, residuals, strict=True))
 
 
@@ -153,7 +168,9 @@ def _by_channel(fit: Estimates, data: Experiment, residuals: dict[str, np.ndarra
     found = {}
     for name, r in residuals.items():
         values, ts = np.asarray(data.values[name]), np.asarray(data.ts)
-        sigma = np.broadcast_to(fit.sigma[name] if name in fit.sigma else np.asarray(data.sigma_of(name)), values.shape)
+        sigma = np.broadcast_to(
+            fit.sigma[name] if name in fit.sigma else np.asarray(data.sigma_of(name)), values.shape
+        )
         found[name] = Prediction(ts, values, values + sigma * np.asarray(r), sigma)
     return found
 
@@ -202,7 +219,14 @@ def informed(problem: Problem, found: Minimum, most: int) -> Informed:
     on sigmas alone, not on factors for the loss or for estimated sigmas.
     """
     unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
-    known = information(at.arrow, unknowns.sizes(theta), unknowns.estimated, unknowns.reached(theta), ~found.going, problem.asked.control.cutoff).only()
+    known = information(
+        at.arrow,
+        unknowns.sizes(theta),
+        unknowns.estimated,
+        unknowns.reached(theta),
+        ~found.going,
+        problem.asked.control.cutoff,
+    ).only()
     some = np.flatnonzero(known.identifiable)[:most]
     C = np.zeros((len(some), unknowns.fixed.size))
     C[:, unknowns.estimated] = known.whole_covariance[some]
@@ -218,8 +242,15 @@ def informed(problem: Problem, found: Minimum, most: int) -> Informed:
                     rows[group.channels[name]] /= at.sigma[0, k]
             # a = C J'
             share = (np.concatenate([C[:, own], C[:, :p]], axis=1) @ rows.T) ** 2 / variance
-            shares[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in group.by_channel(run, share).items()}
-    return Informed(tuple(unknowns.labels[i] for i in some), tuple(shares), tuple(np.asarray(run.ts) for run in problem.runs))
+            shares[run] = {
+                name: np.nansum(x, axis=tuple(range(2, x.ndim)))
+                for name, x in group.by_channel(run, share).items()
+            }
+    return Informed(
+        tuple(unknowns.labels[i] for i in some),
+        tuple(shares),
+        tuple(np.asarray(run.ts) for run in problem.runs),
+    )
 
 
 @dataclass(frozen=True, repr=False)
@@ -239,12 +270,21 @@ class Profile(Printed):
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        ends = "no data set an end to it" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
-        return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: "
-            f"{ends}", *self.notes))
+        ends = (
+            "no data set an end to it" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
+        )
+        return "; ".join(
+            (f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes)
+        )
 
 
-def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
+def profiles(
+    problem: Problem,
+    fitted: Minimum,
+    names: Iterable[str],
+    errors: dict[str, float],
+    inflation: dict[str, float],
+) -> dict[str, Profile]:
     """Return profiles of the named unknowns. `errors`: standard errors by name, for the first step;
     `inflation`: divisor of the rise.
     """
@@ -254,11 +294,28 @@ def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: di
         k = unknowns.labels.index(name)
         place, error = int(unknowns.estimated[k]), errors[name]
         estimate = float(fitted.theta[0, place])
-        first = 0.6 * error if np.isfinite(error) and error > 0 else 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
-        low, high = (side(problem, fitted, 0, place, way, first, RISE_95 / 2 * inflation[name]) for way in (-1.0, 1.0))
+        first = (
+            0.6 * error
+            if np.isfinite(error) and error > 0
+            else 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
+        )
+        low, high = (
+            side(problem, fitted, 0, place, way, first, RISE_95 / 2 * inflation[name]) for way in (-1.0, 1.0)
+        )
         values, rise = np.array(sorted({(estimate, 0.0), *low.points, *high.points})).T
         closed = low.is_closed, high.is_closed
         kind = ("flat", "one-sided", "bounded")[sum(closed)]
         notes = tuple(dict.fromkeys(one.note for one in (low, high) if one.note))
-        found[name] = Profile(name, unknowns.units[k], estimate, values, 2 * rise / inflation[name], low.end, high.end, closed, kind, notes)
+        found[name] = Profile(
+            name,
+            unknowns.units[k],
+            estimate,
+            values,
+            2 * rise / inflation[name],
+            low.end,
+            high.end,
+            closed,
+            kind,
+            notes,
+        )
     return found

@@ -39,7 +39,12 @@ class ByMember:
 
     def of(self: Parts, members) -> Parts:
         """Return the parts of some members."""
-        return type(self)(*(x if x is None else x.of(members) if isinstance(x, ByMember) else x[members] for x in self._parts()))
+        return type(self)(
+            *(
+                x if x is None else x.of(members) if isinstance(x, ByMember) else x[members]
+                for x in self._parts()
+            )
+        )
 
     def put(self: Parts, members, new: Parts) -> None:
         """Store the parts of `new` for these members."""
@@ -63,7 +68,9 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
     """Return T of [J r]; not finite if [J r] is not."""
     width = whole.shape[-1]
     if whole.shape[-2] < width:
-        whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
+        whole = np.concatenate(
+            [whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2
+        )
     # LAPACK's raw form: the transposed triangle, with reflectors beyond the diagonal
     reflected, _ = np.linalg.qr(whole, mode="raw")
     index = np.arange(width)
@@ -97,7 +104,9 @@ class Arrow(ByMember):
         """Return up to three blocks of rows: with shared unknowns only, of single pieces, and of joins
         between a piece and its predecessor.
         """
-        return [x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None]
+        return [
+            x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None
+        ]
 
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
         """Return the entries of x for the columns of each block; arbitrary entries for the missing
@@ -137,7 +146,9 @@ class Arrow(ByMember):
     @cached_property
     def column_norms(self) -> ByUnknown:
         """Return the length of each column of the Jacobian."""
-        return np.sqrt(self._by_unknown(lambda rows: np.einsum("...ij,...ij->...j", rows[..., :-1], rows[..., :-1])))
+        return np.sqrt(
+            self._by_unknown(lambda rows: np.einsum("...ij,...ij->...j", rows[..., :-1], rows[..., :-1]))
+        )
 
     @cached_property
     def gradient(self) -> ByUnknown:
@@ -146,7 +157,10 @@ class Arrow(ByMember):
 
     def _changes(self, d: ByUnknown) -> list[np.ndarray]:
         """Return the first-order change of the residuals of each block."""
-        return [(rows[..., :-1] @ x[..., None])[..., 0] for rows, x in zip(self._blocks, self._columns(d), strict=True)]
+        return [
+            (rows[..., :-1] @ x[..., None])[..., 0]
+            for rows, x in zip(self._blocks, self._columns(d), strict=True)
+        ]
 
     def change(self, d: ByUnknown) -> PerMember:
         """Return `|J d|^2`."""
@@ -157,7 +171,9 @@ class Arrow(ByMember):
         `moved`.
         """
         blocks = [rows.copy() for rows in self._blocks]
-        for rows, change, free in zip(blocks, self._changes(np.where(held, moved, 0.0)), self._columns(~held), strict=True):
+        for rows, change, free in zip(
+            blocks, self._changes(np.where(held, moved, 0.0)), self._columns(~held), strict=True
+        ):
             rows[..., -1] += change
             rows[..., :-1] *= free[..., None, :]
         return self._of_blocks(blocks)
@@ -168,7 +184,9 @@ class Arrow(ByMember):
         here = self._held(held, moved) if held.any() else self
         D_s, D_l = self.split(D)
         tops, left = eliminated(here.local, np.sqrt(damping)[:, None, None] * D_l, here.joins)
-        found = by_singular_values(np.concatenate([here.shared, left], axis=1) if m else here.shared, D_s, damping, cutoff)
+        found = by_singular_values(
+            np.concatenate([here.shared, left], axis=1) if m else here.shared, D_s, damping, cutoff
+        )
         if m:
             right = -(tops[..., -1:] + tops[..., -1 - p : -1] @ found[:, None, :, None])
             own = np.linalg.solve(tops[..., :m], right)
@@ -178,17 +196,23 @@ class Arrow(ByMember):
         return np.where(held, moved, found)
 
 
-def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
+def with_prior(
+    arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]
+) -> Arrow:
     """Return the arrow with the added `residual` (theta - mean) * weight of each unknown, zero without a
     prior. For shared unknowns it is multiplied by M; the scores do not change.
     """
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
     below = np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)
-    return Arrow(tops, np.linalg.qr(np.concatenate([arrow.shared, left, below], axis=1), mode="r"), arrow.scores)
+    return Arrow(
+        tops, np.linalg.qr(np.concatenate([arrow.shared, left, below], axis=1), mode="r"), arrow.scores
+    )
 
 
-def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def eliminated(
+    local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows that express a piece's unknowns by shared ones and the previous piece's; and the
     remaining rows, without the piece's unknowns.
 
@@ -223,7 +247,9 @@ def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.nd
     return np.concatenate([rows[..., :m], np.zeros((*rows.shape[:-1], m)), rows[..., m:]], axis=-1)
 
 
-def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float) -> Float[np.ndarray, "members shared"]:
+def by_singular_values(
+    shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float
+) -> Float[np.ndarray, "members shared"]:
     """Return the damped step of the shared unknowns times D: (S^2 + lambda) ds = - S U' c, zero in
     undetermined directions.
     """

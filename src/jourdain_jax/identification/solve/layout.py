@@ -42,7 +42,8 @@ from jourdain_jax.scene.scene import Scene
 
 _DIAGONAL, _PRODUCTS = ((0, 0), (1, 1), (2, 2)), ((0, 1), (1, 2), (0, 2))
 _OTHERWISE = (
-    "give each parameter its own range or tie, or make its inertia of `jj.identification.log_cholesky` numbers in the scene"
+    "give each parameter its own range or tie, or make its inertia of `jj.identification.log_cholesky`"
+    " numbers in the scene"
 )
 
 
@@ -98,8 +99,15 @@ class BodyInertia:
 
     def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:
         """Return D and l for a scene's parameters; NaN if no body of nonzero thickness has such moments."""
-        value = {(entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index] for entry in self.entries}
-        of_axis = {self.axes[entry.row]: value[entry.row, entry.row] for entry in self.entries if entry.row == entry.column}
+        value = {
+            (entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index]
+            for entry in self.entries
+        }
+        of_axis = {
+            self.axes[entry.row]: value[entry.row, entry.row]
+            for entry in self.entries
+            if entry.row == entry.column
+        }
         I = jnp.diag(jnp.stack([of_axis[k] for k in self.axes]))
         for i, j in (_PRODUCTS[k] for k in self.products):
             I = I.at[i, j].set(value[i, j]).at[j, i].set(value[i, j])
@@ -109,9 +117,13 @@ class BodyInertia:
         A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
         D = jnp.diag(A) ** 2
         l = [A[i, j] / A[j, j] for i, j in (_PRODUCTS[k] for k in self.products)]
-        return D[np.array([self.axes.index(k) for k in range(max(self.axes) + 1)])], jnp.stack(l) if l else jnp.zeros(0, D.dtype)
+        return D[np.array([self.axes.index(k) for k in range(max(self.axes) + 1)])], (
+            jnp.stack(l) if l else jnp.zeros(0, D.dtype)
+        )
 
-    def values(self, D: Float[Entries, "*members moments"], l: Float[Entries, "*members shears"]) -> list[Float[Array, "*members"]]:
+    def values(
+        self, D: Float[Entries, "*members moments"], l: Float[Entries, "*members shears"]
+    ) -> list[Float[Array, "*members"]]:
         """Return the parameter of every entry."""
 
         def inertia(D, l):
@@ -142,19 +154,33 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
             entries.append(entry)
         number, factor = seen[what]
         if factor != entry.factor:
-            raise ValueError(_refusal(scene, name, f"moments about axes {entries[number].row + 1} and "
-                f"{i + 1} are different multiples of `{entry.name}`"))
+            raise ValueError(
+                _refusal(
+                    scene,
+                    name,
+                    f"moments about axes {entries[number].row + 1} and "
+                    f"{i + 1} are different multiples of `{entry.name}`",
+                )
+            )
         axes.append(number)
     there = tuple(k for k, entry in enumerate(products) if entry is not None)
     entries += [entry for entry in products if entry is not None]
     if len({(entry.name, entry.index) for entry in entries}) < len(entries):
-        raise ValueError(_refusal(scene, name, "one parameter serves as a moment and a product, or as two products"))
+        raise ValueError(
+            _refusal(scene, name, "one parameter serves as a moment and a product, or as two products")
+        )
     if len(there) == 2 or (there and len(seen) < 3):
-        what = f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one or three products, and three moments with any"
+        what = (
+            f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one"
+            " or three products, and three moments with any"
+        )
         raise ValueError(_refusal(scene, name, what))
     found = BodyInertia(name, tuple(entries), tuple(axes), there)
     if not all_finite(found.numbers(scene)[0]):
-        moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
+        moments = ", ".join(
+            f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}"
+            for entry in diagonal
+        )
         raise ValueError(
             f"no body of nonzero thickness has the moments of inertia of body `{name}` of "
             f"`{type(scene).__name__}`, {moments} kg m^2 with its products: principal ones must be positive, "
@@ -169,30 +195,55 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     what = f"`free` asks for a possible inertia of `{name}`, which is not a body of `{type(scene).__name__}`"
     check_name(name, known, what)
     if not isinstance(known[name], RigidBody):
-        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name "
-            "a rigid body")
-    names = [of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)]
+        raise ValueError(
+            f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name a rigid body"
+        )
+    names = [
+        of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)
+    ]
     values = {of: np.asarray(getattr(scene, of), float) for of in names}
     generator = np.random.default_rng(0)
-    elsewhere = {of: x * (1 + 0.1 * generator.uniform(size=x.shape)) + 0.01 * generator.uniform(size=x.shape) for of, x in values.items()}
+    elsewhere = {
+        of: x * (1 + 0.1 * generator.uniform(size=x.shape)) + 0.01 * generator.uniform(size=x.shape)
+        for of, x in values.items()
+    }
     slopes_of = _slopes(name)
     (I, slopes), (I_there, slopes_there) = slopes_of(scene, values), slopes_of(scene, elsewhere)
     size, round_off = largest(I), 1e-9
 
     def entry(i: int, j: int) -> Entry | None:
-        where = [(of, index) for of in names for index in np.ndindex(values[of].shape) if slopes[of][(i, j, *index)] or slopes_there[of][(i, j, *index)]]
+        where = [
+            (of, index)
+            for of in names
+            for index in np.ndindex(values[of].shape)
+            if slopes[of][(i, j, *index)] or slopes_there[of][(i, j, *index)]
+        ]
         if not where:
             if i != j and abs(I[i, j]) <= round_off * size:
                 return None
-            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg "
-                "m^2, is not a parameter"))
+            raise ValueError(
+                _refusal(
+                    scene,
+                    name,
+                    f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is not a parameter",
+                )
+            )
         of, index = where[0]
         factor = float(slopes[of][(i, j, *index)])
-        straight = all(abs(M[i, j] - factor * x[of][index]) <= round_off * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
+        straight = all(
+            abs(M[i, j] - factor * x[of][index]) <= round_off * abs(M[i, j])
+            for M, x in ((I, values), (I_there, elsewhere))
+        )
         if len(where) > 1 or not straight:
             parts = ", ".join(f"`{of}`" for of in dict.fromkeys(of for of, _ in where))
-            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia is made of {parts}, "
-                "expected one parameter times a constant"))
+            raise ValueError(
+                _refusal(
+                    scene,
+                    name,
+                    f"entry {i + 1}{j + 1} of its inertia is made of {parts}, "
+                    "expected one parameter times a constant",
+                )
+            )
         return Entry(of, index, i, j, factor)
 
     return [entry(i, j) for i, j in _DIAGONAL], [entry(i, j) for i, j in _PRODUCTS]
@@ -211,7 +262,10 @@ def _slopes(name: str) -> Callable:
 
 
 def _refusal(scene: Scene, name: str, why: str) -> str:
-    return f"the inertia of body `{name}` of `{type(scene).__name__}` cannot be given by `possible_inertia`: {why}; {_OTHERWISE}"
+    return (
+        f"the inertia of body `{name}` of `{type(scene).__name__}` cannot be given by `possible_inertia`:"
+        f" {why}; {_OTHERWISE}"
+    )
 
 
 @dataclass(frozen=True)
@@ -238,19 +292,25 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
         try:
             found = jnp.asarray(value, real_type())
         except (TypeError, ValueError):
-            raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a "
-                f"number or an array of shape {expected}") from None
+            raise ValueError(
+                f"the function in `free` of `{name}` returns {described(value)}, expected a "
+                f"number or an array of shape {expected}"
+            ) from None
         if found.shape != expected:
-            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, "
-                f"expected {expected}, the shape of the parameter")
+            raise ValueError(
+                f"the function in `free` of `{name}` returns an array of shape {found.shape}, "
+                f"expected {expected}, the shape of the parameter"
+            )
         return found
 
     found = Tie(name, Call(jax.make_jaxpr(of_leaves)(*leaves), ("a tied parameter",)))
     try:
         scene.replace(**{name: found.value(leaves)})
     except ValueError as error:
-        raise ValueError(f"at the first guess the function in `free` of `{name}` gives a value that is not "
-            f"allowed: {error}") from None
+        raise ValueError(
+            f"at the first guess the function in `free` of `{name}` gives a value that is not "
+            f"allowed: {error}"
+        ) from None
     return found
 
 
@@ -307,7 +367,14 @@ class Layout:
     @property
     def following(self) -> Labels:
         """Return names of the dependent parameters: moments of inertia of bodies, and tied ones."""
-        return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
+        return tuple(
+            dict.fromkeys(
+                [
+                    *(entry.name for body in self.bodies for entry in body.entries),
+                    *(tie.name for tie in self.ties),
+                ]
+            )
+        )
 
     def scene(self, scene: Scene, shared: Float[Entries, "*members shared"]) -> Scene:
         """Return the scene with these shared unknowns."""
@@ -325,11 +392,16 @@ class Layout:
                 found[leaf] = own.at[(..., *entry.index)].set(value)
         for tie in self.ties:
             # parameters of members have leading axes, shared ones have none
-            function, axes = tie.value, [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
+            function, axes = (
+                tie.value,
+                [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)],
+            )
             for _ in shared.shape[:-1]:
                 function = jax.vmap(function, in_axes=(axes,))
             found[getattr(names, tie.name)] = function(found)
-        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)])
+        return jax.tree.unflatten(
+            treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)]
+        )
 
     def start(self, start: dict, *vectors: Float[Entries, "*members _"]) -> dict:
         """Return the start of a run for these shared unknowns and its own."""
@@ -348,4 +420,9 @@ class Layout:
         """Return names of the unknowns of a kind, with their values in the vectors of shared unknowns and of
         a run.
         """
-        return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)
+        return (
+            (place.name, place.of(x))
+            for places, x in zip((self.shared, self.local), vectors, strict=True)
+            for place in places
+            if place.kind == kind
+        )

@@ -75,12 +75,18 @@ class Minimum(ByMember):
         """
         none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
         trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
-        return Minimum(theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), none.copy(), trace)
+        return Minimum(
+            theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), none.copy(), trace
+        )
 
     def here(self) -> tuple[Members, Arrow, ByUnknown]:
         """Return the running members, with their linearised problems and unknowns."""
         here = np.flatnonzero(self.going)
-        return here, self.at.arrow if here.size == self.going.size else self.at.arrow.of(here), self.theta[here]
+        return (
+            here,
+            self.at.arrow if here.size == self.going.size else self.at.arrow.of(here),
+            self.theta[here],
+        )
 
     def arrived(self, here: Members, done: Flags) -> np.ndarray:
         """Stop the converged members, and return those that try a step."""
@@ -120,10 +126,21 @@ class Minimum(ByMember):
 
     def after(self, before: "Minimum", members: Members) -> "Minimum":
         """Return these members, with steps and trace of the earlier attempt added."""
-        return replace(self, steps=before.steps[members] + self.steps, trace=before.trace[members] + self.trace, grown=before.grown[members])
+        return replace(
+            self,
+            steps=before.steps[members] + self.steps,
+            trace=before.trace[members] + self.trace,
+            grown=before.grown[members],
+        )
 
 
-def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
+def minimise(
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised],
+    theta: ByUnknown,
+    unknowns: Unknowns,
+    control: Control,
+    what: str = "",
+) -> Minimum:
     """Return the minimum from `theta`. `evaluate(theta, members)` returns value and derivatives for the
     members at these numbers; `what`: the name of the objective in the trace.
     """
@@ -162,11 +179,15 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         way.give_up(damping > 1e9)
         for b in here.tolist():
             ((_, costs),) = way.trace[b]
-            way.going[b] &= len(costs) <= control.patience or costs[-1] <= max(control.near, 0.25 * costs[-1 - control.patience])
+            way.going[b] &= len(costs) <= control.patience or costs[-1] <= max(
+                control.near, 0.25 * costs[-1 - control.patience]
+            )
     return way
 
 
-def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> PerMember:
+def fallen(
+    before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, control: Control
+) -> PerMember:
     """Return the decrease of F along a step d.
 
     Near the minimum, errors of the simulation hide small changes of F: F jumps when a motion takes another
@@ -175,7 +196,9 @@ def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, 
     """
     found = before - trial.cost
     by_slopes = 0.5 * (slope - np.einsum("bi,bi->b", trial.arrow.gradient, d))
-    unsure = (np.abs(found) < 1e-6 * np.abs(before)) | ((promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance))
+    unsure = (np.abs(found) < 1e-6 * np.abs(before)) | (
+        (promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance)
+    )
     return np.where(unsure, by_slopes, found)
 
 

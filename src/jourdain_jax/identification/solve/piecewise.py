@@ -25,7 +25,13 @@ from jourdain_jax.identification.solve.layout import Place
 from jourdain_jax.identification.solve.levenberg_marquardt import Linearised
 from jourdain_jax.identification.solve.problem import Asked, Problem, closed
 from jourdain_jax.identification.solve.runs import Some
-from jourdain_jax.identification.solve.shooting import NODE, ends_of_pieces, in_pieces, numbers_of_filters, owned
+from jourdain_jax.identification.solve.shooting import (
+    NODE,
+    ends_of_pieces,
+    in_pieces,
+    numbers_of_filters,
+    owned,
+)
 from jourdain_jax.identification.solve.unknowns import Places, Unknowns
 
 
@@ -63,20 +69,28 @@ class Piecewise(Problem):
         super().__init__(asked, runs, unknowns)
         scene, layout, shooting = asked.scene, unknowns.layout, asked.shooting
         assert shooting is not None
-        of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs]
+        of_runs = [
+            len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs
+        ]
         self.states = max(of_runs)  # length of a node, zero-padded for runs with fewer low-pass filters
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
         of_each = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
         parts = tuple(itertools.chain(*of_each))
         if len(parts) == len(runs):
-            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or "
-                "omit `shooting`")
-        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # run of each piece
+            raise ValueError(
+                "`shooting` leaves each run in one piece only; give a shorter `duration`, or omit `shooting`"
+            )
+        self.run_of = np.repeat(
+            np.arange(len(runs)), [len(of_run) for of_run in of_each]
+        )  # run of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
         # numbers of sensors are equal in all pieces: these unknowns of a piece, and its node, are determined
         # by the previous piece
-        self._carried = np.array([k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)], int)
+        self._carried = np.array(
+            [k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)],
+            int,
+        )
         self._decided = np.concatenate([self._carried, self.own + np.arange(self.states)])
         self._states_of = np.array(of_runs)[self.run_of]
         self._layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), self.own, "start")))
@@ -85,15 +99,24 @@ class Piecewise(Problem):
         self._places = [self._places_of(i) for i in range(len(parts))]
         self.tolerance = float(asked.options.rtol), float(asked.options.atol)
 
-    # With nodes as unknowns. ----------------------------------------------------------------------------------------
+    # With nodes as unknowns. --------------------------------------------------------------------------------
 
     def _unknowns(self, pieces: int) -> Unknowns:
         """Return the unknowns of all pieces with their nodes."""
         whole, free = self.unknowns, unbounded(1.0)
-        ranges = self._each(np.array(whole.ranges, object), free, free, np.array([unbounded(float(size)) for size in self.node_sizes], object))
-        means, weights = (self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight))
+        ranges = self._each(
+            np.array(whole.ranges, object),
+            free,
+            free,
+            np.array([unbounded(float(size)) for size in self.node_sizes], object),
+        )
+        means, weights = (
+            self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight)
+        )
         fixed, guess = self._each(whole.fixed, True, True, False), self.spread(whole.guess)
-        return Unknowns(self._layout, pieces, guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening)
+        return Unknowns(
+            self._layout, pieces, guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening
+        )
 
     def measure(self, node_sizes: Float[np.ndarray, "states"]) -> None:
         """Set the sizes of the entries of nodes."""
@@ -116,7 +139,9 @@ class Piecewise(Problem):
         whole = np.concatenate([own, nodes], axis=-1)
         return np.concatenate([shared, whole.reshape(*whole.shape[:-2], -1)], axis=-1)
 
-    def with_ends(self, theta: np.ndarray, members: np.ndarray) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
+    def with_ends(
+        self, theta: np.ndarray, members: np.ndarray
+    ) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
         """Return [J r] of all pieces with these unknowns, and [J x] of their end states."""
         _, pieces, M = self.pieces.unknowns.split(theta)[1].shape
         found, ends = [], np.zeros((len(members), pieces, self.states, M + self.shared + 1))
@@ -126,12 +151,17 @@ class Piecewise(Problem):
             found.append((b, j, rows))
         return found, ends
 
-    def _from_before(self, ends: np.ndarray, local: np.ndarray, piece: int) -> Float[np.ndarray, "members decided width"]:
+    def _from_before(
+        self, ends: np.ndarray, local: np.ndarray, piece: int
+    ) -> Float[np.ndarray, "members decided width"]:
         """Return [A B c], a linear model of a gap: the end of a piece as a function of its predecessor's
         unknowns, minus the next piece's start.
         """
         carried = np.zeros((len(local), self._carried.size, ends.shape[-1]))
-        carried[:, range(self._carried.size), self._carried], carried[..., -1] = 1.0, local[:, piece - 1, self._carried]
+        carried[:, range(self._carried.size), self._carried], carried[..., -1] = (
+            1.0,
+            local[:, piece - 1, self._carried],
+        )
         rows = np.concatenate([carried, ends[:, piece - 1]], axis=1)
         rows[..., -1] -= local[:, piece, self._decided]
         return rows
@@ -155,14 +185,24 @@ class Piecewise(Problem):
         cost = np.where(finite, at.cost + 0.5 * np.sum(joins[..., -1] ** 2, axis=(1, 2)), np.inf)
         return replace(at, cost=cost, arrow=replace(at.arrow, joins=joins))
 
-    # Condensed. -----------------------------------------------------------------------------------------------------
+    # Condensed. ---------------------------------------------------------------------------------------------
 
     def put(self, theta: np.ndarray) -> ByUnknown:
         """Set the unknowns of the pieces of all members; return the unknowns of the whole runs."""
         shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
-        slopes, jumps = np.zeros((*local.shape, self.own + self.shared)), np.full((*local.shape[:2], self.states), np.inf)
-        self.at = _Standing(local.copy(), whole, np.empty((len(theta), len(self.runs)), object), slopes, np.zeros(local.shape), jumps)
+        slopes, jumps = (
+            np.zeros((*local.shape, self.own + self.shared)),
+            np.full((*local.shape[:2], self.states), np.inf),
+        )
+        self.at = _Standing(
+            local.copy(),
+            whole,
+            np.empty((len(theta), len(self.runs)), object),
+            slopes,
+            np.zeros(local.shape),
+            jumps,
+        )
         return whole.copy()
 
     def put_nodes(self, theta: ByUnknown, found: Shot) -> None:
@@ -193,7 +233,9 @@ class Piecewise(Problem):
         """
         failed = np.zeros(len(members), bool)
         for _ in range(8):
-            some = np.flatnonzero(~failed & ~((theta == self.at.theta[members]).all(axis=1) & self.closed(members)))
+            some = np.flatnonzero(
+                ~failed & ~((theta == self.at.theta[members]).all(axis=1) & self.closed(members))
+            )
             if not some.size:
                 break
             failed[some] = ~self._move(theta[some], members[some], np.ones(some.size))
@@ -235,7 +277,13 @@ class Piecewise(Problem):
     def _by_piece(self, theta: ByUnknown) -> Float[np.ndarray, "members pieces own_and_shared"]:
         """Return the unknowns of each piece's run, followed by the shared ones."""
         shared, own = self.unknowns.split(theta)
-        return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
+        return np.concatenate(
+            [
+                own[:, self.run_of],
+                np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared)),
+            ],
+            axis=2,
+        )
 
     def growth(self, members: np.ndarray) -> PerMember:
         """Return the largest factor by which small changes of the unknowns grow after the first joint, in
@@ -244,7 +292,9 @@ class Piecewise(Problem):
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
         lengths = np.sqrt(np.sum(slopes**2, axis=(2, 3)))[:, self.follows]
-        return np.maximum(np.max(lengths, axis=1) / np.maximum(np.min(lengths, axis=1), np.finfo(float).tiny), 1.0)
+        return np.maximum(
+            np.max(lengths, axis=1) / np.maximum(np.min(lengths, axis=1), np.finfo(float).tiny), 1.0
+        )
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
@@ -273,13 +323,26 @@ class Piecewise(Problem):
         """
         m, M = self.own, self.own + self.states
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)
-        local = before.local + (before.slopes @ self._by_piece(theta - before.theta)[..., None])[..., 0] + share[:, None, None] * before.gaps
+        local = (
+            before.local
+            + (before.slopes @ self._by_piece(theta - before.theta)[..., None])[..., 0]
+            + share[:, None, None] * before.gaps
+        )
         local[:, ~self.follows, :m] = own
         some, ends = self.with_ends(np.concatenate([shared, local.reshape(len(theta), -1)], axis=1), members)
         rows = np.empty(local.shape[:2], object)
-        for (b, j), one in itertools.chain(*(zip(zip(b, j, strict=True), plain, strict=True) for b, j, plain in some)):
+        for (b, j), one in itertools.chain(
+            *(zip(zip(b, j, strict=True), plain, strict=True) for b, j, plain in some)
+        ):
             rows[b, j] = one
-        new = _Standing(local, theta, np.empty((len(theta), len(self.runs)), object), 0 * before.slopes, 0 * before.gaps, np.zeros(ends.shape[:-1]))
+        new = _Standing(
+            local,
+            theta,
+            np.empty((len(theta), len(self.runs)), object),
+            0 * before.slopes,
+            0 * before.gaps,
+            np.zeros(ends.shape[:-1]),
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             for i in range(len(self.follows)):
                 if not self.follows[i]:
@@ -289,7 +352,9 @@ class Piecewise(Problem):
                 joint = self._from_before(ends, local, i)
                 new.slopes[:, i, self._decided] = joint[..., :M] @ new.slopes[:, i - 1]
                 new.slopes[:, i, self._decided, m:] += joint[..., M:-1]
-                new.gaps[:, i, self._decided] = (joint[..., :M] @ new.gaps[:, i - 1, :, None])[..., 0] + joint[..., -1]
+                new.gaps[:, i, self._decided] = (joint[..., :M] @ new.gaps[:, i - 1, :, None])[
+                    ..., 0
+                ] + joint[..., -1]
                 new.jumps[:, i] = joint[:, self._carried.size :, -1]
             good = np.isfinite(new.slopes.sum(axis=(1, 2, 3)) + new.gaps.sum(axis=(1, 2)))
         for b in np.flatnonzero(good):
@@ -299,7 +364,9 @@ class Piecewise(Problem):
         self.at.put(members[good], new.of(good))
         return good
 
-    def _condensed(self, run: int, rows_of: np.ndarray, slopes: np.ndarray, gaps: np.ndarray) -> Float[np.ndarray, "samples width"]:
+    def _condensed(
+        self, run: int, rows_of: np.ndarray, slopes: np.ndarray, gaps: np.ndarray
+    ) -> Float[np.ndarray, "samples width"]:
         """Return [J g r] of a whole run from [J r], derivatives and gaps of all pieces."""
         M, found = self.own + self.states, np.zeros(self._shape(run))
         for i in np.flatnonzero(self.run_of == run):

@@ -25,7 +25,12 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.identification.data.experiment import Experiment
-from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
+from jourdain_jax.identification.inference.correlated_noise import (
+    SHORTEST,
+    correlation_limits,
+    half_log_determinant,
+    lowest,
+)
 from jourdain_jax.identification.solve.arrow import Arrow, ByMember, PerMember, arrow, triangle, with_prior
 from jourdain_jax.identification.solve.levenberg_marquardt import Control, Linearised, Minimum, minimise
 from jourdain_jax.identification.solve.runs import Group, Some, grouped
@@ -53,20 +58,25 @@ class Loss:
         if self.kind == "student-t":
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
         inside = np.minimum(abs(r), k)
-        return np.sum(inside * (np.minimum(abs(r), np.finfo(float).max / max(k, 1.0)) - 0.5 * inside), axis=-1)
+        return np.sum(
+            inside * (np.minimum(abs(r), np.finfo(float).max / max(k, 1.0)) - 0.5 * inside), axis=-1
+        )
 
     def weight(self, r: Samples) -> Samples:
         """Return w(r)."""
         k = self.parameter
-        return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
+        return (
+            (k + 1) / (k + r**2)
+            if self.kind == "student-t"
+            else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
+        )
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Samples):
         """Return `rows`, each multiplied by the root of its weight."""
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:
-        """Return the factor of the covariance (J'WJ)^-1, for residuals that determined `determined` unknowns.
-        """
+        """Return the factor of the covariance (J'WJ)^-1, for residuals that determined `determined` unknowns."""
         if not np.isfinite(bend := self.bend(r)):
             return bend
         psi, slope = self.weight(r) * r, self._slope(r)
@@ -83,7 +93,11 @@ class Loss:
     def _slope(self, r: Residuals) -> Residuals:
         """Return psi'."""
         k = self.parameter
-        return (k + 1) * (k - r**2) / (k + r**2) ** 2 if self.kind == "student-t" else (np.abs(r) <= k).astype(float)
+        return (
+            (k + 1) * (k - r**2) / (k + r**2) ** 2
+            if self.kind == "student-t"
+            else (np.abs(r) <= k).astype(float)
+        )
 
 
 LEAST_SQUARES = Loss("least squares", np.inf)
@@ -91,7 +105,8 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 def huber(k: Number = 1.345) -> Loss:
     """Return a loss that counts residuals beyond `k` sigmas by magnitude instead of by square: `jj.fit(...,
-    loss=jj.identification.huber())`. The default has 95 % of the efficiency of least squares for normal noise.
+    loss=jj.identification.huber())`. The default has 95 % of the efficiency of least squares for normal
+    noise.
 
     Raises ValueError unless k is positive and finite.
     """
@@ -110,8 +125,9 @@ def student_t(degrees: Number = 4.0) -> Loss:
 def _positive(x: Number, name: str, function: str) -> float:
     checked_real(x, f"`{name}` of `{function}`", ())
     if not (np.isfinite(x) and x > 0):
-        raise ValueError(f"{function}({x}): expected a positive finite number for `{name}`; omit it for the "
-            "default")
+        raise ValueError(
+            f"{function}({x}): expected a positive finite number for `{name}`; omit it for the default"
+        )
     return float(x)
 
 
@@ -142,18 +158,34 @@ class Problem:
     unknowns. `repeats`: the number of repeats of the experiment, or None.
     """
 
-    def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None):
-        self.asked, self.runs, self.unknowns, self.single, self.count = asked, runs, unknowns, repeats is None, repeats or 1
+    def __init__(
+        self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None
+    ):
+        self.asked, self.runs, self.unknowns, self.single, self.count = (
+            asked,
+            runs,
+            unknowns,
+            repeats is None,
+            repeats or 1,
+        )
         self.scene, self.loss = asked.scene, asked.loss
-        self.groups = [Group(asked.scene, runs, indices, unknowns.layout, asked.options, repeats) for indices in grouped(runs)]
+        self.groups = [
+            Group(asked.scene, runs, indices, unknowns.layout, asked.options, repeats)
+            for indices in grouped(runs)
+        ]
         # run -> its group of runs of equal structure
         self.group_of = {run: group for group in self.groups for run in group.runs.tolist()}
         # channels with estimated sigma
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))
-        largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
+        largest = [
+            max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values)
+            for name in self.estimated
+        ]
         # lower limit of these sigmas, reached by an exact fit
         self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])
-        self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
+        self.with_memory = tuple(
+            sorted({name for run in runs for name in run.unknown_correlation})
+        )  # channels whose correlation time is estimated
         # s, of these channels; initially as for white noise
         self.tau = np.zeros((self.count, len(self.with_memory)))
         self.failed = False  # whether any motion has failed
@@ -183,9 +215,16 @@ class Problem:
         """Return the objective and its arrow matrix for some members, over all runs or a span of them."""
         return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
 
-    def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
+    def minimum(
+        self,
+        theta: np.ndarray,
+        members: np.ndarray,
+        what: str = "",
+        control: Control | None = None,
+        span: Span | None = None,
+    ) -> Minimum:
         """Return the minimum for some members, starting from theta. `control` replaces the fit's own."""
-        evaluate = lambda x, here: self.linearised(x, members[here], span and span.of(here))  # noqa: E731
+        evaluate = lambda x, here: self.linearised(x, members[here], span and span.of(here))
         return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
 
     def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
@@ -197,11 +236,28 @@ class Problem:
         begin[0, place], fixed[place] = value, True
         # tolerance in standard errors: the value of F matters here, not the location of the minimum
         roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
-        return minimise(lambda x, _: self.linearised(x, np.array([member])), begin, replace(unknowns, fixed=fixed), roughly)
+        return minimise(
+            lambda x, _: self.linearised(x, np.array([member])),
+            begin,
+            replace(unknowns, fixed=fixed),
+            roughly,
+        )
 
-    def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: np.ndarray, span: Span | None = None) -> Linearised:
+    def assembled(
+        self,
+        theta: np.ndarray,
+        members: np.ndarray,
+        evaluated: Iterable[Some],
+        taus: np.ndarray,
+        span: Span | None = None,
+    ) -> Linearised:
         """Return the objective for evaluated residuals and these correlation times."""
-        (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
+        (p, m), count, runs, kinds = (
+            self.unknowns.layout.sizes,
+            len(theta),
+            self.unknowns.runs,
+            1 + len(self.estimated),
+        )
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
         kept, sigma = np.empty((count, runs), object), np.zeros((count, 0))
@@ -232,29 +288,42 @@ class Problem:
             samples = self.counted(self.estimated, members)
             sigma = np.sqrt(np.maximum(squares[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        whole, of_priors = self.joined(theta, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), span)
+        whole, of_priors = self.joined(
+            theta, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), span
+        )
         cost = cost + of_priors
         return Linearised(cost, whole, kept, sigma, triangles, squares)
 
-    def joined(self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None) -> tuple[Arrow, np.ndarray | float]:
+    def joined(
+        self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None
+    ) -> tuple[Arrow, np.ndarray | float]:
         """Return the arrow matrix for triangles (members, runs, kinds, width, width), these sigmas (members,
         kinds) and all priors; and the contribution of the priors to F.
         """
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]
         if kinds > 1 or np.any(sigma != 1):
-            together = np.linalg.qr((triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r")
+            together = np.linalg.qr(
+                (triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r"
+            )
         whole = arrow(together, m)
         unknowns, mean, weight = self.unknowns, self.unknowns.prior_mean, self.unknowns.prior_weight
         if span is not None:
             none = (weight == 0) & ~unknowns.fixed
-            mean, weight = np.where(none, span.begun, mean), np.where(none, 1 / unknowns.sizes(span.begun), weight)
+            mean, weight = (
+                np.where(none, span.begun, mean),
+                np.where(none, 1 / unknowns.sizes(span.begun), weight),
+            )
         elif not weight.any():
             return whole, 0.0
         r, M = (theta - mean) * weight, unknowns.whitening
-        return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
+        return with_prior(whole, r, weight, M), 0.5 * (
+            np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1)
+        )
 
-    def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
+    def is_followed(
+        self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float
+    ) -> Bool[np.ndarray, "members shares"]:
         """Return for which shares of the span the mean squared residual is at most `most` times the value for
         noise.
         """
@@ -273,25 +342,37 @@ class Problem:
         """Maximise the restricted likelihood over unknown correlation times. Return the largest change of
         rho, the correlation over one shortest interval.
         """
-        evaluated, ends = list(self.evaluated(theta, members)), np.array([correlation_limits(self.runs, name) for name in self.with_memory])
+        evaluated, ends = (
+            list(self.evaluated(theta, members)),
+            np.array([correlation_limits(self.runs, name) for name in self.with_memory]),
+        )
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
         for k, (low, high) in enumerate(ends):
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
-            found = np.exp(lowest(lambda x, k=k: self._restricted(theta, members, evaluated, _with(taus, k, np.exp(x)))[0], *edges))
+            found = np.exp(
+                lowest(
+                    lambda x, k=k: self._restricted(theta, members, evaluated, _with(taus, k, np.exp(x)))[0],
+                    *edges,
+                )
+            )
             interval = low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[:, k])))
             taus[:, k] = found
         self.tau[members % self.count] = taus
         return changed
 
-    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray) -> tuple[np.ndarray, Linearised]:
+    def _restricted(
+        self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray
+    ) -> tuple[np.ndarray, Linearised]:
         """Return the terms of the negative restricted log likelihood."""
         at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
             np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], taus[b]))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
-    def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    def doubt(
+        self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the contribution of estimated correlation times to each squared standard error C, (members,
         unknowns), relative to C; and the variance of log C.
 
@@ -307,18 +388,20 @@ class Problem:
         for k, name in enumerate(self.with_memory):
             low, high = correlation_limits(self.runs, name)
             interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
-            angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
+            angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))
             # nodes in standard deviations of arcsin rho, which are 1 / sqrt(samples) without unknowns
             nodes = angle(taus[:, k])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
             inside = (nodes >= angle(low)) & (nodes <= angle(high))
             found = []
             for node in np.clip(nodes, angle(low), angle(high)).T:
-                value, at = self._restricted(theta, members, evaluated, _with(taus, k, -interval / np.log(np.sin(node))))
+                value, at = self._restricted(
+                    theta, members, evaluated, _with(taus, k, -interval / np.log(np.sin(node)))
+                )
                 found.append((value, *of(at.arrow)))
             values, errors, moved = (np.stack(x, axis=1) for x in zip(*found, strict=True))
             weight = np.where(inside, np.exp(np.min(values, axis=1, keepdims=True) - values), 0.0)
             weight = (weight / weight.sum(axis=1, keepdims=True))[..., None]
-            mean = lambda x, weight=weight: np.sum(weight * x, axis=1)  # noqa: E731
+            mean = lambda x, weight=weight: np.sum(weight * x, axis=1)
             middle = errors[:, 4] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
                 logs = 2 * np.log(errors)
@@ -329,7 +412,12 @@ class Problem:
     @property
     def samples(self) -> int:
         """Return the number of samples of channels with known sigma, in one repeat."""
-        channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
+        channels = [
+            (run, name)
+            for i, run in enumerate(self.runs)
+            for name in run.values
+            if name not in self.estimated
+        ]
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
@@ -342,7 +430,9 @@ class Problem:
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))
         if white and longest:
-            whole = group.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
+            whole = group.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[
+                ..., 0
+            ]
         parts = group.by_channel(run, whole)
         for k, name in enumerate(self.estimated):
             if name in parts:
@@ -357,7 +447,10 @@ class Problem:
             return [whole]
         channels = self.group_of[run].channels
         known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
-        return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]
+        return [
+            np.concatenate([whole[:, :0], *known], axis=1),
+            *(whole[:, channels.get(name, slice(0))] for name in self.estimated),
+        ]
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:

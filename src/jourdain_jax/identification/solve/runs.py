@@ -27,7 +27,16 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar
 from jourdain_jax.identification.data.channels import Channel, StopEvent
 from jourdain_jax.identification.data.experiment import Experiment
-from jourdain_jax.identification.data.sensors import Drive, Numbers, Reading, Times, grid, ideal, intervals, with_numbers
+from jourdain_jax.identification.data.sensors import (
+    Drive,
+    Numbers,
+    Reading,
+    Times,
+    grid,
+    ideal,
+    intervals,
+    with_numbers,
+)
 from jourdain_jax.identification.inference.correlated_noise import Chains, whitened
 from jourdain_jax.identification.solve.layout import Layout
 from jourdain_jax.identification.solve.shooting import LAST, NODE, begin, ended
@@ -61,18 +70,26 @@ class Run(NamedTuple):
             inputs = drive.put_into(inputs)
         if options.backend == "auto" and any(drive.unknown for drive in self.drives.values()):
             options = replace(options, backend="xla")  # this backend differentiates with respect to samples
-        return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
+        return simulate(
+            scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options
+        )
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
         """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
-        states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
+        states = (
+            motion.motions()
+            if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values())
+            else None
+        )
         found, filters, place = {}, [], len(state_names(scene))
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None
             if isinstance(sensor.operation, StopEvent):
-                shown = self.stops(sensor.operation, name, partial(self.motion, scene, simulate, options=options))
+                shown = self.stops(
+                    sensor.operation, name, partial(self.motion, scene, simulate, options=options)
+                )
             else:
                 x = sensor.quantity(motion, states)
                 if sensor.has_filter and NODE in self.start:
@@ -95,7 +112,9 @@ class Run(NamedTuple):
         if not layout.numbers:
             return self._replace(start=changed)
         known = layout.known(shared, local)
-        return self._replace(start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known))
+        return self._replace(
+            start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known)
+        )
 
 
 def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
@@ -106,8 +125,21 @@ def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
     for name, values in data.values.items():
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
-    measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
+    measured = {
+        name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()
+    }
+    found = Run(
+        data.t0,
+        data.ts,
+        None,
+        measured,
+        weights,
+        data.start,
+        data.inputs,
+        data.readings,
+        data.drives,
+        data.correlation_time,
+    )
     return on_equal_grids([found])[0] if any(sensor.is_late for sensor in data.readings.values()) else found
 
 
@@ -115,7 +147,9 @@ def on_equal_grids(runs: Sequence[Run]) -> list[Run]:
     """Return the runs on grids with the number of intervals that the longest run needs."""
     nodes = [run.start.get(LAST) for run in runs]
     count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
-    return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
+    return [
+        run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)
+    ]
 
 
 def equal_runs(data: Sequence[Experiment]) -> list[tuple[Indices, Run]]:
@@ -126,7 +160,9 @@ def equal_runs(data: Sequence[Experiment]) -> list[tuple[Indices, Run]]:
     for indices in grouped(data):
         for i in indices:
             run = run_of(data[i], jnp)
-            groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, is_array)))), []).append((i, run))
+            groups.setdefault(
+                (indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, is_array)))), []
+            ).append((i, run))
     found = []
     for members in groups.values():
         numbers, runs = zip(*members, strict=True)
@@ -144,7 +180,9 @@ def grouped(data: Sequence[Experiment]) -> list[list[int]]:
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
         parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time
-        signals = jax.tree.map(lambda x: None if _is_sampled(x) else x, parts[2:4], is_leaf=_is_sampled)  # without samples
+        signals = jax.tree.map(
+            lambda x: None if _is_sampled(x) else x, parts[2:4], is_leaf=_is_sampled
+        )  # without samples
         arrays, rest = eqx.partition((*parts[:2], signals), is_array)
         kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
@@ -160,7 +198,14 @@ def _is_sampled(x) -> bool:
 
 
 def most_knots(runs: Sequence[Run]) -> list[int]:
-    counts = [[x.ts.shape[0] for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
+    counts = [
+        [
+            x.ts.shape[0]
+            for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled)
+            if _is_sampled(x)
+        ]
+        for run in runs
+    ]
     return [max(column) for column in zip(*counts, strict=True)]
 
 
@@ -177,14 +222,26 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
         extra = next(counts) - x.ts.shape[0]
         span = np.asarray(x.ts[-1] - x.ts[0] + 1.0)
         ts = np.concatenate([x.ts, max(x.ts[-1], run.ts[-1]) + span * np.arange(1, extra + 1)])
-        return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
+        return eqx.tree_at(
+            lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])]))
+        )
 
     if knots:
-        run = run._replace(**dict(zip(("inputs", "drives"), jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled), strict=True)))
+        run = run._replace(
+            **dict(
+                zip(
+                    ("inputs", "drives"),
+                    jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled),
+                    strict=True,
+                )
+            )
+        )
     if not more:
         return run
     ts = np.concatenate([run.ts, run.ts[-1] + 1e-6 * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    return _of_members(run._replace(ts=ts), lambda x: np.pad(x, [(0, 0), (0, more), *[(0, 0)] * (x.ndim - 2)]))
+    return _of_members(
+        run._replace(ts=ts), lambda x: np.pad(x, [(0, 0), (0, more), *[(0, 0)] * (x.ndim - 2)])
+    )
 
 
 # members (of the requested), runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
@@ -200,23 +257,42 @@ class Group:
     share the values.
     """
 
-    def __init__(self, scene: Scene, data: Sequence[Experiment], indices: list[int], layout: Layout, options: AllOptions, members: int | None):
+    def __init__(
+        self,
+        scene: Scene,
+        data: Sequence[Experiment],
+        indices: list[int],
+        layout: Layout,
+        options: AllOptions,
+        members: int | None,
+    ):
         runs = [run_of(data[i], repeats=members is not None) for i in indices]
         if members is None:
             runs = [_of_members(run, lambda x: x[None]) for run in runs]
-        self.runs, self._count, self._lengths = np.array(indices), members or 1, [run.ts.shape[0] for run in runs]
+        self.runs, self._count, self._lengths = (
+            np.array(indices),
+            members or 1,
+            [run.ts.shape[0] for run in runs],
+        )
         times, knots = max(self._lengths), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
         filled = [filled_up(run, times, knots) for run in equal]
         first = _of_members(filled[0], lambda x: x[0])
-        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}  # (runs, members, times, *channel)
+        self.weights = {
+            name: np.array([run.weights[name] for run in filled]) for name in first.weights
+        }  # (runs, members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
         self.channels, end = {}, 0
         for name, weight in sorted(self.weights.items()):
             begin, end = end, end + math.prod(weight.shape[2:])
             self.channels[name] = slice(begin, end)
-        taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
-        unknown = [self.channels.get(name, slice(0)) for name in sorted({name for run in data for name in run.unknown_correlation})]
+        taus = {
+            name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time
+        }
+        unknown = [
+            self.channels.get(name, slice(0))
+            for name in sorted({name for run in data for name in run.unknown_correlation})
+        ]
         self._chains = Chains.of(self.weights, self._ts, taus, self.channels, unknown) if taus else None
         # one row of numbers per run: an array argument costs as much as some steps of a motion
         self._common = _rows((scene, options), (1, 1))[0]
@@ -260,7 +336,9 @@ class Group:
         while width >= 2 * max(count, self._fewest):
             width = -(-width // 2)
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
-        return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
+        return [
+            (min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)
+        ]
 
     def whitened(
         self,
@@ -275,14 +353,18 @@ class Group:
         before, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
-    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: np.ndarray) -> Float[np.ndarray, "lanes"]:
+    def log_widths(
+        self, runs: np.ndarray, members: np.ndarray, taus: np.ndarray
+    ) -> Float[np.ndarray, "lanes"]:
         """Return `sum log sqrt(1 - rho^2)` of each lane."""
         if self._chains is None:
             return np.zeros(len(runs))
         _, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
 
-    def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> Bool[np.ndarray, "lanes samples"]:
+    def within(
+        self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]
+    ) -> Bool[np.ndarray, "lanes samples"]:
         """Return which samples of these runs lie in the first `share` of the span."""
         ts, t0 = self._ts[self.places(runs)], self._t0[self.places(runs)]
         early = np.abs(ts - t0[:, None]) <= (share * np.abs(ts[:, -1] - t0))[:, None]
@@ -304,15 +386,24 @@ class Group:
 
 def _of_members(run: Run, of: Callable) -> Run:
     """Return the run with `of` applied to the fields that differ by member."""
-    return run._replace(**{name: {channel: of(x) for channel, x in getattr(run, name).items()} for name in _BY_MEMBER})
+    return run._replace(
+        **{name: {channel: of(x) for channel, x in getattr(run, name).items()} for name in _BY_MEMBER}
+    )
 
 
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
     """Return all numbers of some trees in the order of `ravel_pytree`, one row per member. A tree without an
     axis of members is repeated in every row.
     """
-    parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
-    return np.hstack([np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)])
+    parts = [
+        np.asarray(x).reshape(count, -1)
+        for tree, count in zip(trees, members, strict=True)
+        for x in jax.tree.leaves(tree)
+        if is_array(x)
+    ]
+    return np.hstack(
+        [np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)]
+    )
 
 
 @lru_cache(maxsize=16)
@@ -324,7 +415,14 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     of arrays.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
-    zeros = [np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype)) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]
+    zeros = [
+        (
+            np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
+            if isinstance(x, jax.ShapeDtypeStruct)
+            else x
+        )
+        for x in leaves
+    ]
     arrays, rest = eqx.partition(jax.tree.unflatten(treedef, zeros), is_array)
     (_, of_all), (_, of_run) = map(ravel_pytree, arrays)
 
@@ -333,16 +431,22 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
         (scene, options), run = eqx.combine((of_all(common), of_run(row)), rest)
 
         def flat(x):
-            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate, alongside(options))
+            residuals = run.at(layout, x[own:], x[:own]).residuals(
+                layout.scene(scene, x[own:]), simulate, alongside(options)
+            )
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
             # dense matrices give the residuals once for each direction
-            directions = np.eye(max(unknowns, 1), unknowns, dtype=x.dtype)  # one of no length where nothing is free
+            directions = np.eye(
+                max(unknowns, 1), unknowns, dtype=x.dtype
+            )  # one of no length where nothing is free
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)))(directions)
         return jnp.concatenate([J[:unknowns], r[:1]]).T
 
     # XLA's newer emitters take twice the time to compile, for a program that is no faster; jaxlib 0.11.1 and
     # later have no others
     older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
-    return jax.jit(jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)
+    return jax.jit(
+        jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None
+    )

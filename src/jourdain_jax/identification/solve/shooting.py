@@ -47,7 +47,12 @@ def begin(scene: Scene, start: dict, t0):
     return {name: value for name, value in start.items() if name != LAST}
 
 
-def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], start: dict, ts: Float[Array, "times"]) -> dict[str, Float[Array, "states"]]:
+def ended(
+    motion: Trajectory,
+    filters: Sequence[Float[Array, "times entries"]],
+    start: dict,
+    ts: Float[Array, "times"],
+) -> dict[str, Float[Array, "states"]]:
     """Return the end state of a piece; empty for a whole run. `ts`: the times of the motion."""
     if LAST not in start:
         return {}
@@ -84,10 +89,16 @@ class MultipleShooting:
                 "s), such as `duration=0.5`"
             )
         if self.pieces is not None:
-            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for "
-                "one piece omit `shooting`")
+            checked_whole(
+                self.pieces,
+                "`pieces` of `MultipleShooting`",
+                2,
+                expected="of two or more; for one piece omit `shooting`",
+            )
         else:
-            number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
+            number: Number = checked_real(
+                self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s"
+            )
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(
                     f"`duration` of `MultipleShooting` is {self.duration} s, expected a positive finite time"
@@ -112,7 +123,9 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
                 f"run {index} has {len(ts)} samples, too few for {pieces} pieces; give at most {count} pieces"
             )
         return np.round(np.linspace(0, count, pieces + 1)).astype(int)
-    at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
+    at = float(run.t0) + shooting.duration * np.arange(
+        1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration))
+    )
     after = np.clip(np.searchsorted(ts, at), 1, count)
     nearest = np.where(at - ts[after - 1] < ts[after] - at, after - 1, after)
     return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
@@ -120,7 +133,11 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
 
 def numbers_of_filters(run: Experiment) -> int:
     """Return the number of filter outputs of the sensors of a `checked` run."""
-    return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
+    return sum(
+        math.prod(x.shape[1:])
+        for name, x in run.values.items()
+        if name in run.readings and run.readings[name].has_filter
+    )
 
 
 def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
@@ -189,5 +206,7 @@ def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
 def check_shooting(shooting) -> None:
     """Raise ValueError unless `shooting` is a `MultipleShooting` or None."""
     if shooting is not None and not isinstance(shooting, MultipleShooting):
-        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.identification.MultipleShooting(duration=...)`, "
-            "`jj.identification.MultipleShooting(pieces=...)`, or None")
+        raise ValueError(
+            f"`shooting` is {shooting!r}, expected `jj.identification.MultipleShooting(duration=...)`, "
+            "`jj.identification.MultipleShooting(pieces=...)`, or None"
+        )

@@ -2,7 +2,8 @@
 
 1. first guesses of nodes from measurements (`first_nodes`)
 2. gaps c_i as residuals of decreasing width, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
-3. c_i = 0 as equations, by sequential quadratic programming with the Gauss-Newton Hessian (generalised Gauss-Newton method):
+3. c_i = 0 as equations, by sequential quadratic programming with the Gauss-Newton Hessian (generalised
+   Gauss-Newton method):
    minimise |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), with ds_i = L_i d + g_i;
    steps are full unless residuals change much
 
@@ -31,7 +32,14 @@ from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.data.sensors import ideal
-from jourdain_jax.identification.solve.levenberg_marquardt import Control, Linearised, Minimum, column_scaling, damped_step, minimise
+from jourdain_jax.identification.solve.levenberg_marquardt import (
+    Control,
+    Linearised,
+    Minimum,
+    column_scaling,
+    damped_step,
+    minimise,
+)
 from jourdain_jax.identification.solve.piecewise import Piecewise
 from jourdain_jax.identification.solve.unknowns import Places, check_starts
 from jourdain_jax.motion.start import start as consistent_start
@@ -40,7 +48,11 @@ from jourdain_jax.scene.scene import Scene
 
 
 def first_nodes(
-    scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"]
+    scene: Scene,
+    run: Experiment,
+    ends: Int[np.ndarray, "ends"],
+    q: Float[np.ndarray, "coordinates"],
+    u: Float[np.ndarray, "speeds"],
 ) -> Float[np.ndarray, "pieces states"]:
     """Return first guesses of the states at the beginning of all pieces of a run; q, u: its start."""
     ts = np.asarray(run.ts, float)
@@ -49,9 +61,13 @@ def first_nodes(
     speeds, filters = np.zeros(len(u), bool), []
     for name, values in run.values.items():
         reading = run.readings.get(name, ideal(name))
-        gain, bias, delay, lag = (np.asarray(reading.numbers[number]) for number in ("gain", "bias", "delay", "lag"))
+        gain, bias, delay, lag = (
+            np.asarray(reading.numbers[number]) for number in ("gain", "bias", "delay", "lag")
+        )
         y = ((np.asarray(values, float) - bias) / np.where(gain == 0, 1.0, gain)).reshape(len(ts), -1)
-        found = np.array([[_parabola(ts - delay, column, t) for column in y.T] for t in at])  # (nodes, entries, 2)
+        found = np.array(
+            [[_parabola(ts - delay, column, t) for column in y.T] for t in at]
+        )  # (nodes, entries, 2)
         if reading.has_filter:
             filters.append(np.nan_to_num(found[..., 0]))
         if reading.operation is not None or np.any(gain == 0):
@@ -69,7 +85,9 @@ def first_nodes(
         qdot, N = _rates(scene, at, qs, us)
         for k in range(len(at)):
             known = np.isfinite(rates[k])
-            us[k, ~speeds] += np.linalg.lstsq(N[k][np.ix_(known, ~speeds)], (rates[k] - qdot[k])[known], rcond=1e-8)[0]
+            us[k, ~speeds] += np.linalg.lstsq(
+                N[k][np.ix_(known, ~speeds)], (rates[k] - qdot[k])[known], rcond=1e-8
+            )[0]
     return np.concatenate([qs, us, *filters], axis=1)
 
 
@@ -112,11 +130,20 @@ def shot(problem: Piecewise, theta: Places) -> Minimum:
     """Return the minimum from each `theta`."""
     check_starts(problem.scene, problem.runs, problem.unknowns)
     begin, control = _begun(problem, theta), problem.asked.control
-    roughly, every = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)), np.arange(len(theta))
+    roughly, every = (
+        replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)),
+        np.arange(len(theta)),
+    )
 
     def with_gaps(begin: np.ndarray, width: float) -> Minimum:
         what = f"pieces with gaps of {width:g}"  # in sizes of the states
-        return minimise(lambda x, members: problem.with_gaps(x, members, width), begin, problem.pieces.unknowns, roughly, what)
+        return minimise(
+            lambda x, members: problem.with_gaps(x, members, width),
+            begin,
+            problem.pieces.unknowns,
+            roughly,
+            what,
+        )
 
     found = with_gaps(begin, 0.1)
     found = with_gaps(found.theta, 0.01).after(found, every)
@@ -128,7 +155,10 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
     count, coordinates = len(theta), len(problem.scene.coordinate_names)
     places = np.arange(problem.states)
     of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
-    nodes, starts = np.zeros((count, len(problem.follows), problem.states)), np.zeros((len(problem.follows), problem.states))
+    nodes, starts = (
+        np.zeros((count, len(problem.follows), problem.states)),
+        np.zeros((len(problem.follows), problem.states)),
+    )
     for run, data in enumerate(problem.runs):
         q, u = _start(problem, data, theta[0], run)
         starts[problem.run_of == run, : q.size + u.size] = np.concatenate([q, u])
@@ -144,24 +174,39 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
     changes[failed] = 0.0
     for run in range(len(problem.runs)):
         here = np.flatnonzero(problem.run_of == run)
-        still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(problem.scene, starts[here[0], :coordinates])
-        nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(changes[:, here[:-1, None], np.flatnonzero(still)], axis=1)
+        still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(
+            problem.scene, starts[here[0], :coordinates]
+        )
+        nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(
+            changes[:, here[:-1, None], np.flatnonzero(still)], axis=1
+        )
     # a piece whose motion fails begins at the start of its run
     nodes = np.where(failed[..., None] & ~of_y, starts, nodes)
     local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
     # sizes: the spread of numbers over nodes, and their change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
     sizes = np.maximum(sizes, 0.01 * largest(nodes, (0, 1)))
-    least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
+    least = np.where(
+        of_y,
+        sizes,
+        np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)),
+    )
     problem.measure(np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0))
     return guess
 
 
-def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
+def _start(
+    problem: Piecewise, data: Experiment, theta: np.ndarray, run: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return coordinates and speeds of the start of a run at the first guess."""
     shared, own = problem.unknowns.split(theta)
     layout = problem.unknowns.layout
-    state = consistent_start(layout.scene(problem.scene, shared), t0=data.t0, inputs=data.inputs, **layout.start(data.start, shared, own[run]))
+    state = consistent_start(
+        layout.scene(problem.scene, shared),
+        t0=data.t0,
+        inputs=data.inputs,
+        **layout.start(data.start, shared, own[run]),
+    )
     return np.asarray(state.q), np.asarray(state.u)
 
 
@@ -170,19 +215,29 @@ def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> Non
     unknowns, scene = problem.unknowns, problem.scene
     low, high = unknowns.low, unknowns.high
     for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):
-        q, u, _ = np.split(nodes[:, first], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]), axis=-1)
+        q, u, _ = np.split(
+            nodes[:, first], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]), axis=-1
+        )
         for place in (place for place in unknowns.layout.local if place.kind == "start"):
             where = np.arange(place.begin, place.end)
             at = problem.shared + run * problem.own + where
-            names, x = (scene.coordinate_names, q) if place.name in scene.coordinate_names else (scene.speed_names, u)
+            names, x = (
+                (scene.coordinate_names, q)
+                if place.name in scene.coordinate_names
+                else (scene.speed_names, u)
+            )
             value = names.view(x)[place.name].reshape(len(x), -1)
-            free = ~unknowns.fixed[at] & (unknowns.prior_weight[at] == 0) & (value > low[at]) & (value < high[at])
+            free = (
+                ~unknowns.fixed[at]
+                & (unknowns.prior_weight[at] == 0)
+                & (value > low[at])
+                & (value < high[at])
+            )
             local[:, first, where] = np.where(free, value, local[:, first, where])
 
 
 def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
-    """Return the minimum with all gaps closed, by sequential quadratic programming from the present pieces.
-    """
+    """Return the minimum with all gaps closed, by sequential quadratic programming from the present pieces."""
     unknowns, control = problem.unknowns, problem.asked.control
 
     def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
@@ -197,9 +252,15 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
             break
         # keeps held unknowns from making the system singular
         size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)
-        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(problem, control, here))
+        d = damped_step(
+            arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(problem, control, here)
+        )
         length = problem.change(way.at.sigma[here], d, here)
-        done = problem.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+        done = (
+            problem.closed(here)
+            & (length <= control.tolerance)
+            & (np.abs(d) <= control.tolerance * size).all(axis=1)
+        )
         here, d, x, length = way.arrived(here, done), d[~done], x[~done], length[~done]
         if not here.size:
             break

@@ -18,10 +18,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from jourdain_jax.calculus.reals import Indices
-from jourdain_jax.identification.data.estimate import Correlated, Estimate, Range, positive, unbounded, whitening
+from jourdain_jax.identification.data.estimate import (
+    Correlated,
+    Estimate,
+    Range,
+    positive,
+    unbounded,
+    whitening,
+)
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.data.sensors import UNITS, default_range
-from jourdain_jax.identification.solve.layout import BodyInertia, Kind, Layout, Place, PossibleInertia, inertia_of_body, tied_by
+from jourdain_jax.identification.solve.layout import (
+    BodyInertia,
+    Kind,
+    Layout,
+    Place,
+    PossibleInertia,
+    inertia_of_body,
+    tied_by,
+)
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.names import Labels, as_names, check_name
 from jourdain_jax.scene.parameter_fields import parameters_of
@@ -56,7 +71,9 @@ class Unknowns:
     def __post_init__(self):
         self.estimated = np.flatnonzero(~self.fixed)
         self.low, self.high = np.array([(r.low, r.high) for r in self.ranges]).T
-        self.least = np.array([r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)])
+        self.least = np.array(
+            [r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)]
+        )
 
     @property
     def prior_rows(self) -> Float[np.ndarray, "unknowns unknowns"]:
@@ -106,12 +123,18 @@ class _Entry:
     @property
     def labels(self) -> list[str]:
         """Return the name of each number."""
-        return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)] if self.guess.ndim else [self.label]
+        return (
+            [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)]
+            if self.guess.ndim
+            else [self.label]
+        )
 
 
 def unknowns_of(
-    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | "
-        "Callable | None] | Iterable[str]", apart: bool = False
+    scene: Scene,
+    runs: Sequence[Experiment],
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]",
+    apart: bool = False,
 ) -> Unknowns:
     """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
 
@@ -128,8 +151,17 @@ def unknowns_of(
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if isinstance(given, PossibleInertia):
             bodies.append(inertia_of_body(scene, name))
-            numbers = zip(bodies[-1].labels, ("kg m^2", ""), (positive(), unbounded(1.0)), bodies[-1].numbers(scene), strict=True)
-            shared += [(label, "inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
+            numbers = zip(
+                bodies[-1].labels,
+                ("kg m^2", ""),
+                (positive(), unbounded(1.0)),
+                bodies[-1].numbers(scene),
+                strict=True,
+            )
+            shared += [
+                (label, "inertia", _entry(label, unit, None, default, np.asarray(guess)))
+                for label, unit, default, guess in numbers
+            ]
             continue
         check_name(
             name, parameters, f"`free` names `{name}`, which is not a parameter of `{type(scene).__name__}`"
@@ -144,28 +176,52 @@ def unknowns_of(
             continue
         about = parameters[name]
         has_sign = about["positive"] or about["non_negative"]
-        entry = _entry(name, about["unit"], given, positive() if has_sign else unbounded(), np.asarray(getattr(scene, name)))
+        entry = _entry(
+            name,
+            about["unit"],
+            given,
+            positive() if has_sign else unbounded(),
+            np.asarray(getattr(scene, name)),
+        )
         shared.append((name, "scene", _not_negative(entry, about["positive"]) if has_sign else entry))
     of_runs = _of_all_runs(runs)
-    shared += [(label, "sensor", _of_sensor(label, label, estimate)) for label, estimate in of_runs.items() if not estimate.per_run]
+    shared += [
+        (label, "sensor", _of_sensor(label, label, estimate))
+        for label, estimate in of_runs.items()
+        if not estimate.per_run
+    ]
     starts = {name: run.start[name].shape for run in reversed(runs) for name in run.unknown_start}
-    own: list[tuple[str, Indices, Kind]] = [(name, starts[name], "start") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
-    own += [(label, np.shape(estimate.guess), "sensor") for label, estimate in of_runs.items() if estimate.per_run]
+    own: list[tuple[str, Indices, Kind]] = [
+        (name, starts[name], "start")
+        for name in dict.fromkeys(name for run in runs for name in run.unknown_start)
+    ]
+    own += [
+        (label, np.shape(estimate.guess), "sensor") for label, estimate in of_runs.items() if estimate.per_run
+    ]
     local = _placed(own)
-    of_each = [_of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local]
+    of_each = [
+        _of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local
+    ]
     if len(runs) == 1 and not apart:
         shared += [(place.name, place.kind, entry) for place, entry in zip(local, of_each, strict=True)]
         local, of_each = (), []
     entries = [*(entry for *_, entry in shared), *of_each]
     if all(entry.fixed for entry in entries):
-        raise ValueError("nothing is free; name parameters in `free` "
-            f"({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
+        raise ValueError(
+            "nothing is free; name parameters in `free` "
+            f"({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run"
+        )
     each = [entry for entry in entries for _ in range(entry.guess.size)]  # of each number
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
-    layout = Layout(_placed((name, entry.guess.shape, kind) for name, kind, entry in shared), local, tuple(bodies))
+    layout = Layout(
+        _placed((name, entry.guess.shape, kind) for name, kind, entry in shared), local, tuple(bodies)
+    )
     _check_told_once(layout, functions)
     for name, function in functions.items():
-        layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
+        layout = replace(
+            layout,
+            ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))),
+        )
     return Unknowns(
         layout=layout,
         runs=len(runs),
@@ -175,7 +231,9 @@ def unknowns_of(
         labels=tuple(label for entry in entries if not entry.fixed for label in entry.labels),
         units=tuple(entry.unit for entry in each if not entry.fixed),
         prior_mean=np.array([0.0 if entry.prior is None else float(entry.prior.mean) for entry in each]),
-        prior_weight=np.array([0.0 if entry.prior is None else 1 / float(entry.prior.sigma) for entry in each]),
+        prior_weight=np.array(
+            [0.0 if entry.prior is None else 1 / float(entry.prior.sigma) for entry in each]
+        ),
         whitening=whitening([entry.prior for entry in each[: layout.sizes[0]]]),
     )
 
@@ -204,12 +262,16 @@ def _placed(parts: Iterable[tuple[str, Indices, Kind]]) -> tuple[Place, ...]:
 
 def _check_told_once(layout: Layout, functions: Mapping) -> None:
     """Raise ValueError if a moment of inertia is given twice."""
-    told = {place.name: f"`{place.name}`" for place in layout.shared if place.kind == "scene"} | {name: f"a function for `{name}`" for name in functions}
+    told = {place.name: f"`{place.name}`" for place in layout.shared if place.kind == "scene"} | {
+        name: f"a function for `{name}`" for name in functions
+    }
     for body in layout.bodies:
         for entry in body.entries:
             if entry.name in told:
-                raise ValueError(f"`free` has {told[entry.name]} and the possible inertia of `{body.body}`, "
-                    f"which determines `{entry.name}`; omit one of them")
+                raise ValueError(
+                    f"`free` has {told[entry.name]} and the possible inertia of `{body.body}`, "
+                    f"which determines `{entry.name}`; omit one of them"
+                )
         told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
@@ -232,7 +294,11 @@ def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
     """Return an unknown of one run, held if the run knows it or does not have it."""
     if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
-        return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
+        return (
+            _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True)
+            if estimate is None
+            else _of_sensor(label, place.name, estimate)
+        )
     guess = np.asarray(run.start.get(place.name, np.zeros(place.shape)))
     if place.name not in run.unknown_start:
         return _Entry(label, "", guess, unbounded(), fixed=True)
@@ -282,12 +348,19 @@ def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -
     does when the unknowns change.
     """
     guess, layout = unknowns.guess, unknowns.layout
-    change = 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
+    change = (
+        1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))
+    )  # by unequal amounts
     changes = "violates the constraints when the unknowns change: the values in `start` depend on each other"
     for index, run in enumerate(runs):
         for theta, why in ((guess, "is not admissible"), (guess + change, changes)):
             shared, local = unknowns.split(theta)
             try:
-                consistent_start(layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **layout.start(run.start, shared, local[index]))
+                consistent_start(
+                    layout.scene(scene, shared),
+                    t0=run.t0,
+                    inputs=run.inputs,
+                    **layout.start(run.start, shared, local[index]),
+                )
             except ValueError as error:
                 raise ValueError(f"the start of run {index} {why}. {error}") from None

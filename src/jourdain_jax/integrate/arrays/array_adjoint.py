@@ -107,7 +107,7 @@ def cotangents(
 
     def added(g, first, last):
         """Add the cotangents of the states saved at the times with indices `first` to `last - 1`."""
-        more = lambda: g + jnp.sum(jnp.where((index >= first) & (index < last), g_ys, 0.0), axis=0)  # noqa: E731
+        more = lambda: g + jnp.sum(jnp.where((index >= first) & (index < last), g_ys, 0.0), axis=0)
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(first < last)), more, lambda: g)
 
     w = of.writer(start, asked)
@@ -138,7 +138,10 @@ def cotangents(
             number = lanes_["passed"].astype(jnp.int32)
             own = (numbers(form.transitions, g_t) == number) & is_noted(w, form, w.load(left))
             g_time = jnp.sum(jnp.where(own, g_log, 0.0), axis=0)
-            w.if_any(switched, lambda: reset_back(w, form, known, state, left, w.holding(g_time[None]), g, by_known))
+            w.if_any(
+                switched,
+                lambda: reset_back(w, form, known, state, left, w.holding(g_time[None]), g, by_known),
+            )
         if isinstance(of.method, Method):
             step_back(w, form, of.method, known, state, at, g, by_known)
         else:

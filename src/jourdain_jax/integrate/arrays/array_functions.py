@@ -100,7 +100,9 @@ class Functions:
         if self.modes:
             field, scene, inputs, *more = args
             left = iter(self.modes)
-            channels = (Constant(next(left)) if isinstance(channel, Mode) else channel for channel in inputs.channels)
+            channels = (
+                Constant(next(left)) if isinstance(channel, Mode) else channel for channel in inputs.channels
+            )
             args = field, scene, Inputs(tuple(channels)), *more
         return integrands.within(self.w.number(math.inf) if middle is None else middle, args)
 
@@ -193,14 +195,18 @@ class Functions:
         state, modes, rise = jnp.split(after, (self.form.q_and_v, len(after) - 1))
         return jnp.concatenate([state, y[self.form.q_and_v :] - rise, modes])
 
-    def _reset_at(self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]) -> tuple[list, list]:
+    def _reset_at(
+        self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]
+    ) -> tuple[list, list]:
         """Return the state after an event and the time of the event, both with their tangents.
 
         `parts`: the state and the varying arrays, with tangents; `fixed`: the other arrays, by index;
         `modes`: modes after the event.
         """
-        given = lambda at: (dict(zip((k for k in range(len(fixed) + len(at)) if k not in fixed), at, strict=True)) | fixed)  # noqa: E731
-        whole = lambda at: [given(at)[k] for k in range(len(fixed) + len(at))]  # noqa: E731
+        given = lambda at: (
+            dict(zip((k for k in range(len(fixed) + len(at)) if k not in fixed), at, strict=True)) | fixed
+        )
+        whole = lambda at: [given(at)[k] for k in range(len(fixed) + len(at))]
         if len(parts) == 1:
             return [self._reset(event, t, *whole(parts[0]))[: self.count]], [t]
         before, along = parts[: len(parts) // 2], parts[len(parts) // 2 :]
@@ -211,7 +217,7 @@ class Functions:
 
             return pushed(f, [[y, *part[1:]] for y, part in zip(states, before, strict=True)])
 
-        value = lambda t, *at: chosen(self.w, event, list(self._events(t, *whole(at))))  # noqa: E731
+        value = lambda t, *at: chosen(self.w, event, list(self._events(t, *whole(at))))
         now = rates([part[0] for part in before])
         dc = jax.jvp(partial(value, t), before[0], along[0])[1]
         zero = [jnp.zeros_like(x) for x in before[0][1:]]
@@ -232,7 +238,10 @@ class Functions:
         modes = self._reset(event, t, *parts[0])[self.count :]
         moves = {0} | {k for part in parts[1:] for k, x in enumerate(part) if x is not None}
         fixed = {k: x for k, x in enumerate(parts[0]) if k not in moves}
-        varying = [[jnp.zeros_like(parts[0][k]) if part[k] is None else part[k] for k in sorted(moves)] for part in parts]
+        varying = [
+            [jnp.zeros_like(parts[0][k]) if part[k] is None else part[k] for k in sorted(moves)]
+            for part in parts
+        ]
         states, times = self._reset_at(event, t, varying, fixed, list(modes))
         self._store(states, after, self.count)
         self.w.store(modes, after, Rows(of["mode"].start, len(modes)))
@@ -244,11 +253,16 @@ class Functions:
             self.w.store(lost, after, of["lost"].start)
         self._store([x[None] for x in times], self.w.at(after, of["t"].start), 1)
 
-    def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
+    def pull_reset(
+        self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer
+    ) -> None:
         """Pull cotangents back through the state after an event. The cotangent of the event's time is added
         after the arrays' cotangents.
         """
-        known, of_state = sum(self.sizes()), lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
+        known, of_state = (
+            sum(self.sizes()),
+            lambda y, *shared: self._reset(event, t, y, *shared)[: self.count],
+        )
         self._pull(of_state, y, g, self.count, to_y, to_known)
         at, g_y = self.w.load(y, self.y), self.w.load(g, self.y)
         by_time = jax.vjp(lambda t: self._reset(event, t, at, *self.shared[0])[: self.count], t)[1](g_y)[0]

@@ -68,7 +68,11 @@ class Loop(NamedTuple):
         """Return the rows of transitions, grouped by kind."""
         names = [name for name in ("log_event", "log_mode", "log_lost", "log_t") if name in self.form.rows]
         most = max(self.form.transitions, 1)
-        return [range(k, k + most) for name in names for k in range(self.form.rows[name].start, self.form.rows[name].stop, most)]
+        return [
+            range(k, k + most)
+            for name in names
+            for k in range(self.form.rows[name].start, self.form.rows[name].stop, most)
+        ]
 
     def writer(self, start: Start, asked: Sequence[int] = ()) -> ArrayWriter:
         """Return a writer with the functions that a step calls."""
@@ -79,7 +83,11 @@ class Loop(NamedTuple):
     def rows_in(self, w: ArrayWriter, going: Going, fixed: dict) -> Pointer:
         """Put the rows of all samples into memory."""
         state = w.holding(going.y)
-        logged = {row: (array, i) for block, array in zip(self.log, going.log, strict=True) for i, row in enumerate(block)}
+        logged = {
+            row: (array, i)
+            for block, array in zip(self.log, going.log, strict=True)
+            for i, row in enumerate(block)
+        }
         rows = going.rows | fixed | logged
         state.room.rows.extend(rows[row] for row in range(self.form.integrated, self.form.all))
         return state

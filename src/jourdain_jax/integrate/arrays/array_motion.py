@@ -40,7 +40,7 @@ def loop_of(
         setup.most_steps(knots),
         float(eps_of(y0.q)),
     )
-    count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
+    count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
     modes = modes_at_start(setup.inputs)
     form = ArrayForm(
@@ -58,8 +58,7 @@ def loop_of(
         stops=field.stops if of_events["has_events"] else (),
         sides=field.lowered.sides if field.lowered else (),
         **of_events,
-        compensated=most * eps
-        > eps**0.5,  # the round-off of so many steps may exceed half of the digits
+        compensated=most * eps > eps**0.5,  # the round-off of so many steps may exceed half of the digits
     )
     known, rest = split(begun.args)
     numbers = jax.lax.stop_gradient(
@@ -69,8 +68,7 @@ def loop_of(
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """Return the motion as a function of its start; `at_once`: samples per block (0: all samples of `vmap`).
-    """
+    """Return the motion as a function of its start; `at_once`: samples per block (0: all samples of `vmap`)."""
     return differentiated(
         lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
     )
@@ -117,7 +115,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
         lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched)
     )
     blocks = -(-count // at_once)
-    last = lambda tree: jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)  # noqa: E731
+    last = lambda tree: jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
     def block(given):
         start, *others = given

@@ -11,11 +11,11 @@ and if a motion ended at a stop event, at the time t_e = t - c(t, y)/cdot and in
 
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
-In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by cotangents
-of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g' be the
-change of g along a tangent. The result is dS/dx, where x is the initial state and the known numbers. Its
-change is d(dS)/dx, where dS is the sum of states times g' and of their tangents times g: the cotangents are
-g' for the states and g for their tangents.
+In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by
+cotangents of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g'
+be the change of g along a tangent. The result is dS/dx, where x is the initial state and the known numbers.
+Its change is d(dS)/dx, where dS is the sum of states times g' and of their tangents times g: the cotangents
+are g' for the states and g for their tangents.
 """
 
 import math
@@ -34,7 +34,17 @@ from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.event_search import RUNNING, chosen, slope_is_flat
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.loop.handover import Start, constant_rows
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, set_goal
+from jourdain_jax.integrate.loop.lanes import (
+    Form,
+    Lanes,
+    MachineWriter,
+    Number,
+    StepWriter,
+    arguments_of_samples,
+    copied,
+    each_row,
+    set_goal,
+)
 from jourdain_jax.integrate.loop.loop import (
     COUNT,
     MOST_KERNELS,
@@ -97,11 +107,22 @@ def _write_note(w: MachineWriter, form: Form) -> None:
     """
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form, state)
-        with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.each_lane() as lane:
+        with (
+            w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))),
+            w.each_lane() as lane,
+        ):
             times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
             with w.repeated() as leave:
-                leave(~(lanes.of("code", lane).equals(RUNNING) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
-                before, goals = w.converted("fptosi", w.load(saved, lane, "double"), "i64"), w.load(job, GOALS, "ptr")
+                leave(
+                    ~(
+                        lanes.of("code", lane).equals(RUNNING)
+                        & lanes.of("t", lane).equals(lanes.of("goal", lane))
+                    )
+                )
+                before, goals = (
+                    w.converted("fptosi", w.load(saved, lane, "double"), "i64"),
+                    w.load(job, GOALS, "ptr"),
+                )
                 if form.sampled:
                     at_knot = lanes.of("t", lane).differs(goal_of(w, job, goals, number, before))
                     with w.when(at_knot):
@@ -155,7 +176,16 @@ def _used(method: Method) -> list[int]:
     return found
 
 
-def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Number, here: Number, g: Number, by_known: Number) -> None:
+def step_back(
+    w: StepWriter,
+    form: Form,
+    method: Method,
+    asked: int,
+    state: Number,
+    here: Number,
+    g: Number,
+    by_known: Number,
+) -> None:
     """Go back over the step in the slot `here`, in lanes that advanced in it."""
     slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
     h, t = w.load(here, slot.taken), w.load(here, slot.t)
@@ -167,7 +197,9 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
     if form.projects:
         each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
         w.run("project_back", state, t + h, at, g1, added)
-    A, columns, b, c, order = (w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n], used))
+    A, columns, b, c, order = (
+        w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n], used)
+    )
     near = None
     if form.squares:
         pivots = w.room(len(form.monitored))
@@ -200,7 +232,9 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
 
         each_row(w, count, at, state_at)
         each_row(w, count, v, cotangent)
-        is_near = None if near is None or w.is_first(stage) else w.at_first(stage, w.literal(0, w.truth), near)
+        is_near = (
+            None if near is None or w.is_first(stage) else w.at_first(stage, w.literal(0, w.truth), near)
+        )
         if is_near is not None:
             put_near_rows(w, form, state, is_near, time, at)
         w.run("pull_rates", state, time, at, v, of_stage, added)
@@ -285,7 +319,16 @@ def is_located(w: StepWriter, lanes: Lanes) -> Number:
     return w.equal(lanes["code"], result_codes.EVENT) & (lanes["accepted"] > 0.0)
 
 
-def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Number, g_t: Number, g: Number, by_known: Number) -> None:
+def event_back(
+    w: StepWriter,
+    form: Form,
+    asked: int,
+    state: Number,
+    located: Number,
+    g_t: Number,
+    g: Number,
+    by_known: Number,
+) -> None:
     """Turn cotangents of a state at a fixed time into cotangents at the time and state of an event."""
     lanes, count = Lanes(w, form, state), form.integrated
     f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
@@ -319,7 +362,9 @@ def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Nu
     each_row(w, asked, by_known, lambda i: with_event(w.load(by_known, i), w.load(added, i)))
 
 
-def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
+def _moved_back(
+    w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int
+) -> Number:
     """Return the time derivative of an event's contribution to a tangent. It changes the cotangents `g` of
     the state and adds to the others.
     """
@@ -351,7 +396,9 @@ def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Call
     return lambda *arguments: run_rows(*arguments)[0]
 
 
-def flow_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable[..., Float[Array, "found"]]:
+def flow_back(
+    form: Form, method: Method, asked: Indices, memory: int
+) -> Callable[..., Float[Array, "found"]]:
     """Return a function that returns cotangents of the start's state and of the requested known numbers
     (`asked`). Its arguments are the start, and cotangents of the states at the goals, of the end and of the
     end's time.

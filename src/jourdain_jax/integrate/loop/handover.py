@@ -25,8 +25,7 @@ def constant_rows(form: Form) -> dict[int, float]:
 
 
 class Start(NamedTuple):
-    """Input of a loop: one motion. The state and the known numbers are followed by their tangents (`Form`).
-    """
+    """Input of a loop: one motion. The state and the known numbers are followed by their tangents (`Form`)."""
 
     of_samples: tuple[Array, ...]  # tables and knots (`samples.py`); for a loop in JAX, only the knots
     control: Numbers  # rtol, atol, shortest, longest and first step, most steps
@@ -64,7 +63,12 @@ class Found(NamedTuple):
     rest: Float[Array, "rest *lanes"]
 
     @staticmethod
-    def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
+    def of(
+        form: Form,
+        states: Float[Array, "times y *lanes"],
+        end: Float[Array, "returned *lanes"],
+        count: Float[Array, "one *lanes"],
+    ) -> "Found":
         """Build a motion from its states, its rows at the end, and the number of goals reached."""
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
@@ -96,6 +100,8 @@ class Found(NamedTuple):
         parts = range(len(self.y))
         base = any(jax.tree.leaves(given._replace(y=(), known=())))
         own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in parts]
-        of_parts = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts)
+        of_parts = tuple(
+            base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts
+        )
         lanes = Found(of_parts, of_parts, of_parts, of_parts, of_parts[0])
         return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], self, lanes), lanes

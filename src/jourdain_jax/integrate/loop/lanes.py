@@ -89,12 +89,14 @@ class Form:
     @property
     def known(self) -> dict[str, int]:
         """Return the row counts of known numbers (except time and state) and of their tangents."""
-        return {"known": len(self.program.fixed) + len(self.program.inputs), "dknown": sum(map(len, self.moving))}
+        return {
+            "known": len(self.program.fixed) + len(self.program.inputs),
+            "dknown": sum(map(len, self.moving)),
+        }
 
     @property
     def squares(self) -> Indices:
-        """Return each constraint's squared part normal to the earlier ones and its squared size, alternating.
-        """
+        """Return each constraint's squared part normal to the earlier ones and its squared size, alternating."""
         return self.program.squares if self.projects else ()
 
     @property
@@ -108,7 +110,15 @@ class Form:
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
-        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events]
+        return [
+            *self.rates,
+            *program.guards,
+            *program.pivots,
+            *program.directions,
+            *self.squares,
+            *projected,
+            *events,
+        ]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
         """Return the nodes of fixed values, of time, of the state without work, and of the inputs."""
@@ -177,11 +187,31 @@ class Form:
     @property
     def rows(self) -> dict[str, range]:
         """Return name -> rows."""
-        search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
+        search = {
+            "search_t": 3,
+            "search_c": 3 * self.events,
+            "search_step": 1,
+            "search_left": 1,
+            "search_shift": 1,
+            "search_slope": self.events,
+        }
         most, modes = self.transitions, len(self.switched)
-        log = {"passed": 1, "log_event": most, "log_mode": most * self.modes, "log_lost": most, "log_t": most * (1 + len(self.moving))}
+        log = {
+            "passed": 1,
+            "log_event": most,
+            "log_mode": most * self.modes,
+            "log_lost": most,
+            "log_t": most * (1 + len(self.moving)),
+        }
         log = log if self.goes_on else {}
-        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **log, **dict.fromkeys(CONTROL, 1), "mode": modes}
+        counts = {
+            "y": self.integrated,
+            **dict.fromkeys(PROGRESS, 1),
+            "dt": len(self.moving),
+            **log,
+            **dict.fromkeys(CONTROL, 1),
+            "mode": modes,
+        }
         counts |= {
             **self.known,
             "goal": 1,
@@ -192,7 +222,9 @@ class Form:
             **dict.fromkeys(SAMPLES if self.sampled else (), 1),
         }
         counts |= dict.fromkeys(("rest", "next_rest"), self.y) if self.compensated else {}
-        counts |= {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if self.goes_on else {}
+        counts |= (
+            {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if self.goes_on else {}
+        )
         return _in_a_row(counts)
 
     @property
@@ -352,14 +384,21 @@ class Lanes:
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
-def each_row(w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]) -> None:
+def each_row(
+    w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]
+) -> None:
     """Set these rows of a state in memory, or the first `rows`."""
     w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
 def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
     """Copy the first `rows` rows from another place, in lanes where `where` holds."""
-    each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
+    each_row(
+        w,
+        rows,
+        into,
+        lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)),
+    )
 
 
 def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:

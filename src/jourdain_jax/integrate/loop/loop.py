@@ -33,8 +33,19 @@ from jourdain_jax.integrate.loop.lanes import (
     room_of_lanes,
     set_goal,
 )
-from jourdain_jax.integrate.loop.rate_functions import check_derivatives, write_events, write_projection, write_rates
-from jourdain_jax.integrate.loop.samples import WORDS_OF_SAMPLES, begin_samples, pass_knot, store_samples, write_sampled_inputs
+from jourdain_jax.integrate.loop.rate_functions import (
+    check_derivatives,
+    write_events,
+    write_projection,
+    write_rates,
+)
+from jourdain_jax.integrate.loop.samples import (
+    WORDS_OF_SAMPLES,
+    begin_samples,
+    pass_knot,
+    store_samples,
+    write_sampled_inputs,
+)
 from jourdain_jax.integrate.loop.step import IDLE, write_step
 from jourdain_jax.integrate.loop.taylor import TaylorSteps, products
 from jourdain_jax.integrate.loop.transitions import write_reset
@@ -99,7 +110,11 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
     an array of samples and times.
     """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
-    of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
+    of_samples, arguments, times = (
+        arguments[: arguments_of_samples(form)],
+        arguments[arguments_of_samples(form) :],
+        arguments[-1],
+    )
     arrays = [x.data for x in (*arguments, *results)]
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
@@ -144,17 +159,38 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
         if isinstance(method, TaylorSteps):
             w.run("save_within", job, state, who, k)
         code = lanes["code"]
-        on_its_way = (code.equals(RUNNING) & lanes["t"].differs(lanes["goal"])) | code.equals(LOCATING) | code.equals(IDLE)
+        on_its_way = (
+            (code.equals(RUNNING) & lanes["t"].differs(lanes["goal"]))
+            | code.equals(LOCATING)
+            | code.equals(IDLE)
+        )
         with w.when(w.any(~on_its_way)), w.each_lane() as lane:
             w.run("serve", job, state, who, lane)
 
 
-def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
+def begin_lane(
+    w: MachineWriter,
+    form: Form,
+    job: Value,
+    goals: Value,
+    lanes: Lanes,
+    lane: Value,
+    number: Value,
+    there: Value,
+) -> None:
     """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with
     the data of the first sample.
     """
     if form.sampled:
-        begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
+        begin_samples(
+            w,
+            form,
+            w.at(job, FIRST_OF_SAMPLES, "i64"),
+            w.load(job, COUNT, "i64"),
+            lanes,
+            lane,
+            w.where(there, number, 0),
+        )
     if w.device:
         w.store(w.load(job, COMMON, "ptr"), lanes.pointer, form.all)
     with w.when(there):
@@ -242,7 +278,10 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
         every, flags, y = form.integrated, w.room(), w.room(form.integrated)
-        times, goals, states = (w.load(job, TIMES, "i64"), *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)))
+        times, goals, states = (
+            w.load(job, TIMES, "i64"),
+            *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)),
+        )
         with w.repeated() as leave:
             goal = lanes["goal"]
             due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
@@ -273,7 +312,9 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
                     lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))
 
 
-def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
+def _save(
+    w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value
+) -> None:
     """Save the state of a lane at a due time. At the end, save it for all remaining
     times and begin the next sample.
     """
@@ -318,13 +359,18 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
     @motion.def_vmap
     def motions(count, batched: Sequence, start: Start):
         (given,) = batched
-        found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
+        found = jax.vmap(
+            motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count
+        )(start)
         return found.shared(given)
 
     return motion
 
 
-OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; use `jj.simulate(..., backend="xla")`'
+OF_SAMPLES = (
+    "machine code does not differentiate with respect to samples of an input; use `jj.simulate(...,"
+    ' backend="xla")`'
+)
 
 
 def flow(form: Form, method: Method, order: int | None) -> Loop:
@@ -355,8 +401,13 @@ def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[
         (start,), (along,) = primals, tangents
         check(form, along)
         raised, more = with_tangents(form, start, along)
-        both = differentiated(motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check)(more)
-        found, d = (Found(*(part[half] for part in both[:4]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
+        both = differentiated(
+            motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check
+        )(more)
+        found, d = (
+            Found(*(part[half] for part in both[:4]), both.rest)
+            for half in (slice(len(start.y)), slice(len(start.y), None))
+        )
         return found, d._replace(rest=jnp.zeros_like(found.rest))
 
     return own
@@ -366,7 +417,10 @@ def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
     """Return the form and the start with these tangents added."""
     every = (tuple(range(len(start.known[0]))), *form.moving)
     moves = [[not is_zero(dx) for dx in part] for part in along.known]
-    moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))
+    moving = tuple(
+        tuple(i for i, does in zip(of, part, strict=True) if does)
+        for of, part in zip(every, moves, strict=True)
+    )
     known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
     more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
     return replace(form, moving=(*form.moving, *moving)), more

@@ -52,7 +52,11 @@ def numbers_of(channel: FunctionOfTime) -> list:
     """Return each number of a function of time. For a tree of flags or tangents, return its entries instead
     of the numbers (None: nothing).
     """
-    return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
+    return [
+        x
+        for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True)
+        for x in _each(part, shape)
+    ]
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
@@ -60,7 +64,10 @@ def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
     replacement; None if there are none.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
-    return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
+    return [
+        None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape)
+        for each, shape in found
+    ]
 
 
 def _shapes(channel: FunctionOfTime) -> list[Shape]:
@@ -137,7 +144,9 @@ LARGEST_PROGRAM = 60_000
 MOST_PRODUCTS = 12_000  # limit on products of coefficients in a Taylor step, which is written out
 
 
-def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None) -> str:
+def reason_against(
+    field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None
+) -> str:
     """Return why machine code cannot integrate a scene (by Taylor series, if an
     `order` is given); empty if it can.
     """
@@ -147,7 +156,9 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
-    if not all(isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels):
+    if not all(
+        isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels
+    ):
         return "an input is a function of time that captures arrays"
     if isinstance(reason := driven(field.program, inputs), str):
         return reason
@@ -195,8 +206,22 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
     switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
-    of_events: dict[str, Any] = {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides} if goes_on else {}
-    return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled, switched=switched, **of_events)
+    of_events: dict[str, Any] = (
+        {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides}
+        if goes_on
+        else {}
+    )
+    return Form(
+        program,
+        field.with_work,
+        field.projects,
+        field.affine,
+        has_events,
+        field.pivots,
+        sampled=sampled,
+        switched=switched,
+        **of_events,
+    )
 
 
 def modes_among(inputs: Inputs) -> Indices:
@@ -204,7 +229,9 @@ def modes_among(inputs: Inputs) -> Indices:
     return tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Mode))
 
 
-def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
+def cotangents(
+    form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved
+) -> tuple[Integrated, list]:
     """Return cotangents of the start, and of each requested known number (`asked`), from
     the cotangents of the results.
 
@@ -233,8 +260,15 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 
     def moved_by(y, t, d):
         known = known_of(args)
-        values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
-        for i, value in [*zip(form.sampled, values, strict=True), *((i, others[i](t)) for i in form.switched)]:
+        values, slopes = (
+            zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True)
+            if form.sampled
+            else ((), ())
+        )
+        for i, value in [
+            *zip(form.sampled, values, strict=True),
+            *((i, others[i](t)) for i in form.switched),
+        ]:
             known[fixed + i] = value
         z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
         return Integrated.of(along_rates(z, d)[: form.y], form)
@@ -265,7 +299,11 @@ def start_of(setup: Setup, begun: Begun) -> Start:
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
     """Return the numbers of the modes at the start."""
-    return tuple(jax.lax.stop_gradient(jnp.asarray(channel.value, real_type())) for channel in inputs.channels if isinstance(channel, Mode))
+    return tuple(
+        jax.lax.stop_gradient(jnp.asarray(channel.value, real_type()))
+        for channel in inputs.channels
+        if isinstance(channel, Mode)
+    )
 
 
 def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scalar, ...]:
@@ -279,19 +317,35 @@ def known_of(args: tuple) -> list:
     time, and constant inputs. Sampled inputs have None.
     """
     _, _, inputs, fixed, _ = args
-    functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
-    return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in others_of(inputs))]
+    functions = [
+        x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)
+    ]
+    return [
+        *fixed,
+        *functions,
+        *(channel.value if isinstance(channel, Constant) else None for channel in others_of(inputs)),
+    ]
 
 
 def with_known(inputs: Inputs, known: Sequence) -> Inputs:
     """Return inputs with their numbers replaced, in the order of `known_of` but without the fixed ones."""
     each = iter(known)
-    new = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in parts_from(channel, each)]
+    new = [
+        x
+        for channel in inputs.channels
+        if isinstance(channel, FunctionOfTime)
+        for x in parts_from(channel, each)
+    ]
     new += [x for channel, x in zip(others_of(inputs), each, strict=True) if isinstance(channel, Constant)]
 
     def places(x: Inputs) -> list:
         both: list[tuple[Any, Callable]] = list(zip(x.channels, inputs.channels, strict=True))
-        functions = [part for channel, own in both if isinstance(own, FunctionOfTime) for part in (channel.numbers, *(channel.held if own.held else ()))]
+        functions = [
+            part
+            for channel, own in both
+            if isinstance(own, FunctionOfTime)
+            for part in (channel.numbers, *(channel.held if own.held else ()))
+        ]
         return [*functions, *(channel.value for channel, own in both if isinstance(own, Constant))]
 
     return eqx.tree_at(places, inputs, new, is_leaf=lambda x: x is None) if new else inputs
@@ -302,7 +356,9 @@ def others_of(inputs: Inputs) -> list[Callable]:
     return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
 
-def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
+def _samples(
+    args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None
+) -> tuple[Array, ...]:
     """Return tables of the sampled inputs, and the knots, in the kernel's layout; empty if there are none."""
     _, _, inputs, _, origin = args
     origin = jax.lax.stop_gradient(origin)  # samples are interpolated at fixed times since the start
@@ -314,7 +370,12 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
     def padded(x: Array, with_what) -> Array:
         return jnp.concatenate([x, jnp.full(count - len(x), with_what, x.dtype)])
 
-    tables = jnp.stack([jnp.stack([padded(channel.ts - origin, jnp.inf), padded(channel.values, channel.values[-1])]) for channel in channels])
+    tables = jnp.stack(
+        [
+            jnp.stack([padded(channel.ts - origin, jnp.inf), padded(channel.values, channel.values[-1])])
+            for channel in channels
+        ]
+    )
     return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
 
 
@@ -322,9 +383,14 @@ def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """Return the result of a loop as a `Solved`."""
     h, code, accepted, rejected, event, pivot, crossings, count = found.rest[:8]
     (states,), (end,), (t,), (log,) = found[:4]
-    code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
+    code, accepted, rejected, event, crossings = (
+        x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings)
+    )
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    ys, code = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1]), code_at_end(code, h, accepted, t)
+    ys, code = (
+        jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1]),
+        code_at_end(code, h, accepted, t),
+    )
     most = form.transitions
     passed = NONE_PASSED
     if most:
@@ -332,4 +398,18 @@ def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
         times = jnp.where(jnp.arange(most) < number, log, jnp.inf)
         modes = jnp.reshape(more[2 * most :], (form.modes, most)) if form.modes else jnp.zeros((0, most))
         passed = Passed(times, more[:most].astype(jnp.int32), more[most : 2 * most], modes)
-    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, passed)
+    return Solved(
+        goals[:-1],
+        ys,
+        reached[:-1],
+        t,
+        Integrated.of(end, form),
+        code,
+        event,
+        accepted,
+        rejected,
+        h,
+        pivot,
+        crossings,
+        passed,
+    )

@@ -48,15 +48,17 @@ class Operands(NamedTuple):
         return tuple(is_shared for x, rank, is_shared in rows for _ in range(x.shape[-1] if rank else 1))
 
     def _joined(self, rows: list, dtype, laned: bool) -> Array:
-        """Return rows as one array, with or without batch axes. Neighbours with the same batch axes are joined
-        before they are given the others.
+        """Return rows as one array, with or without batch axes. Neighbours with the same batch axes are
+        joined before they are given the others.
         """
         found = []
         for _, some in groupby(rows, lambda row: np.shape(row[0])[: np.ndim(row[0]) - row[1]]):
             each = []
             for x, rank, _ in some:
                 x = lax.convert_element_type(x, dtype)
-                each.append(lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1))) if rank else lax.expand_dims(x, (0,)))
+                each.append(
+                    lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1))) if rank else lax.expand_dims(x, (0,))
+                )
             # XLA compiles a concatenation of numbers faster with the batch axis last (`markers.entries_of`)
             part = lax.concatenate(each, 0)
             part = lax.transpose(part, (*range(1, part.ndim), 0))
@@ -64,8 +66,7 @@ class Operands(NamedTuple):
         return lax.concatenate(found, found[0].ndim - 1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
-        """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share.
-        """
+        """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share."""
         rows, last = self._rows(values), len(values) - self.others
         starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
         return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]

@@ -56,13 +56,18 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
             w.store(w.literal(0, "i1"), turned)
             with w.counted(rows) as i, w.counted(rows, first=i + 1) as j:
                 first, second = w.at(B, i * width), w.at(B, j * width)
-                a, b, p = (_product_of_rows(w, x, y, columns) for x, y in ((first, first), (second, second), (first, second)))
+                a, b, p = (
+                    _product_of_rows(w, x, y, columns)
+                    for x, y in ((first, first), (second, second), (first, second))
+                )
                 lengths = w.root(a) * w.root(b)
                 slanted = w.magnitude(p) > lengths * (columns * w.eps)
                 with w.when(w.any(slanted)):
                     w.store(w.literal(1, "i1"), turned)
                     zeta = (b - a) / (w.where(slanted, p, 1.0) * 2.0)
-                    t = w.intrinsic("copysign", w.number(1.0) / (w.magnitude(zeta) + w.root(zeta * zeta + 1.0)), zeta)
+                    t = w.intrinsic(
+                        "copysign", w.number(1.0) / (w.magnitude(zeta) + w.root(zeta * zeta + 1.0)), zeta
+                    )
                     c = w.number(1.0) / w.root(t * t + 1.0)
                     c, s = w.where(slanted, c, 1.0), w.where(slanted, c * t, 0.0)
                     with w.counted(width) as k:
@@ -126,7 +131,9 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
         with w.counted(n) as i, w.counted(i + 1) as j:
             on_diagonal = w.converted("uitofp", i.equals(j), "double")
             one = w.spread(on_diagonal)
-            w.store(w.where(is_finite, w.where(definite, w.load(M, i * n + j), one), float("nan")), M, i * n + j)
+            w.store(
+                w.where(is_finite, w.where(definite, w.load(M, i * n + j), one), float("nan")), M, i * n + j
+            )
 
 
 def write_triangular(w: MachineWriter, n: int) -> None:
@@ -184,7 +191,12 @@ class Rows:
         """
         program = self.program
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
-        return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
+        return [
+            *parameters,
+            program.t,
+            *program.q,
+            *(() if self.kind == "positions" else (*program.u, *program.inputs)),
+        ]
 
     def reason_against(self) -> str:
         """Return why this cannot be machine code; empty if it can."""
@@ -196,7 +208,11 @@ class Rows:
         # 14.6 and 1.4, 3.6 and 1.2.
         if max((rows + columns) * rows, columns**2) > 3_000:
             return "there are too many constraints"
-        nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
+        nodes = [
+            *self.residuals,
+            *self.slopes.values(),
+            *({} if self.metric is None else self.metric).values(),
+        ]
         if self.program.graph.operations(nodes) > LARGEST_PROGRAM:
             return "the scalar program is too large"
         return unsupported(self.program.graph, nodes)
@@ -293,8 +309,7 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_moved(w: MachineWriter, of: Rows) -> None:
-    """Write `moved(state, L, c, B, d, weights, x)`: the variables after one step with the `factored` matrix.
-    """
+    """Write `moved(state, L, c, B, d, weights, x)`: the variables after one step with the `factored` matrix."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
     with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):
@@ -325,7 +340,9 @@ def _write_row(w: MachineWriter, of: Rows) -> None:
         w.run("residuals", state, w.at(found, columns))
 
 
-def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
+def _write_putting(
+    w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value
+) -> None:
     """Write the projection in place."""
     if of.metric is not None:
         w.run("metric", state, *factors[:2])

@@ -46,39 +46,66 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     graph, values, variables = on_its_own(program.graph, nodes, program.variables)
     fixed, t, y, inputs = form.split(variables)
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
-    known = [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
+    known = [
+        {i: graph.input(f"tangent {k} of number {i}", True) for i in moving}
+        for k, moving in enumerate(form.moving)
+    ]
     times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     sampled = {len(y) + len(fixed) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
     # all varying quantities, then their tangents, in this order
     given = [dict(enumerate([*y, *fixed, *inputs, t]))]
     for k in range(count):
-        of_time = {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in sampled.items()} if times else {}
+        of_time = (
+            {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in sampled.items()}
+            if times
+            else {}
+        )
         given.append(dict(enumerate(states[k])) | {len(y) + i: n for i, n in known[k].items()} | of_time)
     found = [values[:pushed]]
     while len(found) <= count:
         direction = {given[k][i]: n for k in range(len(found)) for i, n in given[k + len(found)].items()}
         rates = derivatives(graph, [n for part in found for n in part], direction)
         found += [rates[k * pushed : (k + 1) * pushed] for k in range(len(found))]
-    return Outputs(graph, values, found[1:], variables, states, [n for part in known for n in part.values()], times, slopes)
+    return Outputs(
+        graph,
+        values,
+        found[1:],
+        variables,
+        states,
+        [n for part in known for n in part.values()],
+        times,
+        slopes,
+    )
 
 
-def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
+def _found(
+    w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value
+) -> tuple[list[Value], list[list[Value]]]:
     """Return the values of outputs and their tangents; `known`: from `known_values`."""
     given = given_values(w, form, own, known, state, tau, y)
-    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
+    found = [
+        as_real(w, x)
+        for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)
+    ]
     tangents = iter(found[len(own.values) :])
     return found[: len(own.values)], [[next(tangents) for _ in part] for part in own.tangents]
 
 
-def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
+def given_values(
+    w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value
+) -> dict[int, Value]:
     """Return the values of the input nodes of outputs; `known`: from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
     given |= dict(zip(own.known, stated(w, lanes, "dknown"), strict=True)) if own.known else {}
     given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
-    given |= dict(zip(own.slopes, looked_up(w, form, state, tau, True)[len(form.sampled) :], strict=True)) if own.slopes else {}
+    given |= (
+        dict(zip(own.slopes, looked_up(w, form, state, tau, True)[len(form.sampled) :], strict=True))
+        if own.slopes
+        else {}
+    )
     return given
 
 
@@ -87,7 +114,11 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
     known, fixed, t = stated(w, lanes, "known"), len(program.fixed), lanes["origin"] + tau
-    found = dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False)) if form.sampled else {}
+    found = (
+        dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False))
+        if form.sampled
+        else {}
+    )
     found |= dict(zip(form.switched, lanes.every("mode"), strict=True))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
     return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
@@ -103,7 +134,15 @@ def write_rates(w: MachineWriter, form: Form) -> None:
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(w, form, outputs_of(form, [*form.rates, *program.guards, *form.monitored], form.y), known, state, tau, y)
+        found, tangents = _found(
+            w,
+            form,
+            outputs_of(form, [*form.rates, *program.guards, *form.monitored], form.y),
+            known,
+            state,
+            tau,
+            y,
+        )
         for guard in found[form.y : form.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
         for i, x in enumerate([*found[: form.y], *(x for part in tangents for x in part)]):
@@ -118,7 +157,10 @@ def write_projection(w: MachineWriter, form: Form) -> None:
     program = form.program
     with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
         known = known_values(w, form, state, tau, y)
-        for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, form.coordinates)):
+        for condition, nodes, first in (
+            (q_moves, program.projected_q, 0),
+            (~q_moves, program.projected_u, form.coordinates),
+        ):
             with w.when(condition):
                 found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, tau, y)
                 for k, part in enumerate([found, *tangents]):
@@ -173,7 +215,15 @@ def write_events(w: MachineWriter, form: Form) -> None:
             w.store(found[count + i], rate, i)
     if form.moving:
         with w.procedure("event_tangents", "state tau:real y dc") as (state, tau, y, dc):
-            _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, tau, y)
+            _, tangents = _found(
+                w,
+                form,
+                outputs_of(form, program.events, count),
+                known_values(w, form, state, tau, y),
+                state,
+                tau,
+                y,
+            )
             for i, x in enumerate(x for part in tangents for x in part):
                 w.store(x, dc, i)
 
@@ -205,15 +255,24 @@ def check_derivatives(form: Form, order: int) -> None:
 def reason_against_derivatives(form: Form, order: int) -> str:
     """Return why machine code has no derivatives of this order for a form; empty if it has."""
     if order > len(LARGEST_DERIVATIVE):
-        return "`simulate` was differentiated three times, but machine code has only first and second derivatives"
+        return (
+            "`simulate` was differentiated three times, but machine code has only first and second"
+            " derivatives"
+        )
     for nodes in steps_of(form).values():
         along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
         back = pulled_program(replace(form, moving=((),) * (order - 1)), nodes, (), len(nodes))
-        for graph, of_it in ((along.graph, [*along.values, *(n for part in along.tangents for n in part)]), (back.graph, back.found)):
+        for graph, of_it in (
+            (along.graph, [*along.values, *(n for part in along.tangents for n in part)]),
+            (back.graph, back.found),
+        ):
             if reason := unsupported(graph, of_it):
                 return f"machine code cannot differentiate the motion: {reason}"
             if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
-                return f"a derivative of a part of the motion takes {operations} operations, more than the {most} of machine code"
+                return (
+                    f"a derivative of a part of the motion takes {operations} operations, more than the"
+                    f" {most} of machine code"
+                )
     return ""
 
 
@@ -224,7 +283,13 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
     For a state with a tangent, also write `pull_moved`; events are then functions of the state alone.
     """
     for name, nodes in steps_of(form).items():
-        _write_one_pulled(w, form, f"pull_{name}", pulled_program(form, nodes, asked, 0 if name == "events" else len(nodes)), work_stays=name in ("q", "u"))
+        _write_one_pulled(
+            w,
+            form,
+            f"pull_{name}",
+            pulled_program(form, nodes, asked, 0 if name == "events" else len(nodes)),
+            work_stays=name in ("q", "u"),
+        )
     if form.moving and form.has_events:
         _write_one_pulled(w, form, "pull_moved", _moved(form, asked))
 
@@ -246,9 +311,15 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
     if not form.moving:
         graph, values, variables = on_its_own(own.graph, own.values, own.variables)
         own = own._replace(graph=graph, values=values, variables=variables)
-    pulled = {part * form.y + i: n for part, each in enumerate([own.values, *own.tangents]) for i, n in enumerate(each)}
+    pulled = {
+        part * form.y + i: n
+        for part, each in enumerate([own.values, *own.tangents])
+        for i, n in enumerate(each)
+    }
     weights = {row: own.graph.input(f"cotangent {row}", True) for row in pulled}
-    return Pulled(own, cotangents(own.graph, pulled.values(), weights.values(), _varying(form, own, asked)), weights)
+    return Pulled(
+        own, cotangents(own.graph, pulled.values(), weights.values(), _varying(form, own, asked)), weights
+    )
 
 
 def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> NodeList:
@@ -277,7 +348,10 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
         total = graph.add(total, graph.mul(g, x))
     for i in range(1, form.events):
         happens = graph.call("eq", which, graph.const(float(i)))
-        rate, slope = graph.call("select", happens, rate, dc[i]), graph.call("select", happens, slope, slopes[i])
+        rate, slope = (
+            graph.call("select", happens, rate, dc[i]),
+            graph.call("select", happens, slope, slopes[i]),
+        )
     by_dt = graph.neg(graph.div(graph.mul(total, rate), slope))
     times = [t, *(inputs[i] for i in form.sampled)]
     found = cotangents(graph, [by_dt], [graph.one], [*_varying(form, own, asked), *times])
@@ -287,7 +361,9 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
     return Pulled(own, [*found[: len(found) - len(times)], by_time], dict(zip(rows, weights, strict=True)))
 
 
-def _write_one_pulled(w: MachineWriter, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
+def _write_one_pulled(
+    w: MachineWriter, form: Form, name: str, pulled: Pulled, work_stays: bool = False
+) -> None:
     each = form.q_and_v
     end = each * (1 + len(form.moving))
     with w.procedure(name, "state tau:real y g to_y to_known") as (state, tau, y, g, to_y, to_known):

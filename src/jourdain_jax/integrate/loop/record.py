@@ -22,8 +22,7 @@ TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: the state, its derivatives, and finally the rows of a transition; `all`: their number.
-    """
+    """Rows of a slot: the state, its derivatives, and finally the rows of a transition; `all`: their number."""
 
     y: int
     t: int
@@ -143,11 +142,20 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
     def free(number: Value) -> Value:
         with w.when((number < slots) & ((number + 1) * size > w.load(bytes_there, type="i64"))):
-            w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
+            w.store(
+                w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")),
+                record,
+            )
             w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
         return kept(number)
 
-    return _Places(slots, free, lambda number: None, kept, lambda: w.converted("ptrtoint", w.load(record, type="ptr"), "i64").equals(0))
+    return _Places(
+        slots,
+        free,
+        lambda number: None,
+        kept,
+        lambda: w.converted("ptrtoint", w.load(record, type="ptr"), "i64").equals(0),
+    )
 
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
@@ -220,7 +228,9 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
         w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
 
 
-def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+def _write_try_back(
+    w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value
+) -> None:
     """Go back over the trial step in a slot."""
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)

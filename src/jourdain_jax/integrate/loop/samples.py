@@ -31,18 +31,23 @@ def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
         w.store(value, words, word)
 
 
-def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
+def begin_samples(
+    w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value
+) -> None:
     """Assign the table and the knots of sample `number`, of `count` samples, to a lane."""
     size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:
         return w.binary("sdiv", number * w.load(words, of, "i64"), count)
 
-    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * len(form.sampled)), "double")
-    knot = w.at(w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double")
+    table = w.at(
+        w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * len(form.sampled)), "double"
+    )
+    knot = w.at(
+        w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double"
+    )
     for name, value in (("table", table), ("samples", size), ("knot", knot)):
         lanes.set(name, lane, value)
-
 
 
 def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
@@ -78,7 +83,10 @@ def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> Non
                 share = w.smaller(w.larger(there, 0.0), 1.0)
                 w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
                 if with_slopes:
-                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"))
+                    w.store(
+                        w.where(there.equals(share), rise / span, 0.0),
+                        w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"),
+                    )
 
 
 def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:

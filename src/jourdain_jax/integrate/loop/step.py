@@ -5,9 +5,9 @@ the search for a stop event.
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
 This is the only source of a step. A writer object provides arithmetic, memory, branches and loops:
-`MachineWriter` (`lanes.py`) generates machine code, `ArrayWriter` (`integrate/arrays/array_writer.py`) computes with
-JAX arrays. Events, including events of relations (`lowering/sides.py`), are located by the formulas of
-`integrate/event_search.py`.
+`MachineWriter` (`lanes.py`) generates machine code, `ArrayWriter` (`integrate/arrays/array_writer.py`)
+computes with JAX arrays. Events, including events of relations (`lowering/sides.py`), are located by the
+formulas of `integrate/event_search.py`.
 
 A step ends at every requested time and at every knot of the inputs; the step size before such a shortened
 step is remembered. The state advances by the difference of the rounded times at the ends of a step.
@@ -66,7 +66,9 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
         lanes = Lanes(w, form, state)
         if isinstance(method, TaylorSteps):
             first_sides(w, form, lanes)
-            take(w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k))
+            take(
+                w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k)
+            )
         else:
             step(w, form, method, lanes, k, tried_by_stages)
 
@@ -143,7 +145,9 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
         least = w.smaller(w.magnitude(a), w.magnitude(b))
         pivot = least if pivot is None else w.smaller(pivot, least)
         accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
-    accept = accept & ~turns_round(w, form, *(x.values[form.pivots : form.pivots + form.turning] for x in (at_start, at_end)))
+    accept = accept & ~turns_round(
+        w, form, *(x.values[form.pivots : form.pivots + form.turning] for x in (at_start, at_end))
+    )
     if form.projects:
         error = w.room(form.y)
         each_row(w, form.y, error, lambda i: 0.0)
@@ -152,7 +156,13 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
     accept = locating | accept
     p["bound"] = w.where(accept, math.inf, 0.5 * size)
     p["before"] = t
-    return Trial(Aim(t1, step, size, locating), y1, accept, w.where(accept, length, w.smaller(length, 0.5 * size)), pivot)
+    return Trial(
+        Aim(t1, step, size, locating),
+        y1,
+        accept,
+        w.where(accept, length, w.smaller(length, 0.5 * size)),
+        pivot,
+    )
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
@@ -175,7 +185,10 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
     counts = accept & ~locating & w.equal(new["code"], RUNNING) & w.equal(new["t"], t1)
     if smallest is not None:
         pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
-        new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION, new["code"])}
+        new |= {
+            "pivot": pivot,
+            "code": w.where(counts & (pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION, new["code"]),
+        }
     moving = locating | w.equal(p["code"], RUNNING)
     copied(w, count, y1, y, moving)
     if form.compensated:  # round-off of a step that counts
@@ -192,7 +205,9 @@ class Rank(NamedTuple):
     square: Number  # smallest squared sine between a constraint and the earlier ones, over all stages
 
 
-def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number) -> tuple[Number, Number, Rank | None]:
+def stages(
+    w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number
+) -> tuple[Number, Number, Rank | None]:
     """Return the smallest magnitude of a pivot, whether any pivot changed its sign, and the
     distance from a loss of rank.
 
@@ -201,7 +216,11 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()
-    A, c, no = w.table(np.array([*method.A[1:n, :n], method.b[:n]])), w.table(method.c[:n]), w.literal(0, w.truth)
+    A, c, no = (
+        w.table(np.array([*method.A[1:n, :n], method.b[:n]])),
+        w.table(method.c[:n]),
+        w.literal(0, w.truth),
+    )
     copied(w, every, p.pointer, y1)
     w.store(math.inf, square)
 
@@ -214,9 +233,18 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
         if form.squares:
             by_rows = squares_of(w, form, pivots)
             near = w.at_first(i, near_rank_loss(by_rows), near)
-            w.store(w.where(near, reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)), w.load(square)), square)
+            w.store(
+                w.where(
+                    near,
+                    reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)),
+                    w.load(square),
+                ),
+                square,
+            )
         watched = seen(w, form, i, pivots, watched)
-        each_row(w, every, y1, lambda row: w.fma(step, weighted(w, A[i], k, form, row), w.load(p.pointer, row)))
+        each_row(
+            w, every, y1, lambda row: w.fma(step, weighted(w, A[i], k, form, row), w.load(p.pointer, row))
+        )
         return watched, near
 
     watched, near = w.over_stages(n, stage, (unseen(w, form), no))
@@ -234,9 +262,15 @@ def unseen(w: StepWriter, form: Form) -> tuple:
 def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> tuple:
     """Return the monitoring values after a stage with monitored numbers `pivots`."""
     first, low, high, turned = known
-    now, directions = ([w.load(pivots, j) for j in range(a, a + count)] for a, count in ((0, form.pivots), (form.pivots, form.turning)))
+    now, directions = (
+        [w.load(pivots, j) for j in range(a, a + count)]
+        for a, count in ((0, form.pivots), (form.pivots, form.turning))
+    )
     first = [w.at_first(i, new, old) for new, old in zip(directions, first, strict=True)]
-    low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=True)], [w.larger(a, b) for a, b in zip(high, now, strict=True)]
+    low, high = (
+        [w.smaller(a, b) for a, b in zip(low, now, strict=True)],
+        [w.larger(a, b) for a, b in zip(high, now, strict=True)],
+    )
     return first, low, high, turned | turns_round(w, form, first, directions)
 
 
@@ -245,15 +279,23 @@ def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
     sign or a constraint reversed.
     """
     _, low, high, turned = known
-    smallest = reduce(w.smaller, [w.smaller(w.magnitude(a), w.magnitude(b)) for a, b in zip(low, high, strict=True)], w.number(math.inf))
-    return smallest, reduce(operator.or_, [(a < 0.0) & (b > 0.0) for a, b in zip(low, high, strict=True)], turned)
+    smallest = reduce(
+        w.smaller,
+        [w.smaller(w.magnitude(a), w.magnitude(b)) for a, b in zip(low, high, strict=True)],
+        w.number(math.inf),
+    )
+    return smallest, reduce(
+        operator.or_, [(a < 0.0) & (b > 0.0) for a, b in zip(low, high, strict=True)], turned
+    )
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
     """Return, for each constraint, the square of its part normal to the earlier
     ones, and the square of its size.
     """
-    found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
+    found = [
+        w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))
+    ]
     return list(zip(found[::2], found[1::2], strict=True))
 
 
@@ -279,7 +321,7 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
     """Return whether a constraint has reversed: its component along its first direction has
     fallen below the permitted share.
     """
-    along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
+    along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))
     width = max(form.speeds, 1)
     rows = [range(k, k + width) for k in range(0, form.turning, width)]
     # half; a step that retains less is tried again
@@ -298,7 +340,9 @@ def weighted(
     return total
 
 
-def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: Number, rank: Rank | None = None) -> None:
+def project(
+    w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: Number, rank: Rank | None = None
+) -> None:
     """Project `y1` onto the constraints. The error becomes at least as large as this
     displacement, apart from noise.
     """
@@ -306,7 +350,11 @@ def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: 
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
     # 16 eps over the square of the sine counts as noise
-    amplified = None if rank is None else w.where(rank.near, w.smaller(16.0 * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
+    amplified = (
+        None
+        if rank is None
+        else w.where(rank.near, w.smaller(16.0 * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
+    )
     if rank is not None:
 
         def along_rows() -> None:
@@ -314,7 +362,9 @@ def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: 
             copied(w, form.y, y1, both)
             copied(w, form.y, error, w.at(both, form.y))
             w.run("along", p.pointer, t1, both)
-            each_row(w, form.y, error, lambda i: w.where(rank.near, w.load(both, i + form.y), w.load(error, i)))
+            each_row(
+                w, form.y, error, lambda i: w.where(rank.near, w.load(both, i + form.y), w.load(error, i))
+            )
 
         w.if_any(rank.near, along_rows)
     for part in form.parts:

@@ -58,7 +58,15 @@ class Series:
     rates; `order`, the last coefficient of the state; `clock`, the node of time.
     """
 
-    def __init__(self, graph: Graph, known: Iterable[int], states: Sequence[int], rates: Sequence[int], order: int, clock: int) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        known: Iterable[int],
+        states: Sequence[int],
+        rates: Sequence[int],
+        order: int,
+        clock: int,
+    ) -> None:
         self.graph = graph
         self.of = {n: [n] for n in (*known, *states)} | {clock: [clock, graph.one]}
         self.state = [self.of[n] for n in states]
@@ -109,7 +117,10 @@ class Series:
             return graph.mul(rest, graph.div(graph.const(0.5), node))
         if op == "pow":
             e = graph.value[args[1]]
-            terms = (graph.mul(graph.const((e * j - (k - j)) / k), self._term(args[0], node, j, k)) for j in range(k, 0, -1))
+            terms = (
+                graph.mul(graph.const((e * j - (k - j)) / k), self._term(args[0], node, j, k))
+                for j in range(k, 0, -1)
+            )
             return graph.mul(graph.total(terms), graph.div(graph.one, args[0]))
         found = [
             graph.mul(graph.mul(graph.const(j), self._at(a, j)), self._at(self._partial[node, i], k - j))
@@ -173,7 +184,9 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
         if op == "mul":
             forms[n] = [(tuple(sorted(f + g)), graph.mul(c, d)) for f, c in parts[0] for g, d in parts[1]]
         elif op in signs:
-            forms[n] = [(f, graph.mul(c, sign)) for sign, part in zip(signs[op], parts, strict=True) for f, c in part]
+            forms[n] = [
+                (f, graph.mul(c, sign)) for sign, part in zip(signs[op], parts, strict=True) for f, c in part
+            ]
         else:
             forms[n] = [((n,), one)]
             continue
@@ -184,13 +197,17 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     while True:
         shared = Counter(pair for terms in sums.values() for f, _ in terms for pair in {*combinations(f, 2)})
         shared.update((n, x, n) for n, terms in sums.items() for f, _ in terms if len(f) > 1 for x in {*f})
-        found, count = max(shared.items(), key=lambda item: (item[1], -len(item[0]), item[0]), default=((), 0))
+        found, count = max(
+            shared.items(), key=lambda item: (item[1], -len(item[0]), item[0]), default=((), 0)
+        )
         if count < 2:
             break
         name, (a, b) = -len(sums) - 1, found[:2]
         if len(found) == 2:
             for n, terms in sums.items():
-                sums[n] = [((name, *_without(f, a, b)) if found in combinations(f, 2) else f, c) for f, c in terms]
+                sums[n] = [
+                    ((name, *_without(f, a, b)) if found in combinations(f, 2) else f, c) for f, c in terms
+                ]
             sums[name] = [(found, one)]
         else:
             inside = [term for term in sums[a] if b in term[0] and len(term[0]) > 1]
@@ -229,8 +246,7 @@ class TaylorSteps:
 
     @property
     def needed(self) -> int:
-        """Return the number of state vectors that a step keeps: the coefficients, and the rates at its end.
-        """
+        """Return the number of state vectors that a step keeps: the coefficients, and the rates at its end."""
         return self.order + 2
 
     @property
@@ -260,12 +276,23 @@ def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[l
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
     nodes = [n for part in (own.values[: len(rates)], *own.tangents, own.values[len(rates) :]) for n in part]
     # on a fresh graph, because node indices determine the order of evaluation
-    graph, nodes, inputs = on_its_own(own.graph, nodes, [*given, *states, *(n for part in own.states for n in part)])
+    graph, nodes, inputs = on_its_own(
+        own.graph, nodes, [*given, *states, *(n for part in own.states for n in part)]
+    )
     clock, fixed, varying = inputs[[*given].index(clock)], inputs[: len(given)], iter(inputs[len(given) :])
-    moved = [next(varying) if i % form.y < form.q_and_v else graph.input(f"work {i}", True) for i in range(form.integrated)]
+    moved = [
+        next(varying) if i % form.y < form.q_and_v else graph.input(f"work {i}", True)
+        for i in range(form.integrated)
+    ]
     values = dict(zip(fixed, given.values(), strict=True)) | {n: w.load(y, i) for i, n in enumerate(moved)}
-    series = Series(graph, fixed, moved, with_few_products(graph, nodes[: form.integrated], [*moved, clock]), order, clock).state
-    found = iter(written(w, graph, [*(n for row in series for n in row), *nodes[form.integrated :]], values, by_llvm=True))
+    series = Series(
+        graph, fixed, moved, with_few_products(graph, nodes[: form.integrated], [*moved, clock]), order, clock
+    ).state
+    found = iter(
+        written(
+            w, graph, [*(n for row in series for n in row), *nodes[form.integrated :]], values, by_llvm=True
+        )
+    )
     return [[next(found) for _ in row] for row in series], _judged(w, form, list(found))
 
 
@@ -273,7 +300,12 @@ def products(form: Form, order: int) -> int:
     """Return the approximate number of multiplications per step, including tangents."""
     own = outputs_of(form, form.rates, form.y)
     nodes = own.graph.reachable([*own.values, *(n for part in own.tangents for n in part)])
-    return order * (order + 1) // 2 * sum(own.graph.op[n] not in ("const", "input", "add", "sub", "neg") for n in nodes)
+    return (
+        order
+        * (order + 1)
+        // 2
+        * sum(own.graph.op[n] not in ("const", "input", "add", "sub", "neg") for n in nodes)
+    )
 
 
 def _monitored(form: Form) -> list[int]:

@@ -1,5 +1,4 @@
-"""Inputs that are functions of time, on the scalar graph: their substitution into a program, and their jumps.
-"""
+"""Inputs that are functions of time, on the scalar graph: their substitution into a program, and their jumps."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -26,7 +25,12 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     """Return the program with functions of time substituted, or why that is not possible."""
     if not inputs.programs:
         return program
-    return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
+    return with_functions(
+        program,
+        tuple(
+            channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels
+        ),
+    )
 
 
 @lru_cache(maxsize=64)
@@ -34,7 +38,9 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     """Return the program with these functions substituted for inputs, or why that is not possible. Their
     numbers come last among the `fixed` ones.
     """
-    numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
+    numbers = sum(
+        math.prod(shape) for function in functions if function is not None for shape in function.shapes
+    )
     if numbers > MOST_NUMBERS:
         return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
     if any(program.graph.op[n] in ARRAYS for n in program.fixed):
@@ -61,7 +67,10 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
     stays = [i for i, function in enumerate(functions) if function is None]
     u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are not variables
-    q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
+    q, inputs = (
+        np.array([new[n] for n in part.tolist()], np.int64)
+        for part in (program.traced.q, program.traced.inputs[stays])
+    )
     return replace(
         program,
         traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
@@ -77,7 +86,14 @@ def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
     """Return random times and numbers for functions."""
     generator = np.random.default_rng(11)
     # states used to detect jumps of functions
-    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
+    return Probes(
+        graph,
+        {
+            str(graph.value[n]): generator.uniform(-1.0, 3.0, 64)
+            for n in graph.reachable(nodes)
+            if graph.op[n] == "input"
+        },
+    )
 
 
 def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[list[int], int]:

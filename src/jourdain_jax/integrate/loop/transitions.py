@@ -57,7 +57,9 @@ class Reset(NamedTuple):
 def reset_program(form: Form) -> Reset:
     """Return the reset of a form."""
     program, count, events = form.program, len(form.moving), form.events
-    graph, values, variables = on_its_own(program.graph, [*form.rates, *program.events, *program.energies, *program.resets], program.variables)
+    graph, values, variables = on_its_own(
+        program.graph, [*form.rates, *program.events, *program.energies, *program.resets], program.variables
+    )
     fixed, t, y, inputs = form.split(variables)
     event, modes = graph.input("event", True), [inputs[i] for i in form.switched]
     rates, of_events = values[: form.y], values[form.y : form.y + events]
@@ -80,7 +82,10 @@ def reset_program(form: Form) -> Reset:
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     known = [dict(enumerate([*fixed, *inputs]))]
-    known += [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
+    known += [
+        {i: graph.input(f"tangent {k} of number {i}", True) for i in moving}
+        for k, moving in enumerate(form.moving)
+    ]
     z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
     # the energy stored in loads is added at saved times
     state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]
@@ -89,18 +94,35 @@ def reset_program(form: Form) -> Reset:
         along = {n: dn for k in range(parts) for n, dn in zip(z[k], z[k + parts], strict=True)}
         of_known = {known[k][i]: dn for k in range(parts) for i, dn in known[k + parts].items()}
         (dc,) = derivatives(graph, [c], along | of_known)
-        (c_dot,) = derivatives(graph, [c], dict(zip([t, *before[: form.y]], [graph.one, *rates[: form.y]], strict=True)))
+        (c_dot,) = derivatives(
+            graph, [c], dict(zip([t, *before[: form.y]], [graph.one, *rates[: form.y]], strict=True))
+        )
         dt = graph.neg(graph.div(dc, c_dot))
         moved = {n: graph.add(along[n], graph.mul(rate, dt)) for n, rate in zip(before, rates, strict=True)}
-        of_time = {t: dt} | {inputs[i]: graph.mul(slope, dt) for i, slope in zip(form.sampled, slopes, strict=False)}
+        of_time = {t: dt} | {
+            inputs[i]: graph.mul(slope, dt) for i, slope in zip(form.sampled, slopes, strict=False)
+        }
         direction = moved | of_known | of_time
-        rates_after = graph.substituted(rates, dict(zip([*before, *modes], [*state, *modes_after], strict=True)))
+        rates_after = graph.substituted(
+            rates, dict(zip([*before, *modes], [*state, *modes_after], strict=True))
+        )
         moved_after = derivatives(graph, state, direction)
-        state = [*state, *(graph.sub(dx, graph.mul(rate, dt)) for dx, rate in zip(moved_after, rates_after, strict=True))]
+        state = [
+            *state,
+            *(graph.sub(dx, graph.mul(rate, dt)) for dx, rate in zip(moved_after, rates_after, strict=True)),
+        ]
         times = [*times, *derivatives(graph, times, direction)]
         rates = [*rates, *derivatives(graph, rates, along | of_known)]
     of_known = [n for part in known[1:] for n in part.values()]
-    return Reset(Outputs(graph, [], [], variables, states, of_known, [], slopes), event, work, state, modes_after, lost, times)
+    return Reset(
+        Outputs(graph, [], [], variables, states, of_known, [], slopes),
+        event,
+        work,
+        state,
+        modes_after,
+        lost,
+        times,
+    )
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:
@@ -109,7 +131,9 @@ def write_reset(w: MachineWriter, form: Form) -> None:
     """
     reset = reset_program(form)
     with w.procedure("reset", "state tau:real y event:real after") as (state, tau, y, event, after):
-        for i, x in written_in_turn(w, reset.graph, reset.found, _given(w, form, reset, state, tau, y, event)):
+        for i, x in written_in_turn(
+            w, reset.graph, reset.found, _given(w, form, reset, state, tau, y, event)
+        ):
             w.store(as_real(w, x), after, i)
 
 
@@ -121,15 +145,30 @@ def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None
     graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
     weights = [graph.input(f"cotangent {row}", True) for row in range(form.integrated + len(reset.times))]
     z = [n for k, part in enumerate([y, *reset.own.states]) for n in [*part, *reset.work[k : k + 1]]]
-    varying = [*z, *([*fixed, *inputs][i] for i in asked), t, *(inputs[i] for i in form.sampled[: len(reset.own.slopes)])]
+    varying = [
+        *z,
+        *([*fixed, *inputs][i] for i in asked),
+        t,
+        *(inputs[i] for i in form.sampled[: len(reset.own.slopes)]),
+    ]
     pulled = cotangents(graph, [*reset.state, *reset.times], weights, varying)
     first = len(z) + len(asked)
     by_time = pulled[first]
     for n, slope in zip(pulled[first + 1 :], reset.own.slopes, strict=True):
         by_time = graph.add(by_time, graph.mul(n, slope))
     assert len(z) == each * (1 + len(form.moving))
-    with w.procedure("pull_reset", "state tau:real y event:real g to_y to_known") as (state, tau, y, event, g, to_y, to_known):
-        given = _given(w, form, reset, state, tau, y, event) | {n: w.load(g, row) for row, n in enumerate(weights)}
+    with w.procedure("pull_reset", "state tau:real y event:real g to_y to_known") as (
+        state,
+        tau,
+        y,
+        event,
+        g,
+        to_y,
+        to_known,
+    ):
+        given = _given(w, form, reset, state, tau, y, event) | {
+            n: w.load(g, row) for row, n in enumerate(weights)
+        }
         for i, x in written_in_turn(w, graph, [*pulled[:first], by_time], given):
             if i < len(z):
                 w.store(as_real(w, x), to_y, i)
@@ -137,9 +176,15 @@ def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None
                 w.store(w.load(to_known, i - len(z)) + as_real(w, x), to_known, i - len(z))
 
 
-def _given(w: MachineWriter, form: Form, reset: Reset, state: Value, tau: Value, y: Value, event: Value) -> dict[int, Value]:
+def _given(
+    w: MachineWriter, form: Form, reset: Reset, state: Value, tau: Value, y: Value, event: Value
+) -> dict[int, Value]:
     given = given_values(w, form, reset.own, known_values(w, form, state, tau, y), state, tau, y)
-    return given | {reset.event: event} | {n: w.load(y, k * form.y + form.q_and_v) for k, n in enumerate(reset.work)}
+    return (
+        given
+        | {reset.event: event}
+        | {n: w.load(y, k * form.y + form.q_and_v) for k, n in enumerate(reset.work)}
+    )
 
 
 def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
@@ -196,7 +241,9 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     w.run("events", p.pointer, t, y1, y1, before, slopes)
     w.run("reset", p.pointer, t, y1, event, after)
     left = w.at(p.pointer, rows["left"].start)
-    w.store(w.where(switches & ~quiet, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left)
+    w.store(
+        w.where(switches & ~quiet, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left
+    )
     w.store(w.where(switches, t, w.load(left, 1)), left, 1)
     copied(w, count, y1, w.at(left, 2), switches)
     modes = w.at(p.pointer, rows["mode"].start)
@@ -212,7 +259,9 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     noted = [(event, "log_event", 0)] + [(w.load(modes, i), "log_mode", i) for i in range(form.modes)]
     times = [t, *(w.load(after, row) for row in of["t"][1:])]
     noted += [(w.load(after, of["lost"].start), "log_lost", 0)]
-    noted += [(times[0], "log_t", 0)] + [(w.where(flat, math.nan, dt), "log_t", i) for i, dt in enumerate(times[1:], 1)]
+    noted += [(times[0], "log_t", 0)] + [
+        (w.where(flat, math.nan, dt), "log_t", i) for i, dt in enumerate(times[1:], 1)
+    ]
     for value, name, part in noted if most else ():
         w.put_at(w.at(p.pointer, rows[name].start + part * most), most, number, value, switches & ~side)
     w.run("rates", p.pointer, t, y1, k, pivots)
@@ -230,7 +279,12 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     p.put("disarmed", disarmed)
     for i in range(form.modes):
         mode = w.load(modes, i)
-        w.store(w.where(switches & (mode < 0.0), float(result_codes.IMPACT_GAINS_ENERGY - 1) - mode, w.load(stuck)), stuck)
+        w.store(
+            w.where(
+                switches & (mode < 0.0), float(result_codes.IMPACT_GAINS_ENERGY - 1) - mode, w.load(stuck)
+            ),
+            stuck,
+        )
     for i, whole in enumerate(form.sides):
         k, mode = form.stated + i, form.modes + i
         this, rate = switches & w.equal(event, float(k)), w.load(slopes, k) * p["direction"]
@@ -239,7 +293,16 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         w.store(w.where(this & ~rests & (rate < 0.0), float(result_codes.STICKS), w.load(stuck)), stuck)
 
 
-def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:
+def reset_back(
+    w: StepWriter,
+    form: Form,
+    asked: int,
+    state: Number,
+    left: Number,
+    g_t: Number,
+    g: Number,
+    by_known: Number,
+) -> None:
     """Turn cotangents after a transition into cotangents before it, and restore the modes, in lanes where the
     transition ended a phase (`left`).
 
@@ -269,7 +332,9 @@ def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Numbe
     rate = w.load(rates)
     for i in range(1, form.events):
         rate = w.where(w.equal(event, float(i)), w.load(rates, i), rate)
-    by_value = w.where((mark < 0.0) & w.differs(total, 0.0), math.nan, w.where(w.equal(total, 0.0), 0.0, -total / rate))
+    by_value = w.where(
+        (mark < 0.0) & w.differs(total, 0.0), math.nan, w.where(w.equal(total, 0.0), 0.0, -total / rate)
+    )
     for i in range(form.events):
         w.store(w.where(switched & w.equal(event, float(i)), by_value, 0.0), weights, i)
     w.run("pull_events", state, t, z, weights, by_event, added)

@@ -10,9 +10,9 @@ Results do not depend on the width.
 Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
 programs that are too large, JAX differentiates the program run by XLA.
 
-Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies at
-saved states. XLA computes speeds of few operations (`lowering/lowered_equations.py`). Machine code saves XLA's tracing
-and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
+Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies
+at saved states. XLA computes speeds of few operations (`lowering/lowered_equations.py`). Machine code saves
+XLA's tracing and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,14 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
+from jourdain_jax.calculus.derivatives import (
+    OtherDeviceError,
+    Rules,
+    differentiated_as,
+    filled,
+    is_zero,
+    with_rules,
+)
 from jourdain_jax.calculus.markers import entries_of, lanes_of
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.loop.lanes import MachineWriter
@@ -121,8 +128,7 @@ def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
 def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
-    """Return the operands that `make` computes from operands of a call, and the context for a call with them.
-    """
+    """Return the operands that `make` computes from operands of a call, and the context for a call with them."""
     made = jax.make_jaxpr(make)(*ctx.avals_in)
     lower = mlir.lower_fun(jaxpr_as_fun(made))
     return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)
@@ -179,7 +185,9 @@ mlir.register_lowering(_call_p, _on_nvidia, platform="cuda")
 batching.primitive_batchers[_call_p] = _more_lanes
 
 
-def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
+def nodes_called(
+    graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1
+) -> Callable[[Array], Array]:
     """Return values of nodes of a graph as a function of the values of the variables."""
 
     def write(w: MachineWriter) -> None:
@@ -212,7 +220,11 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
         try:
             first = along(nodes, w) if order == 2 else nodes
-            found = cotangents(graph, [first[i] for i in there], weights, variables) if back else along(first, weights)
+            found = (
+                cotangents(graph, [first[i] for i in there], weights, variables)
+                if back
+                else along(first, weights)
+            )
         except Unsupported:
             return None
         # limit on operations; machine code of this size takes 1.4 MB of stack and 0.3 s to compile
@@ -272,7 +284,10 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
         return found if in_order else jnp.append(found, jnp.zeros((), x.dtype))[which]
 
     def by_xla(x):
-        found = [jnp.asarray(value, x.dtype) for value in run(graph, list(number), dict(zip(variables, x, strict=True)))]
+        found = [
+            jnp.asarray(value, x.dtype)
+            for value in run(graph, list(number), dict(zip(variables, x, strict=True)))
+        ]
         return placed(jnp.stack(found) if found else x[:0], x)
 
     return by_xla, lambda x: placed(kernel(x), x)
@@ -316,7 +331,9 @@ def beside(program: Lowered) -> Beside | None:
     if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
         return None
     used = set(graph.reachable(program.fixed))
-    needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
+    needed = tuple(
+        tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters
+    )
     given = [n for leaf in needed for n in leaf if n >= 0]
     numbers, speeds = _at_state(program, [*program.pivots, *program.energies], nodes_called), None
     # Operations from which speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers
@@ -325,7 +342,11 @@ def beside(program: Lowered) -> Beside | None:
     # gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
     if program.graph.operations(program.z) >= 100:
         every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
-        speeds = _at_state(program, [every[i] for i in np.argsort([*program.independent, *program.dependent])], values_of_nodes)
+        speeds = _at_state(
+            program,
+            [every[i] for i in np.argsort([*program.independent, *program.dependent])],
+            values_of_nodes,
+        )
     return Beside(
         program,
         needed,
@@ -340,7 +361,9 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
     """Return machine code of nodes, which takes only the fixed numbers that it needs."""
     used = set(program.graph.reachable(nodes))
     which = [k for k, n in enumerate(program.fixed) if n in used]
-    run = function(program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]])
+    run = function(
+        program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]]
+    )
 
     def values(fixed, t, q, y, inputs) -> Float[Array, "nodes"]:
         known = jnp.stack([*(fixed[k] for k in which), t])

@@ -44,7 +44,9 @@ def usual_lengths(scene: Scene) -> UsualLengths:
     with jax.ensure_compile_time_eval():  # cached between calls, whether inside `jit` or not
         own_speeds = _of_own_speeds(scene)
         if not is_traced(scene):
-            return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), own_speeds)
+            return UsualLengths(
+                jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), own_speeds
+            )
     return UsualLengths(*_of_traced(scene), own_speeds)
 
 
@@ -54,12 +56,18 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
     """
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(12, known.random)
-    t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
+    t, q, inputs = (
+        jnp.asarray(known.times[:count]),
+        jnp.asarray(known.coordinates[:count]),
+        jnp.asarray(generic_inputs(scene)),
+    )
     u = jnp.ones(len(scene.speed_names), q.dtype)
 
     def lengths(t, q):
         A = jax.jacfwd(lambda u: velocity_residual(still, t, q, u, inputs.astype(q.dtype)))(u)
-        return jnp.linalg.norm(A * speed_scale(mass_matrix_at(still, t, q)), axis=1), jnp.linalg.norm(A, axis=1)
+        return jnp.linalg.norm(A * speed_scale(mass_matrix_at(still, t, q)), axis=1), jnp.linalg.norm(
+            A, axis=1
+        )
 
     scaled, plain = (_usual(x) for x in jax.vmap(lengths)(t, q))
     norms = jnp.ones(len(scene.coordinates.quaternions), plain.dtype)
@@ -79,7 +87,9 @@ def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
     """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
-    lengths = jnp.nanmedian(jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0)
+    lengths = jnp.nanmedian(
+        jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0
+    )
     return jnp.where(lengths > 0, lengths, jnp.inf) / trust(scene)
 
 
@@ -105,7 +115,11 @@ class ByMatrices(VectorField):
         """
         state = at.scene, at.t, at.y.q, u, at.inputs
         found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
-        return motion_at(*state), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
+        return (
+            motion_at(*state),
+            found,
+            _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)]),
+        )
 
     def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
         """Add the coordinate rates by each of the scene's own speeds, which must stay finite, to these
@@ -116,7 +130,9 @@ class ByMatrices(VectorField):
         width = max(rows.shape[1], N.shape[1])
         padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
         pivots = jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1))
-        return Watched(Integrated(coordinate_rates_in_modes(at.scene, motion), v, power), pivots, jnp.concatenate(padded))
+        return Watched(
+            Integrated(coordinate_rates_in_modes(at.scene, motion), v, power), pivots, jnp.concatenate(padded)
+        )
 
     def project(self, at: Instant) -> Integrated:
         scene, _, t, y, inputs = at
@@ -126,7 +142,9 @@ class ByMatrices(VectorField):
         if self.projects_positions:
             q = project_positions(scene, t, q, iterations=2, typical=self.usual.closures)
         if self.projects_speeds:
-            v = project_speeds(scene, t, q, v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths)
+            v = project_speeds(
+                scene, t, q, v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths
+            )
         return Integrated(q, v, y.work)
 
 
@@ -152,10 +170,20 @@ class MinimalByMatrices(ByMatrices):
     def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates` and the sign of det A_z."""
         known = self._kinematics(at)
-        own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
-        motion, found = accelerations_of(at.scene, known, at.t, at.y.q, at.inputs) if own else self.solved(at, known.u)[:2]
+        own = (
+            isinstance(self.reduction, Privileged)
+            and self.reduction.independent == self.independent
+            and self.stabilisation is None
+        )
+        motion, found = (
+            accelerations_of(at.scene, known, at.t, at.y.q, at.inputs)
+            if own
+            else self.solved(at, known.u)[:2]
+        )
         v = found.udot[jnp.array(self.independent, jnp.int32)]
-        return self.watched(at, motion, found, v, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
+        return self.watched(
+            at, motion, found, v, known.split.orientation()[None], jnp.zeros((0, len(known.u)))
+        )
 
     def _kinematics(self, at: Instant) -> MinimalKinematics:
         return minimal_kinematics(at.scene, self.independent, self.rows, at.t, at.y.q, at.y.v, at.inputs)
@@ -173,7 +201,11 @@ class FullByMatrices(ByMatrices):
     def reduction_name(self) -> str:
         if self.own_equations:
             return f"none, {self.own_equations}"
-        return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
+        return (
+            super().reduction_name
+            if self.cutoff is None
+            else f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
+        )
 
     @property
     def needs_pivot(self) -> bool:
@@ -196,14 +228,21 @@ class FullByMatrices(ByMatrices):
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
         if not isinstance(self.reduction, Privileged | GibbsAppell):
             return at.y.v, jnp.ones(())
-        return at.y.v, bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot
+        return (
+            at.y.v,
+            bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot,
+        )
 
     def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates`, eliminated constraints, and 1 if the constraints determine the branch of the
         motion, or -1 if round-off does.
         """
         motion, found, directions = self.solved(at, at.y.v)
-        branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
+        branch = (
+            jnp.zeros(0)
+            if self.undecided is None
+            else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
+        )
         watched = self.watched(at, motion, found, found.udot, branch.astype(at.y.q.dtype), directions)
         return watched._replace(sine=found.pivot) if self.near_rank_loss else watched
 

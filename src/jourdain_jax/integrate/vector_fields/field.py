@@ -39,11 +39,12 @@ class Formulation(eqx.Module):
     """The equations that `simulate` integrates. The default is chosen for the scene.
 
     - `state`: "minimal", coordinates q and independent speeds y; "full", coordinates and all speeds u; "auto"
-      (default), the minimal one if the independent speeds are well conditioned over the scene's domain and the
-      constraints are linear or affine.
-    - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the scene's
-      scalar program if there is one).
-    - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by construction:
+      (default), the minimal one if the independent speeds are well conditioned over the scene's domain and
+      the constraints are linear or affine.
+    - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the
+      scene's scalar program if there is one).
+    - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by
+      construction:
       "projection" (default) projects the state after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
       the constraints, for comparison; None does nothing.
 
@@ -64,9 +65,15 @@ class Formulation(eqx.Module):
     def __check_init__(self) -> None:
         check_name(self.state, _STATES, f"unknown state form `{self.state}`")
         stabilisation = self.stabilisation
-        if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
-            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", '
-                '`jj.Baumgarte(alpha, beta)` or None')
+        if not (
+            stabilisation is None
+            or isinstance(stabilisation, Baumgarte)
+            or (isinstance(stabilisation, str) and stabilisation == "projection")
+        ):
+            raise ValueError(
+                f'`stabilisation` is {described(stabilisation)}, expected "projection", '
+                "`jj.Baumgarte(alpha, beta)` or None"
+            )
 
     @property
     def projects(self) -> bool:
@@ -87,8 +94,7 @@ def as_formulation(formulation) -> Formulation:
     if formulation is None:
         return _DEFAULT
     check_kind(
-        formulation, Formulation, "`formulation`",
-        "`jj.Formulation(state, reduction, stabilisation)` or None"
+        formulation, Formulation, "`formulation`", "`jj.Formulation(state, reduction, stabilisation)` or None"
     )
     return formulation
 
@@ -226,7 +232,9 @@ class VectorField(eqx.Module):
         """
         if not (self.with_work and self.of_inputs):
             return jnp.zeros((), q.dtype)
-        return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
+        return stored_by_inputs(
+            scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs
+        )
 
     @abc.abstractmethod
     def speeds(self, at: Instant) -> Speeds:
@@ -254,7 +262,9 @@ class VectorField(eqx.Module):
         """Return `event_resets` for the integrated speeds. Batches are supported only if `lowers_events`."""
         found = event_resets(at.scene, self.motion(at), self.of_inputs)
         every = range(len(at.scene.speed_names))
-        left_out = [len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent]
+        left_out = [
+            len(at.y.q) + k for k in every if self.independent is not None and k not in self.independent
+        ]
         return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
@@ -311,7 +321,11 @@ class ByProgram(VectorField):
     @property
     def pivots(self) -> int:
         """Return the number of monitored pivots. With multipliers, only the coordinate rates have pivots."""
-        return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
+        return (
+            self.program.divisors
+            if self.independent is None and not self.program.by_partition
+            else len(self.program.pivots)
+        )
 
     @property
     def needs_pivot(self) -> bool:
@@ -336,7 +350,11 @@ class ByProgram(VectorField):
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
         state = self.fixed(scene), t, q, u, inputs
-        return self.native.at_start(*state) if self.native else self.program.values(self.program.at_start, *state)
+        return (
+            self.native.at_start(*state)
+            if self.native
+            else self.program.values(self.program.at_start, *state)
+        )
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
         return (self.native or self.program).energies_at(*at.of_program)
@@ -355,11 +373,17 @@ class ByProgram(VectorField):
     def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates`, the pivots of the elimination, and the eliminated constraints."""
         y = at.y
-        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(*at.of_program, self.with_work)
+        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(
+            *at.of_program, self.with_work
+        )
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
-        rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
-        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
+        rows = (
+            jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
+        )
+        return Watched(
+            Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine
+        )
 
     def project(self, at: Instant) -> Integrated:
         """Return the state projected onto the constraints."""

@@ -6,7 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, static, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import (
+    Count,
+    Scalar,
+    eps_of,
+    largest,
+    passing_cutoff,
+    static,
+    with_nan_as_a_mark,
+)
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.integrate.inputs import Constant, Mode, Sampled
@@ -35,12 +43,18 @@ class Energies(eqx.Module):
         """Return T - W + V + D: W is the work of forces without potential and of constraints that do work,
         D the energy lost in events.
         """
-        return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (0.0 if self.work is None else self.work)
+        return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (
+            0.0 if self.work is None else self.work
+        )
 
     @property
     def kind(self) -> str:
         """Return a description of `balance`."""
-        return "T + V" + " less the work done" * (self.work is not None) + " plus losses in events" * (self.lost is not None)
+        return (
+            "T + V"
+            + " less the work done" * (self.work is not None)
+            + " plus losses in events" * (self.lost is not None)
+        )
 
 
 class Diagnostics(eqx.Module):
@@ -81,8 +95,10 @@ def diagnose(trajectory: Record) -> Diagnostics:
     Unreached times are ignored. Raises ValueError for anything but a trajectory.
     """
     if not hasattr(trajectory, "scene"):
-        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
-            "a rollout pass one lane: `rollout.lane(0)`")
+        raise ValueError(
+            f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
+            "a rollout pass one lane: `rollout.lane(0)`"
+        )
     checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
 
@@ -99,7 +115,9 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind + (", changed by work that was not integrated" if lacks_work else ""),
         # plus a share of the whole energy: if less than that varies, as at rest, no drift is reported
-        energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
+        energy_size=jnp.nanmax(energy.kinetic)
+        + _span(energy.potential)
+        + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
         smallest_singular_value=jnp.nanmin(jnp.where(reached, found.smallest_singular_value, jnp.nan)),
@@ -124,7 +142,9 @@ def _lacks_work(trajectory: Record) -> bool:
 def _extremes(force: ContactForce) -> ContactExtremes:
     friction = jnp.where(jnp.isnan(force.normal), 0.0, force.friction_needed)
     known = jnp.all(force.determined), jnp.all(force.normal_determined)
-    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), *known)
+    return ContactExtremes(
+        jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), *known
+    )
 
 
 def _span(values) -> Scalar:
@@ -141,28 +161,33 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
     if low != high:
-        warned.append(f"constraints change their rank along the motion, {low} to {high}: constraint forces "
-            "and the further motion may not be unique")
+        warned.append(
+            f"constraints change their rank along the motion, {low} to {high}: constraint forces "
+            "and the further motion may not be unique"
+        )
     elif high < usual:
         warned.append(
             f"constraints have rank {high} on the whole motion, but {usual} at generic states: a singular "
-                "configuration or another assembly; state a `domain` around the motion to decide"
+            "configuration or another assembly; state a `domain` around the motion to decide"
         )
     elif smallest < np.sqrt(eps_of(trajectory.q)):
         warned.append(f"constraints come within {smallest:.1e} of a loss of rank, where digits are lost")
-    for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
+    for kind, residual, state in (
+        ("geometric", found.position_residual, trajectory.q),
+        ("velocity", found.velocity_residual, trajectory.u),
+    ):
         # residual of a constraint, relative to the state
         if float(residual) > 1e-4 * (1.0 + float(_largest(state))):
             warned.append(
                 f"{kind} constraints are violated by up to {float(residual):.1e}: use projection or smaller "
-                    "tolerances, or look for constraints that contradict each other"
+                "tolerances, or look for constraints that contradict each other"
             )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size and not _lacks_work(trajectory):
         share = f"{drift:.1e} J, {drift / size:.0%} of the varying energy"
         warned.append(
             f"{found.energy_kind}, which should be constant, drifts by {share}: tighten `rtol`, or check "
-                "potentials and constraints with `verify`"
+            "potentials and constraints with `verify`"
         )
     pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
     # the error of an acceleration is round-off over the square of the pivot; motions
@@ -170,8 +195,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
             f"the reduction's independent speeds hardly determine the others (pivot {pivot:.1e}), "
-                f"so no digit of the accelerations is reliable in {trajectory.q.dtype}; use the "
-                "default `reduction` or float64"
+            f"so no digit of the accelerations is reliable in {trajectory.q.dtype}; use the "
+            "default `reduction` or float64"
         )
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
@@ -180,7 +205,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
             f"times are resolved to {resolved:.0e} s, steps are {step:.0e} s: loads, poses and inputs "
-                "receive rounded times; count time from zero, or use float64"
+            "receive rounded times; count time from zero, or use float64"
         )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull; a real one lifts off" for name in pulled))
@@ -192,34 +217,88 @@ def summary(trajectory: Record, message: str) -> str:
     ts = np.asarray(trajectory.ts)
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
     saved, several = f"{reached} of {len(ts)} times saved", reached > 1
-    pivot = "" if trajectory.state_form == "full" else f"; pivot of the independent speeds at least {float(trajectory.smallest_pivot):.1e}"
+    pivot = (
+        ""
+        if trajectory.state_form == "full"
+        else f"; pivot of the independent speeds at least {float(trajectory.smallest_pivot):.1e}"
+    )
     dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
     moved, left = (float(trajectory.moved_q), float(trajectory.moved_u)), _left_domain(trajectory)
     lost = left if int(trajectory.result) == SINGULAR_PARTITION else ""
-    inputs = [f"{name} {_channel_text(channel)}" for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)]
+    inputs = [
+        f"{name} {_channel_text(channel)}"
+        for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)
+    ]
     rows = [
         ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}{lost}"),
-        ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
-        ("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + left if int(trajectory.fallback) else ""),
-        ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
+        (
+            "solver",
+            (
+                f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)}"
+                " rejected"
+            ),
+        ),
+        (
+            "run again",
+            (
+                FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + left
+                if int(trajectory.fallback)
+                else ""
+            ),
+        ),
+        (
+            "state",
+            f"{trajectory.state_form}, reduction: {trajectory.reduction}"
+            + (", projected after each step" if trajectory.projected else "")
+            + pivot,
+        ),
         ("dense", dense),
         ("relations", f"{int(trajectory.crossings)} crossings" if int(trajectory.crossings) > 0 else ""),
         ("relations", f"not monitored: {trajectory.unwatched}" if trajectory.unwatched else ""),
         ("phases", _phases_text(trajectory) if trajectory.phases.ts.size else ""),
-        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "no "
-            "drift from one saved time"),
-        ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
-        ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
-        ("start", f"projected onto the constraints: coordinates changed by {moved[0]:.1e}, speeds by "
-            f"{moved[1]:.1e}; named values are kept"),
+        (
+            "energy",
+            (
+                f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"
+                if several
+                else "no drift from one saved time"
+            ),
+        ),
+        (
+            "residuals",
+            f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}",
+        ),
+        (
+            "rows",
+            (
+                f"rank {low if low == high else f'{low} to {high}'}, smallest singular value"
+                f" {float(found.smallest_singular_value):.2e}"
+            ),
+        ),
+        (
+            "start",
+            (
+                f"projected onto the constraints: coordinates changed by {moved[0]:.1e}, speeds by "
+                f"{moved[1]:.1e}; named values are kept"
+            ),
+        ),
         ("inputs", ", ".join(inputs)),
     ]
-    rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
+    rows += [
+        (f"invariant {name}", f"drift {float(drift):.2e}")
+        for name, drift in found.invariant_drifts.items()
+        if several
+    ]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     rows += [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
     width = max(len(name) for name, text in rows if text)
-    return "\n".join([f"Trajectory of {type(trajectory.scene).__name__}", *(f"  {name:<{width}}  {text}" for name, text in rows if text)])
+    return "\n".join(
+        [
+            f"Trajectory of {type(trajectory.scene).__name__}",
+            *(f"  {name:<{width}}  {text}" for name, text in rows if text),
+        ]
+    )
 
 
 def _phases_text(trajectory: Record) -> str:
@@ -240,7 +319,10 @@ def _left_domain(trajectory: Record) -> str:
     if not first:
         return ""
     i, name, value, low, high = min(first)
-    return f"; `{name}` leaves its domain, {low:.4g} to {high:.4g}: {value:.4g} at t = {float(trajectory.ts[i]):.4g} s"
+    return (
+        f"; `{name}` leaves its domain, {low:.4g} to {high:.4g}: {value:.4g} at t ="
+        f" {float(trajectory.ts[i]):.4g} s"
+    )
 
 
 def _channel_text(channel) -> str:
@@ -261,5 +343,9 @@ def _contact_text(contact: ContactExtremes) -> str:
         return text
     if bool(contact.normal_determined):
         return f"{text}; the constraints do not determine the tangential force (minimum norm)"
-    hint = "" if contact.honest else "; if this contact does not carry all bodies, name those it carries in `carried=`"
+    hint = (
+        ""
+        if contact.honest
+        else "; if this contact does not carry all bodies, name those it carries in `carried=`"
+    )
     return f"{text}; the constraints do not determine it (minimum norm){hint}"

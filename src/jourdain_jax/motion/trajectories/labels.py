@@ -20,12 +20,29 @@ from jourdain_jax.scene.scene import state_names
 
 # name: field of a motion, type, missing value, attributes
 OF_LANES: dict[str, tuple[str, str, float, dict]] = {
-    "result": ("result", "int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
+    "result": (
+        "result",
+        "int8",
+        -1,
+        {
+            "long_name": "how the motion ended",
+            "flag_values": list(range(len(CODES))),
+            "flag_meanings": " ".join(CODES),
+        },
+    ),
     "event": ("event", "int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
     "steps": ("accepted", "int32", -1, {"long_name": "accepted steps"}),
     "rejected_steps": ("rejected", "int32", -1, {"long_name": "rejected steps"}),
-    "retries": ("fallback", "int8", -1, {"long_name": "how it was "
-        "repeated", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
+    "retries": (
+        "fallback",
+        "int8",
+        -1,
+        {
+            "long_name": "how it was repeated",
+            "flag_masks": [1, 2],
+            "flag_meanings": "full_state implicit_solver",
+        },
+    ),
     "end_time": ("t_end", "float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
 }
 
@@ -42,7 +59,9 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
     shared = not lanes or bool(np.all(ts == ts[:1]))
     along = (*lanes, "time" if shared else "save")
     about_time = {"long_name": "time", "units": "s"}
-    found: dict[str, tuple] = {"time": ("time", ts[0] if lanes else ts, about_time) if shared else (along, ts, about_time)}
+    found: dict[str, tuple] = {
+        "time": ("time", ts[0] if lanes else ts, about_time) if shared else (along, ts, about_time)
+    }
     if lanes:
         found["lane"] = ("lane", np.arange(len(ts)), {"long_name": "index of the motion"})
 
@@ -50,8 +69,8 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
         if name in found or name == "lane":
             raise ValueError(
                 f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; "
-                    "rename it in the scene (names other than "
-                    f"{', '.join(('time', 'lane', *OF_LANES))}), or use `to_pandas()`"
+                "rename it in the scene (names other than "
+                f"{', '.join(('time', 'lane', *OF_LANES))}), or use `to_pandas()`"
             )
         found[name] = (axes, values, about)
 
@@ -65,8 +84,13 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
         axes = tuple(f"{name}_{k}" for k in range(values.ndim - len(lanes)))
         unit = {"units": about["unit"]} if about["unit"] else {}
         add(name, (*lanes, *axes), values, {"long_name": about["about"] or name, "role": "parameter"} | unit)
-    held = xarray.Dataset({name: value for name, value in found.items() if name not in ("time", "lane")}, {n: found[n] for n in ("time", "lane") if n in found})
-    return held.assign_attrs(scene=type(record.scene).__name__, conventions=record.scene.conventions, solver=record.solver)
+    held = xarray.Dataset(
+        {name: value for name, value in found.items() if name not in ("time", "lane")},
+        {n: found[n] for n in ("time", "lane") if n in found},
+    )
+    return held.assign_attrs(
+        scene=type(record.scene).__name__, conventions=record.scene.conventions, solver=record.solver
+    )
 
 
 @of_known_numbers
@@ -87,15 +111,27 @@ def _lanes(record: Record) -> Labels:
 
 def _columns(record: Record) -> dict[str, np.ndarray]:
     names = (record.scene.coordinate_names.entries, record.scene.speed_names.entries)
-    return {name: np.asarray(array)[..., k] for entries, array in zip(names, (record.q, record.u), strict=True) for k, name in enumerate(entries)}
+    return {
+        name: np.asarray(array)[..., k]
+        for entries, array in zip(names, (record.q, record.u), strict=True)
+        for k, name in enumerate(entries)
+    }
 
 
 def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
     """Return units of quaternions, their angular velocities, and given ones."""
     known: dict[str, str] = {}
-    for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
-        known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
+    for names, unit in (
+        (scene.coordinate_names, "1"),
+        *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ()),
+    ):
+        known |= {
+            name: unit for _, first, length in names.groups for name in names.entries[first : first + length]
+        }
     valid = state_names(scene)
-    check_names(given or {}, valid,
-        f"`units` names `{{}}`, which is not a coordinate or speed of `{type(scene).__name__}`")
+    check_names(
+        given or {},
+        valid,
+        f"`units` names `{{}}`, which is not a coordinate or speed of `{type(scene).__name__}`",
+    )
     return known | dict(given or {})

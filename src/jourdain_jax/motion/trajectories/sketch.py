@@ -49,7 +49,9 @@ def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
             for j in range(half):
                 axes.fill_between(ts[chosen], y[j], y[-1 - j], color=MODEL, alpha=0.25, lw=0)
             axes.plot(ts[chosen], y[half], color=MODEL, lw=1.2)
-            axes.set(title=f"{name}: {y.min():.3g} to {y.max():.3g}", xticks=[], yticks=[], xlim=(ts[0], ts[-1]))
+            axes.set(
+                title=f"{name}: {y.min():.3g} to {y.max():.3g}", xticks=[], yticks=[], xlim=(ts[0], ts[-1])
+            )
 
     more = f"and {len(names) - shown} more" if len(names) > shown else ""
     return figure(draw, 190 * columns, 66 * rows, more)

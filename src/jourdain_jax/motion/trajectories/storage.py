@@ -48,7 +48,17 @@ from jourdain_jax.structure.trace import velocity_quantities
 # without `work`, which may be absent
 _ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))
 _PHASES = tuple(f"phases.{field.name}" for field in fields(Phases) if hasattr(field.type, "dim_str"))
-_HEADER = ("scene", "static", "units", "coordinates", "speeds", "input_names", "event_names", "reruns", *RERUN_FIELDS)
+_HEADER = (
+    "scene",
+    "static",
+    "units",
+    "coordinates",
+    "speeds",
+    "input_names",
+    "event_names",
+    "reruns",
+    *RERUN_FIELDS,
+)
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
@@ -63,27 +73,44 @@ def save(motion: Trajectory | Rollout, path: FilePath) -> None:
     has a field that is not an array, number or text. Read the file with `load_trajectory` or `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):
-        raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
-    trajectory, kind, reruns = (motion.lanes, "rollout", motion.reruns) if isinstance(motion, Rollout) else (motion, "trajectory", ())
+        raise ValueError(
+            f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout`"
+            " from `jj.rollout`"
+        )
+    trajectory, kind, reruns = (
+        (motion.lanes, "rollout", motion.reruns)
+        if isinstance(motion, Rollout)
+        else (motion, "trajectory", ())
+    )
     if trajectory is motion and motion.q.ndim != 2:
         raise ValueError(
             f"`save` takes one motion, but was given a batch of shape {motion.q.shape[:-2]}; for one batch "
-                "axis, save `jj.Rollout(batch)`"
+            "axis, save `jj.Rollout(batch)`"
         )
     scene = trajectory.scene
     parameters, static = _stored_fields(scene)
     for field in fields(scene):
-        if field.init and field.name not in (*parameters, *static) and getattr(scene, field.name) is not field.default:
+        if (
+            field.init
+            and field.name not in (*parameters, *static)
+            and getattr(scene, field.name) is not field.default
+        ):
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is "
-                    f"{described(getattr(scene, field.name))}, which `save` cannot store; expected arrays, "
-                    "numbers or texts, or the class's default"
+                f"{described(getattr(scene, field.name))}, which `save` cannot store; expected arrays, "
+                "numbers or texts, or the class's default"
             )
     check_place(path)
-    arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
+    arrays = {
+        name: np.asarray(getattr(trajectory, name))
+        for name in (*_ARRAYS, "work")
+        if getattr(trajectory, name) is not None
+    }
     if any(x.size for x in jax.tree.leaves(trajectory.phases)):
         arrays |= {name: np.asarray(attrgetter(name)(trajectory)) for name in _PHASES}
-    arrays["inputs"] = np.asarray((jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts))
+    arrays["inputs"] = np.asarray(
+        (jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts)
+    )
     arrays |= {f"parameter:{name}": np.asarray(value) for name, value in parameters.items()}
     header = {name: getattr(trajectory, name) for name in RERUN_FIELDS} | {
         "format": 1,
@@ -139,7 +166,10 @@ def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
     if the file cannot be read, has another format, contains one trajectory, or belongs to another scene.
     """
     header, arrays, kind = _read(path, scene, "rollout")
-    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
+    ways = tuple(
+        (int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how))
+        for way, how in header["reruns"]
+    )
     return Rollout(_lanes(path, kind, header, arrays), ways)
 
 
@@ -149,13 +179,20 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     """
     samples = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
     longest = max(len(times) for times, _ in samples)  # samples with fewer input times repeat their last one
-    arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
-    arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples])
+    arrays["input_ts"] = np.stack(
+        [np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples]
+    )
+    arrays["inputs"] = np.stack(
+        [np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples]
+    )
     arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` passes NumPy arrays on unchanged
     try:
         lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
     except _NEEDS_NUMBERS:  # the class reads the values when a scene is created
-        each = [_trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()}) for i in range(len(arrays["result"]))]
+        each = [
+            _trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()})
+            for i in range(len(arrays["result"]))
+        ]
         lanes = jax.tree.map(lambda *x: jnp.stack(x), *each)
     _check_scene(path, at_index(lanes.scene, 0))
     return lanes
@@ -168,35 +205,50 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     except _NEEDS_NUMBERS:
         raise
     except TypeError as error:
-        raise _refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+        raise _refused(
+            path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})"
+        ) from None
     parameters, static = _stored_fields(scene)
     # otherwise their defaults would replace the missing values
     if missing := sorted({*parameters, *static} - {*values, *header["static"]}):
         raise ValueError(
             f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged or older than "
-                "the parameter: pass the class as it was when the file was written"
+            "the parameter: pass the class as it was when the file was written"
         )
     then, now = header["units"], {name: about["unit"] for name, _, about in parameters_of(scene)}
     for name in sorted({*then, *now}):
         if then.get(name) != now.get(name):
-            was, takes = (f"in {units[name]}" if units.get(name) else "without a unit" for units in (then, now))
+            was, takes = (
+                f"in {units[name]}" if units.get(name) else "without a unit" for units in (then, now)
+            )
             raise ValueError(
                 f"`{path}` holds the parameter `{name}` {was}, but `{kind.__name__}` takes it {takes}; pass "
-                    "the class as it was when the file was written"
+                "the class as it was when the file was written"
             )
-    for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
+    for name, now in (
+        ("coordinates", scene.coordinate_names),
+        ("speeds", scene.speed_names),
+        ("input_names", scene.inputs),
+    ):
         if tuple(header[name]) != now.entries:
             raise ValueError(
-                f"the file holds the {name.replace('_', ' ')} {', '.join(header[name])}, but `{kind.__name__}` has {', '.join(now.entries) or 'none'}; "
-                "pass the class as it was when the file was written"
+                f"the file holds the {name.replace('_', ' ')} {', '.join(header[name])}, but"
+                f" `{kind.__name__}` has {', '.join(now.entries) or 'none'}; pass the class as it was when"
+                " the file was written"
             )
     channels = [Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T]
     phases = one_phase(tuple(header["event_names"]))
     if "phases.ts" in arrays:
-        phases = Phases(**{name.removeprefix("phases."): arrays[name] for name in _PHASES}, event_names=tuple(header["event_names"]), named=scene.modes)
+        phases = Phases(
+            **{name.removeprefix("phases."): arrays[name] for name in _PHASES},
+            event_names=tuple(header["event_names"]),
+            named=scene.modes,
+        )
         direction = jnp.where(arrays["t_end"] < arrays["ts"][0], -1.0, 1.0)
         ts = jnp.where(jnp.isfinite(phases.ts), phases.ts * direction, jnp.inf)
-        channels[len(channels) - len(phases.modes) :] = [Mode(modes[0], ts, modes[1:], direction) for modes in phases.modes]
+        channels[len(channels) - len(phases.modes) :] = [
+            Mode(modes[0], ts, modes[1:], direction) for modes in phases.modes
+        ]
     return Trajectory(
         scene=scene,
         work=arrays.get("work"),
@@ -221,12 +273,21 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
     """
     kind = scene if isinstance(scene, type) else type(scene)
     if not issubclass(kind, Scene):
-        raise ValueError(f"`scene` is {described(scene)}, expected the class of the simulated scene, or a scene of that class")
+        raise ValueError(
+            f"`scene` is {described(scene)}, expected the class of the simulated scene, or a scene of that"
+            " class"
+        )
     if header["scene"] != kind.__name__:
-        raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass its class")
+        raise ValueError(
+            f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass its"
+            " class"
+        )
     known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
-    check_names((*parameters, *header["static"]), known,
-        f"`{path}` has a parameter `{{}}` that `{kind.__name__}` lacks")
+    check_names(
+        (*parameters, *header["static"]),
+        known,
+        f"`{path}` has a parameter `{{}}` that `{kind.__name__}` lacks",
+    )
     return kind
 
 
@@ -236,15 +297,25 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     with opened(path, what) as file:
         arrays = parsed(_unpacked, file, f"`{path}`", what)
     header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
-    check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
+    check_depth(
+        header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`"
+    )
     if not isinstance(header, dict):
         raise _refused(path, "has an invalid header")
     if header.get("format") != 1:
-        raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
+        raise ValueError(
+            f"`{path}` has format {header.get('format')}, expected 1; read it with the version of"
+            " jourdain-jax that wrote it"
+        )
     found = header.get("kind")
     if found != kind:
-        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
-    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays] + [name for name in _HEADER if name not in header]
+        raise ValueError(
+            f"`{path}` holds a {found}, expected a {kind}; read it with"
+            f" `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`"
+        )
+    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays] + [
+        name for name in _HEADER if name not in header
+    ]
     if missing:
         raise _refused(path, f"lacks `{missing[0]}`")
     if header.get("digest", own := _digest(header, arrays)) != own:
@@ -262,10 +333,16 @@ def _unpacked(file) -> dict[str, np.ndarray]:
             name = member.filename.removesuffix(".npy")
             # limit of the compression ratio: deflate's longest match
             if name in found or member.file_size > 1100 * member.compress_size + 1000:
-                raise ValueError(f"`{name}` occurs twice" if name in found else f"`{name}` claims {member.file_size} bytes")
+                raise ValueError(
+                    f"`{name}` occurs twice" if name in found else f"`{name}` claims {member.file_size} bytes"
+                )
             content = archive.read(member)
             head = io.BytesIO(content)
-            of_version = np.lib.format.read_array_header_1_0 if np.lib.format.read_magic(head) == (1, 0) else np.lib.format.read_array_header_2_0
+            of_version = (
+                np.lib.format.read_array_header_1_0
+                if np.lib.format.read_magic(head) == (1, 0)
+                else np.lib.format.read_array_header_2_0
+            )
             shape, by_columns, dtype = of_version(head)
             if dtype.hasobject or head.tell() + dtype.itemsize * math.prod(shape) != len(content):
                 raise ValueError(f"`{name}` claims an array of shape {shape} in {len(content)} bytes")
@@ -275,7 +352,11 @@ def _unpacked(file) -> dict[str, np.ndarray]:
 
 def _parameters(arrays: dict) -> dict:
     """Return the parameters of the scene among the arrays of a file."""
-    return {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
+    return {
+        name.removeprefix("parameter:"): value
+        for name, value in arrays.items()
+        if name.startswith("parameter:")
+    }
 
 
 def _stored_fields(scene: Scene) -> tuple[dict, dict]:
@@ -283,8 +364,14 @@ def _stored_fields(scene: Scene) -> tuple[dict, dict]:
     texts, such as a number of bodies.
     """
     values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
-    arrays = {field.name: value for field, value in values.items() if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")}
-    return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}
+    arrays = {
+        field.name: value
+        for field, value in values.items()
+        if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")
+    }
+    return arrays, {
+        field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)
+    }
 
 
 def _refused(path, sentence: str) -> ValueError:
@@ -305,5 +392,5 @@ def _check_scene(path, scene: Scene) -> None:
         said = str(error).splitlines()[0]
         raise ValueError(
             f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class "
-                "as it was when it was written"
+            "as it was when it was written"
         ) from None

@@ -53,11 +53,12 @@ class Trajectory(Record, Printed):
             raise UnknownNameError(
                 f"`{name}` is a body of `{type(self.scene).__name__}`, not a coordinate or speed; "
                 f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its '
-                'pose and velocities at all times'
+                "pose and velocities at all times"
             )
         valid = (*state_names(self.scene), "t")
         raise UnknownNameError(
-            f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+            f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}"
+        )
 
     def __contains__(self, name: str) -> bool:
         return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
@@ -98,8 +99,9 @@ class Trajectory(Record, Printed):
         """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates
         `local` (m, from the mass centre).
         """
-        local = checked_real(local, f"point of body `{body}`", (3,),
-            advice="pass three components in its body frame, m")
+        local = checked_real(
+            local, f"point of body `{body}`", (3,), advice="pass three components in its body frame, m"
+        )
         return map_over_times(values_in_time.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
@@ -134,8 +136,7 @@ class Trajectory(Record, Printed):
         return map_over_times(values_in_time.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
-        """Return the quantities that the scene declares conserved, by name at all times; without the energy.
-        """
+        """Return the quantities that the scene declares conserved, by name at all times; without the energy."""
         return map_over_times(values_in_time.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
@@ -154,7 +155,11 @@ class Trajectory(Record, Printed):
 
     def _text(self) -> str:
         with nan_is_a_mark():
-            return summary(self, self.message) if self.q.ndim == 2 else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+            return (
+                summary(self, self.message)
+                if self.q.ndim == 2
+                else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+            )
 
     def _picture(self) -> str:
         return "" if self.q.ndim > 2 else sketch(self)
@@ -197,7 +202,13 @@ class Trajectory(Record, Printed):
         bodies, contacts and gravity; if steps became short, a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
-        if code in (result_codes.STICKS, result_codes.MAX_STEPS, result_codes.SHRANK, result_codes.STEP_TOO_SMALL, result_codes.STIFF):
+        if code in (
+            result_codes.STICKS,
+            result_codes.MAX_STEPS,
+            result_codes.SHRANK,
+            result_codes.STEP_TOO_SMALL,
+            result_codes.STIFF,
+        ):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
             said = " jumps, or has a kink, at the last state; smooth it over a short range, as by `jnp.tanh`"
             return (f"{load}{'' if code == result_codes.STICKS else said}",) if load else ()
@@ -206,7 +217,11 @@ class Trajectory(Record, Printed):
         if self.wrong_parameters:
             return tuple(f"`{name}`" for name in self.wrong_parameters)
         q, u, _ = self.scene.named()
-        return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items() if bool(wrong))
+        return tuple(
+            fault
+            for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items()
+            if bool(wrong)
+        )
 
     def nan_if_failed(self) -> "Trajectory":
         """Return the trajectory, with NaN states if it reached neither its end nor an event. Works under
@@ -217,8 +232,10 @@ class Trajectory(Record, Printed):
         Their derivatives are NaN, too. Samples excluded from a loss by `jnp.where(motion.succeeded, ...,
         0.0)` do not disturb its derivatives with respect to shared values.
         """
-        states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731
-        failed = lambda x: jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape)  # noqa: E731
+        states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]
+        failed = lambda x: jnp.broadcast_to(
+            jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape
+        )
         return eqx.tree_at(states, self, [nan_where(failed(x), x) for x in states(self)])
 
     @of_known_numbers
@@ -231,5 +248,6 @@ class Trajectory(Record, Printed):
         """
         if int(self.result) > result_codes.EVENT:
             raise result_codes.SimulationError(
-                f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
+                f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}"
+            )
         return self

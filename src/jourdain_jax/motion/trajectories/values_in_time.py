@@ -9,7 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static, with_nan_as_a_mark, with_usual_promotion
+from jourdain_jax.calculus.reals import (
+    Count,
+    Scalar,
+    Speeds,
+    Vector3,
+    at_index,
+    is_traced,
+    static,
+    with_nan_as_a_mark,
+    with_usual_promotion,
+)
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
@@ -115,7 +125,7 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     `by_inputs`: whether f needs the rates of the inputs, because constraints depend on varying ones. For a
     batch of motions the batch axes come first.
     """
-    first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))  # noqa: E731  of a batch, the first
+    first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))
     # accelerations depend on the rates of the inputs
     by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs
     known = not is_traced((f, record))
@@ -165,7 +175,10 @@ def _largest_block(record: Record) -> int:
 @with_nan_as_a_mark
 def _on_numpy(f, record: Record, by_inputs: bool):
     by_time, size = (record.ts, record.q, record.u), _largest_block(record)
-    blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
+    blocks = [
+        _uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time])
+        for k in range(0, len(record.ts), size)
+    ]
     return jax.tree.map(lambda *parts: jax.device_put(np.concatenate(parts)), *blocks)
 
 

@@ -88,7 +88,11 @@ def touch(shape: Shape, ground: Ground) -> Touch:
     if isinstance(shape, Ball) and isinstance(ground, Cylinder | Sphere):
         return _of_core(shape.centre, shape.radius, ground)
     if isinstance(shape, Wheel) and isinstance(ground, Sphere):
-        return _of_core(_of_circle(shape, ground), jnp.zeros_like(shape.radius) if shape.tyre is None else shape.tyre, ground)
+        return _of_core(
+            _of_circle(shape, ground),
+            jnp.zeros_like(shape.radius) if shape.tyre is None else shape.tyre,
+            ground,
+        )
     return _by_newton(shape, ground)
 
 
@@ -121,7 +125,9 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
         return jnp.append(x + gap * n - shape.lowest(n), ground.value(x))
 
     guess = _guess(jax.lax.stop_gradient(shape), ground)
-    size = jnp.maximum(jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), tiny_of(guess))  # the radius, nearly
+    size = jnp.maximum(
+        jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), tiny_of(guess)
+    )  # the radius, nearly
     root = newton_root(residual, guess, jnp.full(4, jax.lax.stop_gradient(size)))
     x, gap = root.x[:3], root.x[3]
     found = root.converged

@@ -13,7 +13,16 @@ from typing import Any, TypedDict, Unpack, get_args
 import equinox as eqx
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Parameter, Scalar, Vector, Vector3, check_kind, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import (
+    Parameter,
+    Scalar,
+    Vector,
+    Vector3,
+    check_kind,
+    checked_positive,
+    checked_real,
+    described,
+)
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.contact.grounds import Ground, Plane
@@ -34,8 +43,9 @@ class Coulomb(eqx.Module):
 
     def __init__(self, sliding, static=None):
         self.sliding = checked_real(sliding, "coefficient of friction", ())
-        self.static = self.sliding if static is None else checked_real(static, "coefficient of static "
-            "friction", ())
+        self.static = (
+            self.sliding if static is None else checked_real(static, "coefficient of static friction", ())
+        )
 
 
 class Slipping(TypedDict, total=False):
@@ -79,15 +89,27 @@ class Contact(eqx.Module):
     impact: str = eqx.field(static=True)
 
     def __init__(
-        self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
+        self,
+        body,
+        point,
+        plane=None,
+        height="coordinates",
+        carried=None,
+        distance=None,
+        *,
+        shape=None,
+        ground=None,
+        **slips: Unpack[Slipping],
     ):
         """Make a contact of the `body` at its `point` with the tangent `plane` of a ground."""
         check_kind(body, BodyPose | str, "the body of a contact", 'the pose of a body; write pose["name"]')
         self.body = body if isinstance(body, str) else body.name
         if plane is not None and not isinstance(plane, Plane):
             advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
-            raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a "
-                f"`jj.Plane(...)`, or None for z = 0 at rest{advice}")
+            raise ValueError(
+                f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a "
+                f"`jj.Plane(...)`, or None for z = 0 at rest{advice}"
+            )
         if ground is not None:
             _checked_ground(ground, self.body)
         if shape is not None and not isinstance(shape, get_args(Shape)):
@@ -96,12 +118,22 @@ class Contact(eqx.Module):
                 f"`shape` of the contact of `{self.body}` is {described(shape)}, expected a shape set by "
                 f"`ball_contact` or a similar function; {advice}"
             )
-        self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
-        self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
+        self.point = checked_real(
+            point,
+            f"point of the contact of `{self.body}`",
+            (3,),
+            advice="give three components in the inertial frame, m",
+        )
+        self.plane = (
+            plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
+        )
         self.height = _checked_height(height)
         self.carried = _checked_carried(carried, self.body)
-        self.distance = None if distance is None else checked_real(distance, "distance of the contact of "
-            f"`{self.body}`", ())
+        self.distance = (
+            None
+            if distance is None
+            else checked_real(distance, f"distance of the contact of `{self.body}`", ())
+        )
         self.shape, self.ground = shape, ground
         self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
 
@@ -110,8 +142,7 @@ class Contact(eqx.Module):
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
     def lean(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for other shapes.
-        """
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for other shapes."""
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 
 
@@ -162,7 +193,9 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
     """
 
     def ellipsoid(centre) -> Ellipsoid:
-        lengths = checked_positive(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
+        lengths = checked_positive(
+            semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m"
+        )
         return Ellipsoid(centre, body.orientation, lengths)
 
     return rolling(body, ellipsoid, **options)
@@ -180,10 +213,16 @@ def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unp
     Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
     height. The point is in closed form on a plane and a sphere.
     """
-    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None), **options)
+    return rolling(
+        body,
+        lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None),
+        **options,
+    )
 
 
-def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
+def wheel_contact(
+    body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]
+) -> Contact:
     """Return the rolling contact of a wheel with a tyre of circular section (a torus) with a ground, without
     slip.
 
@@ -198,7 +237,11 @@ def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **
     height. The point is in closed form on a plane and a sphere.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
-    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre), **options)
+    return rolling(
+        body,
+        lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre),
+        **options,
+    )
 
 
 def _radius(body: BodyPose, radius) -> Scalar:
@@ -206,7 +249,14 @@ def _radius(body: BodyPose, radius) -> Scalar:
 
 
 def rolling(
-    body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
+    body: BodyPose,
+    shape: Callable[[Array], Shape],
+    *,
+    centre=None,
+    ground: Ground | None = None,
+    height="coordinates",
+    carried=None,
+    **slips: Unpack[Slipping],
 ) -> Contact:
     """Return the contact of a rolling `shape`, a function of its centre (m, inertial frame). Other arguments:
     as in `ball_contact`.
@@ -214,28 +264,44 @@ def rolling(
     _checked_height(height)
     check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
-        raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a "
-            "`jj.RigidBody`")
+        raise ValueError(
+            f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`"
+        )
     ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position
     if centre is not None:
-        at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
+        at = body.place(
+            checked_real(
+                centre,
+                f"centre of the contact of `{body.name}`",
+                (3,),
+                advice="give three components in its body frame, m",
+            )
+        )
     rolls = shape(at)
     found = touch(rolls, ground)
-    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground, **slips)
+    return Contact(
+        body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground, **slips
+    )
 
 
 def _checked_ground(given, body: str) -> Ground:
     if not isinstance(given, get_args(Ground)):
         known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
-        raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or "
-            "None for z = 0 at rest")
+        raise ValueError(
+            f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or "
+            "None for z = 0 at rest"
+        )
     return given
 
 
-def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="moreau") -> tuple[Coulomb | None, Scalar | None, str]:
+def _slipping(
+    body: str, height: str, friction=None, restitution=0.0, impact="moreau"
+) -> tuple[Coulomb | None, Scalar | None, str]:
     if impact not in IMPACTS:
-        raise ValueError(f"`impact` of the contact of `{body}` is {described(impact)}, expected one of "
-            f"{', '.join(IMPACTS)}")
+        raise ValueError(
+            f"`impact` of the contact of `{body}` is {described(impact)}, expected one of "
+            f"{', '.join(IMPACTS)}"
+        )
     if friction is None:
         return None, None, impact
     if height != "row":
@@ -243,8 +309,11 @@ def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="mo
             f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
             'ground; give the body a coordinate for its height, and write height="row"'
         )
-    law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, "friction of the "
-        f"contact of `{body}`", ()))
+    law = (
+        friction
+        if isinstance(friction, Coulomb)
+        else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
+    )
     return law, checked_real(restitution, f"restitution of the contact of `{body}`", ()), impact
 
 
@@ -262,6 +331,8 @@ def _checked_carried(carried, body: str) -> Labels | None:
         return None
     names = () if isinstance(carried, str) or not isinstance(carried, Iterable) else tuple(carried)
     if not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f'`carried` of the contact of `{body}` is {described(carried)}, expected names of '
-            f'bodies; write ("{body}",)')
+        raise ValueError(
+            f"`carried` of the contact of `{body}` is {described(carried)}, expected names of "
+            f'bodies; write ("{body}",)'
+        )
     return names

@@ -56,8 +56,7 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """Class attribute with the class's declarations, extended for instances that have contacts with friction.
-    """
+    """Class attribute with the class's declarations, extended for instances that have contacts with friction."""
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated
@@ -86,7 +85,13 @@ def has_friction(kind: type) -> bool:
 def _words(code: CodeType) -> set[str]:
     found = set(names_in(code))
     for constant in code.co_consts:  # names of arguments are among the constants
-        found |= _words(constant) if isinstance(constant, CodeType) else set(constant) if isinstance(constant, tuple) else {constant}
+        found |= (
+            _words(constant)
+            if isinstance(constant, CodeType)
+            else set(constant)
+            if isinstance(constant, tuple)
+            else {constant}
+        )
     return found
 
 
@@ -98,17 +103,21 @@ def switching_of(scene) -> Switching:
 
     def look(leaves) -> None:
         scene = jax.tree.unflatten(structure, leaves)
-        t, q, u, inputs = jnp.zeros(()), *(
-            of.view(jnp.zeros(len(of))) for of in (scene.coordinates.names, scene.speed_names, scene.inputs)
+        t, q, u, inputs = (
+            jnp.zeros(()),
+            *(
+                of.view(jnp.zeros(len(of)))
+                for of in (scene.coordinates.names, scene.speed_names, scene.inputs)
+            ),
         )
         at_rest = jnp.zeros(3)
-        bodies = {
-            name: BodyMotion(name, body, at_rest, at_rest) for name, body in scene.bodies(t, q).items()
-        }
+        bodies = {name: BodyMotion(name, body, at_rest, at_rest) for name, body in scene.bodies(t, q).items()}
         motion = Motion(t, q, u, q, inputs, bodies)
         contacts = scene.contacts(motion.pose())
         names.update({name: MODES_OF_CONTACT for name, c in contacts.items() if c.friction is not None})
-        names.update(dict.fromkeys(held_rows(scene.velocity_constraints(motion), scene.loads(motion)), MODES_OF_ROW))
+        names.update(
+            dict.fromkeys(held_rows(scene.velocity_constraints(motion), scene.loads(motion)), MODES_OF_ROW)
+        )
 
     leaves = [jax.ShapeDtypeStruct(np.shape(x), real_type()) for x in leaves]
     jax.eval_shape(look, leaves)

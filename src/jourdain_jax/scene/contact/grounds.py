@@ -19,7 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, as_real, checked_positive, checked_real, described, known_numbers, static
+from jourdain_jax.calculus.reals import (
+    Matrix3,
+    Scalar,
+    Vector,
+    Vector3,
+    as_real,
+    checked_positive,
+    checked_real,
+    described,
+    known_numbers,
+    static,
+)
 from jourdain_jax.calculus.rotations import rot_y
 
 Tangents = Float[Array, "2 3"]
@@ -46,7 +57,9 @@ class _Ground(eqx.Module):
         """
         return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
-    def _moves(self, what: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)) -> None:
+    def _moves(
+        self, what: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)
+    ) -> None:
         """Store the motion, checked."""
         self.origin = checked_real(origin, f"origin of {what}", (3,))
         self.velocity = checked_real(velocity, f"velocity of {what}", (3,))
@@ -54,8 +67,10 @@ class _Ground(eqx.Module):
 
     def _tangent(self, origin, normal, tangents) -> "Plane":
         """Return a plane with the given axes that moves with the ground."""
-        parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
-        return eqx.tree_at(parts, Plane(), (origin, normal, tangents, self.velocity_at(origin), self.angular_velocity))
+        parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)
+        return eqx.tree_at(
+            parts, Plane(), (origin, normal, tangents, self.velocity_at(origin), self.angular_velocity)
+        )
 
 
 class Plane(_Ground):
@@ -81,7 +96,16 @@ class Plane(_Ground):
     normal: Vector3  # unit vector, out of the ground
     tangents: Tangents  # unit vectors along the no-slip constraints
 
-    def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
+    def __init__(
+        self,
+        origin=(0.0, 0.0, 0.0),
+        tilt=None,
+        velocity=(0.0, 0.0, 0.0),
+        angular_velocity=(0.0, 0.0, 0.0),
+        *,
+        normal=None,
+        along=None,
+    ):
         """Make the plane z = 0, rotated by `tilt` (rad, about y; or a rotation matrix), or the plane with
         this `normal` and the first tangent `along`.
         """
@@ -197,8 +221,7 @@ class Sphere(_Round):
     """
 
     def __init__(self, radius, *, side: str, **motion: Unpack[RigidMotion]):
-        """Make a sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground.
-        """
+        """Make a sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground."""
         self._is("a sphere", radius, side, motion)
 
     def arm_to(self, point: Vector) -> Vector3:
@@ -229,8 +252,12 @@ class Surface(_Ground):
     def value(self, point: Vector) -> Scalar:
         """Return f at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
-        return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, "
-            "positive on the side of the bodies")
+        return checked_real(
+            self.f(x, y, z),
+            "f(x, y, z) of a surface",
+            (),
+            advice="return one number, positive on the side of the bodies",
+        )
 
     def plane_at(self, point: Vector) -> Plane:
         """Return the tangent plane at a `point` (m, inertial frame) of the surface."""
@@ -273,7 +300,10 @@ class HeightMap(_Ground):
         height, along_x = jax.jvp(self.height_at, (x, y), (i, o))
         _, along_y = jax.jvp(self.height_at, (x, y), (o, i))
         first, normal = jnp.stack([i, o, along_x]), jnp.stack([-along_x, -along_y, i])
-        first, normal = first / jnp.sqrt(1 + along_x * along_x), normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
+        first, normal = (
+            first / jnp.sqrt(1 + along_x * along_x),
+            normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y),
+        )
         return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
     def point_at(self, x, y) -> Vector3:
@@ -300,7 +330,9 @@ def tangents_of(n: Vector3) -> Tangents:
     x, y, z = n
     s = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))
     a = -1 / (s + z)
-    return jnp.stack([jnp.stack([1 + s * x * x * a, s * x * y * a, -s * x]), jnp.stack([x * y * a, s + y * y * a, -y])])
+    return jnp.stack(
+        [jnp.stack([1 + s * x * x * a, s * x * y * a, -s * x]), jnp.stack([x * y * a, s + y * y * a, -y])]
+    )
 
 
 def _turned(tilt) -> Matrix3:
@@ -323,6 +355,7 @@ def _tangents_along(n, along) -> Tangents:
 
 def _function(f, what: str, example: str) -> Callable:
     if not callable(f):
-        raise ValueError(f"{what} is given by {described(f)}, expected a function of numbers; write "
-            f"{example}")
+        raise ValueError(
+            f"{what} is given by {described(f)}, expected a function of numbers; write {example}"
+        )
     return f

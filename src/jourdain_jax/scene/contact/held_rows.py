@@ -21,8 +21,7 @@ from jourdain_jax.scene.names import check_names
 
 
 class HeldRow(eqx.Module):
-    """A velocity constraint, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m.
-    """
+    """A velocity constraint, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m."""
 
     w: Scalar
     friction: Coulomb
@@ -64,12 +63,13 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
             return jj.gravity(motion, 9.81), jj.joint_friction(motion, angle_rate=self.stiction)
     """
     check_names(friction, motion.u.keys(), "friction on unknown speed `{}`")
-    return JointFriction({name: HeldRow(motion.u[name], force, f"`{name}`") for name, force in friction.items()})
+    return JointFriction(
+        {name: HeldRow(motion.u[name], force, f"`{name}`") for name, force in friction.items()}
+    )
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the constraints that hold up to a force, from the results of `velocity_constraints` and `loads`.
-    """
+    """Return the constraints that hold up to a force, from the results of `velocity_constraints` and `loads`."""
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}
