@@ -15,7 +15,7 @@ from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.identification import Accelerometer, Actuator, LoadCell, Sensor, log_likelihood
-from jourdain_jax.identification.data.sensors import filtered, read
+from jourdain_jax.identification.data.delay_filter import filtered, read
 from jourdain_jax.studies import Normal
 
 MASS, DAMPING, STIFFNESS = 2.0, 0.6, 5.0

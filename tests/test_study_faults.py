@@ -33,7 +33,16 @@ from test_studies import assert_same
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.scene.digests import digest
-from jourdain_jax.studies import End, InUseError, Uniform, folder_lock, merge_studies, store, workers
+from jourdain_jax.studies import (
+    End,
+    InUseError,
+    Uniform,
+    folder_lock,
+    manifest,
+    merge_studies,
+    store,
+    workers,
+)
 from jourdain_jax.studies.run import Runner, opened
 from jourdain_jax.studies.store import Store
 
@@ -92,7 +101,8 @@ def _after(monkeypatch, count, error):
             raise error
         write_whole(path, content, **how)
 
-    monkeypatch.setattr(store, "write_whole", write)
+    for module in (store, manifest):
+        monkeypatch.setattr(module, "write_whole", write)
 
 
 def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monkeypatch, computed):
@@ -284,10 +294,10 @@ def _changed(path, name, **entries):
     """The JSON of a file with other entries, and a manifest that knows them: as a hostile hand, or another
     version, would write it.
     """
-    file, manifest = path / "run" / name, path / "run" / "manifest.json"
+    file, listed = path / "run" / name, path / "run" / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | entries))
-    digests = json.loads(manifest.read_text())["digests"] | {f"run/{name}": store._digest(file.read_bytes())}
-    store._write_manifest(path, digests)
+    digests = json.loads(listed.read_text())["digests"] | {f"run/{name}": manifest.digest(file.read_bytes())}
+    manifest.write_manifest(path, digests)
 
 
 def test_another_format_is_refused(path):

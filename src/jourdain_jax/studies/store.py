@@ -1,12 +1,12 @@
 """A study on disk: a Zarr group (format 3) with one array per quantity along `lane`, and files for continuing
 after an interruption.
 
-    NAME/zarr.json, NAME/c/0, ...    arrays, cut into chunks of lanes; every chunk ends in its CRC-32C, as Zarr's codec `crc32c` has it
-    run/study.json                   identity of the study: format, digests, settings, versions; written once
-    run/grid.json                    the grid of the statistics, written by the first process that completes block 0
-    run/manifest.json                digests of all files that are written once, and of itself; replaced in one step
-    run/chunks/K                     receipt of chunk K: written after its arrays, with their checksums, its counts and its sums
-    run/lock                         held by the process that runs the study
+    NAME/zarr.json, NAME/c/0, ...   arrays, cut into chunks; each ends in its CRC-32C (Zarr's codec `crc32c`)
+    run/study.json      identity of the study: format, digests, settings, versions; written once
+    run/grid.json       grid of the statistics, written by the first process that completes block 0
+    run/manifest.json   digests of all files that are written once, and of itself; replaced in one step
+    run/chunks/K        receipt of chunk K with checksums, counts and sums; written after its arrays
+    run/lock            held by the process that runs the study
 
 A chunk counts as finished if its receipt is intact and belongs to this study and grid, and its arrays match
 the checksums of the receipt; otherwise it is computed again. Files that are not in the manifest count as
@@ -17,7 +17,6 @@ no manifest.
 
 import contextlib
 import errno
-import hashlib
 import json
 import math
 import os
@@ -34,12 +33,12 @@ from jourdain_jax.calculus.files import FilePath, name_of, parsed, read_bytes, s
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.studies.design import MOST_SAMPLES
 from jourdain_jax.studies.folder_lock import locked
+from jourdain_jax.studies.manifest import GRID, MANIFEST, digest, digest_of, write_manifest
+from jourdain_jax.studies.receipt import Receipt, crc32c, with_checksum
 from jourdain_jax.studies.statistics import Tally
 
 FORMAT = 2
-_BEGIN = b"jourdain-jax chunk 2\n"
 MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
-_MANIFEST, _GRID = "run/manifest.json", "run/grid.json"
 
 
 @dataclass(frozen=True)
@@ -55,51 +54,6 @@ class Column:
     every: int = 1
 
 
-@dataclass(frozen=True)
-class Receipt:
-    """The record of a finished chunk."""
-
-    first: int
-    last: int
-    tally: Tally
-    checksums: Mapping[str, int]
-    of: Sequence[str]  # digests of the study and of its grid
-
-    @property
-    def lanes(self) -> tuple[int, int]:
-        """Return the number of samples of the chunk, and of failed ones."""
-        return self.last - self.first, self.tally.failed.size
-
-    def packed(self) -> bytes:
-        """Return the receipt as bytes: a first line, a line of JSON that describes the arrays, the arrays,
-        and the CRC-32C of all these.
-        """
-        arrays = vars(self.tally) | {"cells": self.tally.cells.astype(np.int32)}
-        listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-        head = vars(self) | {"checksums": dict(self.checksums), "arrays": listed}
-        del head["tally"]
-        return _ended(
-            _BEGIN + json.dumps(head).encode() + b"\n" + b"".join(map(np.ndarray.tobytes, arrays.values()))
-        )
-
-    @staticmethod
-    def unpacked(content: bytes, outputs: int) -> "Receipt":
-        """Return the receipt in these bytes, for a study with this number of `outputs`. Raises ValueError, or
-        another error of the reader, for damaged bytes.
-        """
-        if not content.startswith(_BEGIN) or content != _ended(content[:-4]):
-            raise ValueError("the receipt of a chunk is torn")
-        end = content.index(b"\n", len(_BEGIN))
-        head, at, arrays = json.loads(content[len(_BEGIN) : end]), end + 1, {}
-        for name, dtype, shape in head.pop("arrays"):
-            count = math.prod(shape)
-            if min(shape, default=0) < 0 or np.dtype(dtype).hasobject:
-                raise ValueError("the receipt of a chunk holds no numbers")
-            arrays[name] = np.frombuffer(content, dtype, count, at).reshape(shape)
-            at += count * np.dtype(dtype).itemsize
-        return Receipt(tally=Tally.checked(arrays, range(head["first"], head["last"]), outputs), **head)
-
-
 class Store:
     """A study's folder, `path`."""
 
@@ -113,10 +67,9 @@ class Store:
             for name, entry in self.study["columns"].items()
         }
         self.outputs = tuple(self.study.get("outputs", ()))
-        decides = [
-            self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")
-        ]  # equal in all shares
-        self.identity = _digest(json.dumps(decides).encode())
+        # equal in all shares
+        own = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]
+        self.identity = digest(json.dumps(own).encode())
 
     @staticmethod
     def make(
@@ -151,19 +104,11 @@ class Store:
                     return group.create_array(name, shape=shape, chunks=chunks, **options, **kind)
 
                 for name, column in columns.items():
-                    axes, more = zip(
-                        ("lane" if column.every == 1 else "saved_lane", 0), *column.more, strict=True
-                    )
+                    lane = "lane" if column.every == 1 else "saved_lane"
+                    axes, more = zip((lane, 0), *column.more, strict=True)
                     shape, chunks = ((-(-count // column.every), *more[1:]) for count in (lanes, chunk))
-                    array(
-                        name,
-                        axes,
-                        shape,
-                        chunks,
-                        column.attributes,
-                        dtype=column.dtype,
-                        fill_value=column.fill,
-                    )
+                    kind = {"dtype": column.dtype, "fill_value": column.fill}
+                    array(name, axes, shape, chunks, column.attributes, **kind)
                     (beside / name / "c").mkdir(exist_ok=True)
                 for name, (axis, values, about) in constants.items():
                     array(name, (axis,), values.shape, values.shape, about, dtype=values.dtype)[:] = values
@@ -180,8 +125,8 @@ class Store:
                 wait=True,
             )
             files = [file for file in beside.rglob("*") if file.is_file()]
-            _write_manifest(
-                beside, {file.relative_to(beside).as_posix(): _digest(file.read_bytes()) for file in files}
+            write_manifest(
+                beside, {file.relative_to(beside).as_posix(): digest(file.read_bytes()) for file in files}
             )
             with contextlib.suppress(OSError):  # an empty folder, which blocks a rename on Windows
                 path.rmdir()
@@ -228,12 +173,12 @@ class Store:
         """Return the digests of the files that are written once, by name, after checking that each file
         exists and matches. The grid is exempt, since it can be computed again.
         """
-        found = self._json(_MANIFEST)
+        found = self._json(MANIFEST)
         digests = found.get("digests")
-        if not isinstance(digests, dict) or found.get("digest") != _digest_of(digests):
-            raise self._damaged(_MANIFEST)
+        if not isinstance(digests, dict) or found.get("digest") != digest_of(digests):
+            raise self._damaged(MANIFEST)
         for name in digests:
-            if name != _GRID and _digest(self._read(name)) != digests[name]:
+            if name != GRID and digest(self._read(name)) != digests[name]:
                 raise self._damaged(name)
         return digests
 
@@ -329,10 +274,10 @@ class Store:
                     np.dtype(column.dtype).newbyteorder("<"),
                 )
                 full[: len(values[name])] = values[name]
-                content = _ended(full.tobytes())
+                content = with_checksum(full.tobytes())
                 checksums[name] = int.from_bytes(content[-4:], "little")
                 self._write(name, number, content)
-            of = self.identity, self._digests.get(_GRID, "")
+            of = self.identity, self._digests.get(GRID, "")
             write_whole(
                 self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed()
             )
@@ -343,7 +288,7 @@ class Store:
         """
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
-            own = [self.identity, self._digests.get(_GRID, found.of[-1])]
+            own = [self.identity, self._digests.get(GRID, found.of[-1])]
             return (
                 found
                 if ((found.first, found.last), list(found.of), {*found.checksums})
@@ -389,7 +334,7 @@ class Store:
             except OSError:
                 return name
             known = receipt and receipt.checksums[name]
-            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or _crc32c(content) != known:
+            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or crc32c(content) != known:
                 return name
         return "receipt" if receipt is None else None
 
@@ -418,8 +363,8 @@ class Store:
         """
         self._digests = self._read_manifest()
         with contextlib.suppress(ValueError, OSError):
-            content = self._read(_GRID)
-            if _digest(content) == self._digests.get(_GRID):
+            content = self._read(GRID)
+            if digest(content) == self._digests.get(GRID):
                 return json.loads(content)
         return None
 
@@ -427,9 +372,9 @@ class Store:
         """Store the grid of the statistics, and return it."""
         content = json.dumps(grid).encode()
         with self._named():
-            write_whole(self.path / _GRID, content, wait=True)
-            self._digests = self._read_manifest() | {_GRID: _digest(content)}
-            _write_manifest(self.path, self._digests)
+            write_whole(self.path / GRID, content, wait=True)
+            self._digests = self._read_manifest() | {GRID: digest(content)}
+            write_manifest(self.path, self._digests)
         return grid
 
     def take_chunk(self, other: "Store", number: int) -> None:
@@ -448,28 +393,3 @@ def _beyond(study: Mapping) -> str:
     if study["samples"] > MOST_CHUNKS * study["chunk"]:
         return f"{study['samples']} samples are more than {MOST_CHUNKS} chunks of {study['chunk']}"
     return ""
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _digest_of(digests: Mapping[str, str]) -> str:
-    return _digest(json.dumps(digests, sort_keys=True).encode())
-
-
-def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
-    write_whole(
-        path / _MANIFEST,
-        json.dumps({"digests": dict(digests), "digest": _digest_of(digests)}, indent=1).encode(),
-        wait=True,
-    )
-
-
-def _ended(content: bytes) -> bytes:
-    """Return the content followed by its CRC-32C, in the format of Zarr's codec."""
-    return content + _crc32c(content).to_bytes(4, "little")
-
-
-def _crc32c(content) -> int:
-    return needed("google_crc32c", "storing a study", "studies").value(content)  # a dependency of zarr

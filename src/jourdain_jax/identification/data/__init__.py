@@ -1,4 +1,4 @@
-"""What was measured, and what is unknown: experiments, sensors and actuators, channels, guesses and priors.
+"""Measurements and unknowns: experiments, sensors and actuators, channels, first guesses and priors.
 
-Open `experiment.py` first.
+`run_preparation.py` checks an experiment against its scene. Open `experiment.py` first.
 """

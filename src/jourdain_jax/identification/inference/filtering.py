@@ -26,11 +26,14 @@ from jourdain_jax.analysis.tangent import dependent_coordinates, others, privile
 from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, checked_real, holds, real_type
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.identification.data.channels import Channel, Instrument, StopEvent
+from jourdain_jax.identification.data.delay_filter import gauss_legendre
 from jourdain_jax.identification.data.estimate import Correlated, Estimate
 from jourdain_jax.identification.data.experiment import Data, Experiment
-from jourdain_jax.identification.data.sensors import gauss_legendre, ideal
-from jourdain_jax.identification.inference.likelihood import as_fit_options, as_runs, check_known, mapped
-from jourdain_jax.identification.solve.runs import Run, equal_runs
+from jourdain_jax.identification.data.responses import ideal
+from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, check_known
+from jourdain_jax.identification.inference.likelihood import mapped
+from jourdain_jax.identification.solve.run_groups import equal_runs
+from jourdain_jax.identification.solve.run_residuals import Run
 from jourdain_jax.integrate.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options

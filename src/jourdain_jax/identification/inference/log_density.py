@@ -22,16 +22,13 @@ from jourdain_jax.calculus.reals import Indices, Scalar, compiled, holds, is_tra
 from jourdain_jax.identification.data.estimate import Estimate, Range, positive
 from jourdain_jax.identification.data.experiment import Data
 from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.identification.inference.likelihood import (
-    as_fit_options,
-    as_runs,
-    in_all_or_none,
-    mapped,
-    of_run,
-)
+from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, in_all_or_none
+from jourdain_jax.identification.inference.likelihood import mapped, of_run
 from jourdain_jax.identification.report.fit_result import Fit
-from jourdain_jax.identification.solve.layout import Layout, PossibleInertia
-from jourdain_jax.identification.solve.runs import Run, equal_runs
+from jourdain_jax.identification.solve.body_inertia import PossibleInertia
+from jourdain_jax.identification.solve.layout import Layout
+from jourdain_jax.identification.solve.run_groups import equal_runs
+from jourdain_jax.identification.solve.run_residuals import Run
 from jourdain_jax.identification.solve.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate

@@ -1,4 +1,4 @@
-"""Results of a fit: `Fit` with its warnings and text, its page, and fits that are resumed.
+"""Results of a fit: `Fit` with its statistics, warnings, text and page, and fits that are resumed.
 
 Open `fit_result.py` first.
 """

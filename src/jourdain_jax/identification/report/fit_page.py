@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
+from jourdain_jax.identification.inference.standard_errors import RISE_95
 from jourdain_jax.identification.report.estimates import Estimates
-from jourdain_jax.identification.report.resumed_fit import RISE_95, Informed, Prediction, Profile
+from jourdain_jax.identification.report.resumed_fit import Informed, Prediction, Profile
 from jourdain_jax.scene.printing import table
 
 _WIDTH, _HEIGHT = 460, 200  # pixels

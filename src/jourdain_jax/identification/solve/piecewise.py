@@ -24,7 +24,7 @@ from jourdain_jax.identification.solve.arrow import ByMember, ByUnknown, Flags, 
 from jourdain_jax.identification.solve.layout import Place
 from jourdain_jax.identification.solve.levenberg_marquardt import Linearised
 from jourdain_jax.identification.solve.problem import Asked, Problem, closed
-from jourdain_jax.identification.solve.runs import Some
+from jourdain_jax.identification.solve.run_groups import Some
 from jourdain_jax.identification.solve.shooting import (
     NODE,
     ends_of_pieces,

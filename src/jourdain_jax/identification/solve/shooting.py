@@ -26,8 +26,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import Number, checked_real, checked_whole
+from jourdain_jax.identification.data.delay_filter import FEWEST_INTERVALS
 from jourdain_jax.identification.data.experiment import Experiment
-from jourdain_jax.identification.data.sensors import FEWEST_INTERVALS, latest
+from jourdain_jax.identification.data.responses import latest
 from jourdain_jax.integrate.inputs import Inputs, Sampled
 from jourdain_jax.integrate.state_projection import state_of
 from jourdain_jax.motion.trajectories.trajectory import Trajectory

@@ -1,0 +1,90 @@
+"""Warnings of measurements that are permitted, but probably wrong: inputs without samples over the whole run,
+gaps in a log, and angles that jump by a turn.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.calculus.reals import holds, is_traced, largest
+from jourdain_jax.identification.data.experiment import Experiment
+from jourdain_jax.integrate.inputs import Inputs, Sampled
+from jourdain_jax.scene.names import Sentences
+from jourdain_jax.scene.scene import Scene
+
+
+def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentences:
+    """Return one sentence for each oddity of `checked` runs. Traced numbers are not examined. `repeats`:
+    values have a leading axis, of which only the first entry is examined.
+    """
+    found: list[str] = []
+    for index, run in enumerate(runs):
+        for name, signal in zip(
+            scene.inputs, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False
+        ):
+            if isinstance(signal, Sampled) and not holds(
+                lambda x, *_: np.ptp(x) == 0, signal.values, signal.ts, run.ts, run.t0
+            ):
+                found += _of_input(
+                    f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1])
+                )
+        for name, values in run.values.items():
+            quantity, shown = (
+                run.sensors[name].quantity if name in run.sensors else name,
+                values[0] if repeats else values,
+            )
+            is_angle = (
+                quantity in scene.coordinate_names.entries
+                if isinstance(quantity, str)
+                else callable(quantity)
+            )
+            if is_angle and shown.ndim == 1 and not is_traced((shown, run.ts)):
+                found += _of_angle(f"channel `{name}` of run {index}", shown, run.ts)
+    return tuple(found)
+
+
+def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: float) -> Iterator[str]:
+    """Yield sentences on inputs whose samples do not cover a run, and on gaps in a log.
+
+    The last interval may be a jump, as for held commands; then the previous interval counts.
+    """
+    intervals, beyond = np.diff(ts), 1.5  # allowed distance of the ends from the run's, in intervals
+    spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
+    spans += (
+        [f"its last value from {ts[-1]:.6g} to {end:.6g} s"]
+        if end - ts[-1] > beyond * max(intervals[-2:])
+        else []
+    )
+    if spans:
+        yield (
+            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "
+            "repeat that value in its samples, otherwise give more samples, or shorter measurements"
+        )
+    usual = float(np.median(intervals))
+    (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # missing intervals
+    # share of nearly equal intervals, as in a log
+    if gaps.size and np.mean(np.abs(intervals / usual - 1) < 0.1) > 0.9:
+        k = int(gaps[0])
+        more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
+        yield (
+            f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, "
+            "where it is interpolated linearly; if this is wrong, give the samples, or shorter measurements"
+        )
+
+
+def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
+    """Yield a sentence on angles that appear wrapped: values in [-pi, pi] or [0, 2 pi] with jumps of nearly
+    one turn between neighbours.
+    """
+    known, turn = np.isfinite(values), 2 * np.pi
+    x, t = values[known], ts[known]
+    if x.size < 2 or not any(low <= x.min() and x.max() <= low + turn for low in (-np.pi, 0.0)):
+        return
+    steps = np.diff(x)
+    (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
+    if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
+        yield (
+            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn, as "
+            "a wrapped angle; coordinates are continuous: apply `np.unwrap`"
+        )

@@ -1,0 +1,145 @@
+"""Statistics of a minimum: standard errors, intervals, residuals, the fitted scene.
+
+    interval      estimate -+ q e, within the bounds; at a bound: up to a limit by profile likelihood
+    freedom       samples - rank + tr(C P)
+
+e: standard error; q: quantile (see `spread`); P: information of priors; C: covariance.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jourdain_jax.calculus.reals import Entries
+from jourdain_jax.identification.data.data_warnings import oddities
+from jourdain_jax.identification.inference.bound_limits import (
+    AtBounds,
+    moved_from_bounds,
+    too_narrow_near_bounds,
+)
+from jourdain_jax.identification.inference.information import Information, variances
+from jourdain_jax.identification.inference.standard_errors import spread
+from jourdain_jax.identification.report.motion_warnings import events_met
+from jourdain_jax.identification.solve.levenberg_marquardt import Minimum
+from jourdain_jax.identification.solve.problem import Problem
+from jourdain_jax.identification.solve.unknowns import Unknowns
+from jourdain_jax.scene.names import Sentences
+from jourdain_jax.scene.scene import Scene
+
+Counts = Int[np.ndarray, "*repeats"]
+PerRepeat = Float[np.ndarray, "*repeats"]
+PerUnknown = Float[np.ndarray, "*repeats unknowns"]
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Statistics of a minimum, apart from its position."""
+
+    scene: Scene  # with the estimates
+    starts: tuple[dict[str, Float[Entries, "..."]], ...]  # initial values of each run, with the estimates
+    sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
+    standard_errors: PerUnknown  # NaN if not identifiable
+    low: PerUnknown  # ends of the 95 % intervals; NaN if not identifiable
+    high: PerUnknown
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # without a standard error, with a one-sided interval
+    quantiles: PerUnknown  # q
+    information: Information  # covariance in blocks, and undetermined directions
+    # of each run by channel: (prediction - value) / sigma; NaN if missing
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    # residuals minus their prediction from the previous sample, if noise is correlated
+    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
+    sigma: dict[str, PerRepeat]  # of channels with estimated noise
+    correlation_time: dict[str, PerRepeat]  # s, of channels with an estimate; near zero: white
+    untold: Sentences  # channels that do not determine their sigma, in any repeat
+    chi_square: PerRepeat  # sum of squared whitened residuals; NaN if the motion fails
+    samples: Counts  # with a finite sigma
+    degrees_of_freedom: PerRepeat  # samples minus the directions that they determine; priors reduce these
+    of_rise: PerUnknown  # divisor of 2 (F - F_min), for an interval that ends where it is `RISE_95`
+    from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
+    oddities: Sentences  # sentences about oddities of the runs
+    # sentences about events before the end of a run, or missed; empty for a batch or multiple shooting
+    events_met: Sentences
+    too_narrow: Sentences  # sentences about intervals that bounds make too narrow; empty for a batch
+
+
+@np.errstate(over="ignore", invalid="ignore")  # for unknowns without bounds that grew enormously
+def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
+    """Return the statistics of the minimum."""
+    unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
+    places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
+    here = lambda x: one(x[:, places])
+    low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
+    limit = here(at_bounds.limit)
+    about = spread(problem, found, bound)
+    levels, known, reach = (
+        about.levels,
+        about.known.only() if single else about.known,
+        one(about.quantiles * about.known.standard_errors),
+    )
+    residuals, white = (
+        tuple(
+            {name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()}
+            for run in range(len(problem.runs))
+        )
+        for flag in (False, True)
+    )
+    over = lambda r: tuple(range(0 if single else 1, r.ndim))
+    samples = sum(np.sum(np.isfinite(r), axis=over(r)) for run in residuals for r in run.values())
+    determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
+
+    too_narrow = []
+    if single and found.converged[0]:
+        too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
+        if problem.asked.errors == "sigmas":
+            too_narrow += too_narrow_near_bounds(problem, found, at_bounds, about.rise.errors[0])
+    values = here(theta)
+    shared, local = unknowns.split(theta)
+    scene = unknowns.layout.scene(problem.scene, one(shared))
+    if not single:
+        scene = jax.tree.map(
+            lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))),
+            scene,
+            problem.scene,
+        )
+    return Statistics(
+        scene=scene,
+        starts=tuple(
+            unknowns.layout.start(run.start, one(shared), one(local[:, i]))
+            for i, run in enumerate(problem.runs)
+        ),
+        sizes=here(size),
+        standard_errors=known.standard_errors,
+        low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
+        high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
+        at_bound=here(bound),
+        quantiles=one(about.quantiles),
+        information=known,
+        residuals=residuals,
+        whitened=white,
+        sigma={name: one(levels.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
+        correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
+        untold=tuple(
+            name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()
+        ),
+        chi_square=np.where(
+            one(fails), np.nan, sum(np.nansum(r**2, axis=over(r)) for run in white for r in run.values())
+        ),
+        samples=np.asarray(samples),
+        degrees_of_freedom=np.asarray(samples - one(determined)),
+        of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.rise.of_rise)),
+        from_prior=(values - unknowns.prior_mean[places]) * unknowns.prior_weight[places],
+        oddities=oddities(problem.scene, problem.runs, not single),
+        events_met=events_met(problem, theta[0]) if single and problem.asked.shooting is None else (),
+        too_narrow=tuple(too_narrow),
+    )
+
+
+def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
+    """Return the number of unknowns determined by the samples: rank - tr(C P)."""
+    p, weight = len(unknowns.whitening), unknowns.prior_weight
+    rows = unknowns.whitening * weight[:p]
+    of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
+    return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, p:] @ weight[p:] ** 2
