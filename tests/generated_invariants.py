@@ -37,7 +37,7 @@ from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.scene.identity import reference_parameters
-from jourdain_jax.structure.trace import power_of_loads
+from jourdain_jax.structure.load_power import power_of_loads
 
 PUSH = 0.7  # value of the input, where a scene has one
 # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is

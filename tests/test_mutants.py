@@ -39,7 +39,7 @@ from jourdain_jax.integrate.loop import native_motion, step
 from jourdain_jax.integrate.loop.handover import Start
 from jourdain_jax.integrate.setup import Solved
 from jourdain_jax.integrate.vector_fields.field import Integrated
-from jourdain_jax.lowering import appell, kept_rows, lower
+from jourdain_jax.lowering import appell, kept_rows, lower, partial_velocities
 from jourdain_jax.models import MODELS
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
@@ -368,7 +368,7 @@ class Mutant:
 
 
 DENSE = "differs from the dense path"
-BUILD, KINEMATICS = appell.AppellOnGraph, appell._Kinematics
+BUILD, KINEMATICS = appell.AppellOnGraph, partial_velocities.Kinematics
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts
 STEPS, TIMES, ALONG, EVENT = (

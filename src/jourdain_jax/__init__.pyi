@@ -10,7 +10,7 @@ from .analysis.linearize import linearize
 from .analysis.report import report
 from .analysis.steady import steady
 from .analysis.verify import verify
-from .calculus.derivatives import DifferentiationModeError
+from .calculus.derivative_errors import DifferentiationModeError
 from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from .dynamics.newton_euler import newton_residual

@@ -29,6 +29,7 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
     smallest_pivot,
 )
+from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
     Count,
     Indices,
@@ -36,7 +37,6 @@ from jourdain_jax.calculus.reals import (
     Scalar,
     all_finite,
     array_module,
-    compiled_quickly,
     holds,
     is_traced,
     largest,

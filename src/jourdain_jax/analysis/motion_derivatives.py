@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import Entries, Indices, array_module, compiled_quickly, real_type
+from jourdain_jax.calculus.compilation import compiled_quickly
+from jourdain_jax.calculus.reals import Entries, Indices, array_module, real_type
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual

@@ -28,6 +28,7 @@ from jourdain_jax.analysis.motion_derivatives import (
     unseen,
 )
 from jourdain_jax.analysis.tangent import privileged_speeds
+from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
     Flag,
     Indices,
@@ -35,7 +36,6 @@ from jourdain_jax.calculus.reals import (
     Numbers,
     Scalar,
     check_kind,
-    compiled_quickly,
     eps_of,
     largest,
     static,

@@ -21,7 +21,7 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.stability import eigenvalues, linear_matrices, stability_speeds, upright_running
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
-from jourdain_jax.calculus.reals import compiled_quickly
+from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.integrate.result_codes import EVENT
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.rollout import Rollout, rollout

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.reals import Indices, Scalar, compiled_quickly, real_type
+from jourdain_jax.calculus.compilation import compiled_quickly
+from jourdain_jax.calculus.reals import Indices, Scalar, real_type
 from jourdain_jax.scene.names import Labels, Sentences, check_name
 
 PerHanging = Float[Array, "hangings"]

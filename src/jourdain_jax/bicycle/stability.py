@@ -36,7 +36,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
 from jourdain_jax.analysis.linearize import linearize
-from jourdain_jax.calculus.reals import Flag, Scalar, compiled_quickly, real_type
+from jourdain_jax.calculus.compilation import compiled_quickly
+from jourdain_jax.calculus.reals import Flag, Scalar, real_type
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 

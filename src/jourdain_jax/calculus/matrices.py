@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import Count, rank_cutoff, with_usual_promotion
+from jourdain_jax.calculus.compilation import with_usual_promotion
+from jourdain_jax.calculus.reals import Count, rank_cutoff
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))

@@ -32,17 +32,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import (
-    Count,
-    Flag,
-    Scalar,
-    all_finite,
-    eps_of,
-    largest,
-    tiny_of,
-    with_usual_promotion,
-)
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, all_finite, eps_of, largest, tiny_of
 
 Unknowns = Float[Array, "unknowns"]
 

@@ -28,8 +28,8 @@ from jourdain_jax.equations.scene_parts import has_load_without_potential
 from jourdain_jax.equations.virtual_power import potential_energy
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.load_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.structure.structure import Structure, structure_of
-from jourdain_jax.structure.trace import explicit_rate, forces_for_potentials, power_of_loads
 
 
 class Power(eqx.Module):

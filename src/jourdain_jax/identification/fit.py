@@ -18,7 +18,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from jourdain_jax.calculus.derivatives import DifferentiationModeError
+from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.reals import checked_whole, is_traced
 from jourdain_jax.identification.data.estimate import Estimate, Range
 from jourdain_jax.identification.data.experiment import Data, Experiment

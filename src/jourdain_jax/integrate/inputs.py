@@ -27,12 +27,12 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jourdain_jax.calculus.compilation import compiled
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.calculus.reals import (
     PerLane,
     as_real,
     checked_unless_traced,
-    compiled,
     described,
     in_default_precision,
     is_traced,

@@ -12,13 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.derivatives import (
-    SECOND_ORDER_MESSAGE,
-    DifferentiationModeError,
-    Rules,
-    pushed_by_jax,
-    with_rules,
-)
+from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE, DifferentiationModeError
+from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_rules
 from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays

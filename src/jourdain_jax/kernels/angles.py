@@ -18,7 +18,8 @@ Arithmetic (2018), chapter 4.
 import math
 from collections.abc import Callable, Sequence
 
-from jourdain_jax.kernels.ir import Value, Writer
+from jourdain_jax.kernels.ir import Writer
+from jourdain_jax.kernels.ir_value import Value
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
 DoubleDouble = tuple[Value, Value]  # head and low part

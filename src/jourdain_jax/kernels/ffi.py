@@ -23,7 +23,8 @@ import numpy as np
 from jax.interpreters import mlir
 
 from jourdain_jax.kernels import host, nvidia
-from jourdain_jax.kernels.ir import Value, Writer
+from jourdain_jax.kernels.ir import Writer
+from jourdain_jax.kernels.ir_value import Value
 
 HANDLER, KERNEL = "handler", "kernel"
 WORDS, MOST_BUFFERS = 4, 16  # words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays

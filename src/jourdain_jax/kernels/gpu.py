@@ -20,7 +20,8 @@ import numpy as np
 from jax.interpreters import mlir
 
 from jourdain_jax.kernels import ffi, host, nvidia
-from jourdain_jax.kernels.ir import Value, Writer
+from jourdain_jax.kernels.ir import Writer
+from jourdain_jax.kernels.ir_value import Value
 
 _TARGET = "jourdain_jax_on_gpu"
 MOST_KERNELS = 4096  # per process

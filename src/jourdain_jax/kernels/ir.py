@@ -4,61 +4,16 @@
 literals. No flags allow LLVM to change results: every lane is rounded as written here, whatever the width.
 
 On a GPU (`device`) every thread runs the same code with its own lane; the threads of a warp meet
-(`together`) where the loop over steps continues. Local values stay in registers only in inlined functions:
-those called once, and small ones.
+(`together`) where the loop over steps continues.
 """
 
-import re
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
-_COMPARED = {
-    "lt": ("olt", "slt"),
-    "le": ("ole", "sle"),
-    "gt": ("ogt", "sgt"),
-    "ge": ("oge", "sge"),
-    "eq": ("oeq", "eq"),
-    "ne": ("une", "ne"),
-}
-
-
-def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
-    """Return the method of values that appends this operation or comparison; `turned`: with swapped operands."""
-
-    def appended(self: "Value", other) -> "Value":
-        a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)
-        return (self.writer.compared if op in _COMPARED else self.writer.binary)(op, a, b)
-
-    return appended
-
-
-@dataclass(frozen=True, eq=False)
-class Value:
-    """Result of an instruction, an argument or a literal."""
-
-    writer: "Writer"
-    type: str
-    name: str
-    place: str = ""  # its memory location, if loaded or stored
-
-    __add__ = __radd__ = _operator("add")
-    __sub__, __rsub__ = _operator("sub"), _operator("sub", turned=True)
-    __mul__ = __rmul__ = _operator("mul")
-    __truediv__, __rtruediv__ = _operator("div"), _operator("div", turned=True)
-    __lt__, __le__ = _operator("lt"), _operator("le")
-    __gt__, __ge__ = _operator("gt"), _operator("ge")
-    equals, differs = _operator("eq"), _operator("ne")  # NaN is equal to nothing
-    __and__, __or__, __xor__ = _operator("and"), _operator("or"), _operator("xor")
-
-    def __neg__(self) -> "Value":
-        return self.writer.instruction(self.type, f"fneg {self.type} {self.name}")
-
-    def __invert__(self) -> "Value":
-        return self ^ -1
+from jourdain_jax.kernels.inline_attributes import with_inlining
+from jourdain_jax.kernels.ir_value import COMPARED, Value
 
 
 class Writer:
@@ -84,7 +39,7 @@ class Writer:
     def text(self) -> str:
         """Return the text of the module."""
         whole = "\n".join([*self._lines, *self._declared.values(), ""])
-        return _inlined(whole) if self.device else whole
+        return with_inlining(whole) if self.device else whole
 
     # functions and control
 
@@ -219,7 +174,7 @@ class Writer:
         found = self.truth if a.type.startswith("<") else "i1"
         return self.instruction(
             found,
-            f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}",
+            f"{'fcmp' if real else 'icmp'} {COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}",
         )
 
     def is_nan(self, a: Value) -> Value:
@@ -406,36 +361,3 @@ class Writer:
         place = self.at(pointer, index, value.type).name
         self._lines.append(f"  store {value.type} {value.name}, ptr {place}")
         return replace(value, place=place)
-
-
-def _inlined(text: str) -> str:
-    """Return a module that inlines small functions and those called once, and marks all others `noinline`."""
-    parts = {
-        found[1]: found[0]
-        for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)
-    }
-    calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
-    sizes: dict[str, int] = {}
-
-    def sites(name: str) -> int:
-        return sum(counts[name] for counts in calls.values())
-
-    def size(name: str) -> int:
-        if name not in sizes:
-            written_out = {
-                inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)
-            }
-            sizes[name] = parts[name].count("\n") + sum(
-                count * size(inner) for inner, count in written_out.items()
-            )
-        return sizes[name]
-
-    def is_small(name: str) -> bool:
-        # inline a function on a GPU up to 10_000 lines in total
-        return sites(name) == 1 or sites(name) * size(name) <= 10_000
-
-    for name, part in parts.items():
-        if " internal " in (head := part.split("\n", 1)[0]):
-            plain = head.replace(" noinline", "").replace(" alwaysinline", "").removesuffix(" {")
-            text = text.replace(head, f"{plain} {'alwaysinline' if is_small(name) else 'noinline'} {{")
-    return text

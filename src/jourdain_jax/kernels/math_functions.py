@@ -19,7 +19,8 @@ from functools import partial
 from jourdain_jax.calculus.scalar_operations import COMPARISONS
 from jourdain_jax.kernels import angles
 from jourdain_jax.kernels.angles import WHOLE, polynomial, product_less, quotient, two_product, two_sum
-from jourdain_jax.kernels.ir import Value, Writer
+from jourdain_jax.kernels.ir import Writer
+from jourdain_jax.kernels.ir_value import Value
 
 DoubleDouble = tuple[Value, Value]  # head and low part
 

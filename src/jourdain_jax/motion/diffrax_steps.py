@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
+from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE
+from jourdain_jax.calculus.derivatives import by_modes
 from jourdain_jax.calculus.reals import at_index, static
 from jourdain_jax.integrate import event_search, integrands, result_codes
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter

@@ -25,16 +25,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.compilation import RUN_SELDOM
 from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import (
-    RUN_SELDOM,
-    Count,
-    Flag,
-    Scalar,
-    at_index,
-    eps_of,
-    in_default_precision,
-)
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, at_index, eps_of, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from jourdain_jax.calculus.compilation import with_nan_as_a_mark
 from jourdain_jax.calculus.reals import (
     at_index,
     checked_real,
@@ -25,7 +26,6 @@ from jourdain_jax.calculus.reals import (
     known_numbers,
     real_type,
     static,
-    with_nan_as_a_mark,
 )
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.explicit_steps import Taylor

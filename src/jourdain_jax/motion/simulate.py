@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.compilation import nan_is_a_mark
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import (
     Number,
@@ -22,7 +23,6 @@ from jourdain_jax.calculus.reals import (
     described,
     is_traced,
     known_numbers,
-    nan_is_a_mark,
     nothing_is_traced,
     real_type,
 )

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
     Number,
     Numbers,
     all_finite,
     at_once,
     check_kind,
-    compiled_quickly,
     described,
     eps_of,
     is_traced,

@@ -4,7 +4,6 @@ Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a
 square roots, sin(-x), cos(-x). Arguments of sums and products are ordered, so that a b and b a are one node.
 """
 
-import heapq
 import math
 import threading
 from collections import Counter
@@ -392,27 +391,6 @@ class Graph:
     def operations(self, outputs: Iterable[int]) -> int:
         """Return the number of operations on varying quantities."""
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
-
-    def more_operations(self, a: int, b: int) -> int:
-        """Return how many more operations node a needs than node b, not counting shared ones."""
-        if a == b:
-            return 0
-        needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]
-        unshared, more = 2, 0
-        while unshared:  # pending nodes that only one of the two needs
-            node = -heapq.heappop(newest_first)
-            who = needed_by[node]
-            if who != 3:
-                unshared -= 1
-                if self.varies[node] and self.op[node] in OPERATIONS:
-                    more += 1 if who == 1 else -1
-            for arg in self.args[node]:
-                before = needed_by.get(arg, 0)
-                if not before:
-                    heapq.heappush(newest_first, -arg)
-                needed_by[arg] = before | who
-                unshared += (needed_by[arg] != 3) - (before in (1, 2))
-        return more
 
 
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}

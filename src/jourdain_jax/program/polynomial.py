@@ -12,6 +12,7 @@ from functools import reduce
 from operator import and_
 
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
+from jourdain_jax.program.subgraph import more_operations
 
 Monomial = tuple[int, ...]  # atoms in order, repeated by their power
 Polynomial = dict[Monomial, float]
@@ -63,7 +64,7 @@ class NormalForms:
             form = self.rebuilt(self.expanded(node))
         except TooLarge:
             return node
-        return form if self.graph.more_operations(form, node) <= 0 else node
+        return form if more_operations(self.graph, form, node) <= 0 else node
 
     # expansion
 

@@ -1,10 +1,11 @@
-"""Extraction of the part of a graph that some nodes need."""
+"""Parts of a graph that some nodes need: extraction, and comparison of their sizes."""
 
+import heapq
 from collections.abc import Iterable
 
 import numpy as np
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import OPERATIONS, Graph
 
 
 def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
@@ -18,3 +19,25 @@ def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
     for n in kept:
         place[n] = found.like(graph, n, tuple(place[list(graph.args[n])].tolist()))
     return found, place
+
+
+def more_operations(graph: Graph, a: int, b: int) -> int:
+    """Return how many more operations node a needs than node b, not counting shared ones."""
+    if a == b:
+        return 0
+    needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]
+    unshared, more = 2, 0
+    while unshared:  # pending nodes that only one of the two needs
+        node = -heapq.heappop(newest_first)
+        who = needed_by[node]
+        if who != 3:
+            unshared -= 1
+            if graph.varies[node] and graph.op[node] in OPERATIONS:
+                more += 1 if who == 1 else -1
+        for arg in graph.args[node]:
+            before = needed_by.get(arg, 0)
+            if not before:
+                heapq.heappush(newest_first, -arg)
+            needed_by[arg] = before | who
+            unshared += (needed_by[arg] != 3) - (before in (1, 2))
+    return more

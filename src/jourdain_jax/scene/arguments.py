@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import DifferentiationModeError
+from jourdain_jax.calculus.compilation import with_usual_promotion
+from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.reals import (
     Entries,
     Scalar,
@@ -32,7 +33,6 @@ from jourdain_jax.calculus.reals import (
     described,
     is_traced,
     real_type,
-    with_usual_promotion,
 )
 from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene

@@ -34,7 +34,7 @@ from jourdain_jax.structure.assembly import (
     speed_scales,
     typical_lengths,
 )
-from jourdain_jax.structure.plausibility import Numbers
+from jourdain_jax.structure.scene_numbers import Numbers
 from jourdain_jax.structure.trace import TracedScene, named_values, traced_scene
 
 SparseRows = list[dict[int, int]]  # by row: variable -> node of the derivative

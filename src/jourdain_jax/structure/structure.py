@@ -9,25 +9,34 @@ class's defaults), so that the choice is static.
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, is_traced, largest
+from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, is_traced
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import speed_scales, typical_row_lengths
 from jourdain_jax.structure.plausibility import sentences
-from jourdain_jax.structure.probes import TIMED, Probed, follow_from_others, probed_on_graph
+from jourdain_jax.structure.probe_findings import (
+    RANDOM_PROBES,
+    at_probes,
+    check_inertia,
+    exceeds,
+    far_rows,
+    is_singular,
+    moves,
+    sizes,
+    speed_terms,
+)
+from jourdain_jax.structure.probes import TIMED, follow_from_others
 from jourdain_jax.structure.rank import (
-    Scaled,
     best_privileged,
     contradictions,
     named_speeds,
@@ -37,10 +46,9 @@ from jourdain_jax.structure.rank import (
     scaled_states,
     worst_pivot,
 )
-from jourdain_jax.structure.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
+from jourdain_jax.structure.sampling import drawn_states, no_numbers, usable_states
 from jourdain_jax.structure.smoothness import kinks
 
-RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is the default
 
 
@@ -150,60 +158,6 @@ class Structure:
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
 
-def _moves(rates: np.ndarray) -> bool:
-    """Return whether any rate is a number other than zero."""
-    return bool(np.any(np.isfinite(rates) & (rates != 0)))
-
-
-def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
-    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because
-    constraints may have any unit.
-    """
-    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
-    return bool(np.any(np.abs(difference) > tolerance * size))
-
-
-def _sizes(found: Probed) -> np.ndarray:
-    """Return the largest entry of every row, at every state."""
-    return largest(found.A, 2)
-
-
-def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    try:
-        found = probed_on_graph(scene, t, q, u, u_other, generic)
-        if not found.in_calls:
-            return found
-        # the graph does not show how calls behave away from the probes, so a few distant states are probed
-        generator, count = np.random.default_rng(1), 16
-        far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
-        for first, _ in scene.coordinates.quaternions:
-            far[1][:, first : first + 4] = q[:count, first : first + 4]
-        u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
-        beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
-        return replace(
-            found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u))
-        )
-    except Unsupported as reason:
-        raise ValueError(
-            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
-            "that part a rule with `jax.custom_jvp`"
-        ) from None
-
-
-def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
-    """Return the quantities that are nonzero at distant states; for constraints, above round-off."""
-    some = np.sqrt(eps_of(found.A))
-    seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
-    rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
-    rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
-    return frozenset(seen | rows)
-
-
-def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
-    """Return the sizes of the terms of every constraint at the probed speeds."""
-    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
-
-
 def structure_of(scene: Scene) -> Structure:
     """Return static facts about a scene: rank of its constraints, privileged velocities and their
     conditioning, kinds of constraints; eqs. (25)-(31).
@@ -266,7 +220,7 @@ def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
     for drawn in drawn_states(scene, RANDOM_PROBES, np.random.default_rng(0)):
-        t, u, generic, found = _at_probes(scene, *drawn)
+        t, u, generic, found = at_probes(scene, *drawn)
         if (np.isfinite(found.error) & all_finite(found.A, axis=(1, 2)))[generic].any():
             break
     on_rows = usable_states(scene, found, generic)
@@ -299,7 +253,7 @@ def _probed_structure(scene: Scene) -> Structure:
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is reported as a fault instead
-        _check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
+        check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
@@ -312,17 +266,17 @@ def _probed_structure(scene: Scene) -> Structure:
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
     acts, at_rest = (
-        lambda name: name in unproved or _moves(found.vanishing[name]),
+        lambda name: name in unproved or moves(found.vanishing[name]),
         found.vanishing["rows at rest"],
     )
-    affine = "nonlinear" not in unproved and not _exceeds(
-        found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]
+    affine = "nonlinear" not in unproved and not exceeds(
+        found.A - found.A_other, np.sqrt(eps), sizes(found)[..., None]
     )
     # near round-off: integrating zero work does less harm than omitting work
-    homogeneous = "rows at rest" not in unproved and not _exceeds(at_rest, 32 * eps, _speeds(found, u))
+    homogeneous = "rows at rest" not in unproved and not exceeds(at_rest, 32 * eps, speed_terms(found, u))
     rows_of_inputs = acts("rows of inputs")
     # smaller numbers may be errors of tables and iterations
-    asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))
+    asks_for_motion = exceeds(at_rest, np.sqrt(eps), speed_terms(found, u))
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
         faults = contradictions(
@@ -335,7 +289,7 @@ def _probed_structure(scene: Scene) -> Structure:
     # last, since the replacement of a traced direction must not hide another fault
     faults = faults or sentences(scene, found.numbers, "gravity")
     redundant = redundant_rows(
-        scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn)
+        scaled, found.error, ranks, generic, names, lambda: far_rows(scene, typical, *drawn)
     )
     return Structure(
         row_names=names,
@@ -357,7 +311,7 @@ def _probed_structure(scene: Scene) -> Structure:
         homogeneous=homogeneous,
         timed=tuple(filter(acts, TIMED)),
         driven=acts("motion at rest"),
-        massless=_is_singular(scaled.M[generic]),
+        massless=is_singular(scaled.M[generic]),
         varying_inertia=acts("inertia"),
         potentials_of_inputs=tuple(
             sorted(
@@ -380,60 +334,6 @@ def _probed_structure(scene: Scene) -> Structure:
         closure_slopes=found.G[generic][:4],
         row_slopes=found.A[generic][:4],
     )
-
-
-def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
-    symmetric = symmetric_configurations(scene)
-    t, q, u = (
-        np.concatenate([t, np.zeros(len(symmetric))]),
-        np.concatenate([q, symmetric]),
-        np.concatenate([u, u[:1].repeat(len(symmetric), 0)]),
-    )
-    generic = np.arange(len(t)) < RANDOM_PROBES
-    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
-
-
-def _is_singular(M: np.ndarray) -> bool:
-    """Return whether scaled inertias are singular at all states."""
-    return bool(M.size) and bool(
-        np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M))
-    )
-
-
-def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
-    """Raise ValueError for speeds along which free motion has no inertia at every generic state."""
-    moved = []
-    for A, M, c in zip(found.A, found.M, found.c, strict=True):
-        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
-        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
-        if not sizes.size or sizes[0] > 16 * len(M) * eps_of(M):
-            return
-        moved.append(np.abs(c * (free @ directions[:, 0])))
-    if not moved:
-        return
-    share = np.median([x / x.max() for x in moved], axis=0)
-    moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
-    names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
-    raise ValueError(
-        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
-        "constraint determines it; give a body that moves with it a mass (or inertia), add a constraint, or "
-        "omit the coordinate"
-    )
-
-
-def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
-    """Return scaled rows at states on the geometric constraints whose coordinates differ from the given ones
-    by up to half a turn.
-    """
-    generator = np.random.default_rng(4)
-    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
-    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
-    for first, _ in scene.coordinates.quaternions:
-        turned[:, first : first + 4] = q[:, first : first + 4]
-    found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
-    good = np.isfinite(found.error) & all_finite(found.A, axis=(1, 2))
-    return at_index(scaled_states(found, typical), good)
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

@@ -20,21 +20,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Num, PyTree
 
-from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
 from jourdain_jax.equations.contact_state import At
-from jourdain_jax.equations.kinematics import (
-    coordinate_rates,
-    inertias_of,
-    motion_at,
-    of_bodies,
-    pose_at,
-    velocities_of,
-)
+from jourdain_jax.equations.kinematics import inertias_of, motion_at, of_bodies, velocities_of
 from jourdain_jax.equations.phases import contact_changes, contact_events, contacts_at_start, put_back
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.scene_parts import names_of_bodies, names_of_position_rows
@@ -50,12 +41,12 @@ from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
 from jourdain_jax.scene.identity import once_per_class
-from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.modes import Event
-from jourdain_jax.scene.motion_state import Motion, Pose
+from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene, state_names
-from jourdain_jax.scene.user_methods import events_of, loads_of, potential_of
-from jourdain_jax.structure.plausibility import Numbers, numbers_of
+from jourdain_jax.scene.user_methods import events_of, loads_of
+from jourdain_jax.structure.load_power import explicit_power, stored_by_inputs
+from jourdain_jax.structure.scene_numbers import Numbers, numbers_of
 
 PerBody = Num[Entries, "bodies 3"]
 
@@ -359,90 +350,3 @@ def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
     named["closure"] = named["phi"] = [f"constraint `{name}`" for name in names_of_position_rows(scene)]
     pairs = [pair for field, nodes in fields.items() for pair in zip(named[field], nodes, strict=False)]
     return {node: owner for owner, nodes in reversed(pairs) for node in np.ravel(nodes).tolist()}
-
-
-def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
-    """Return the potential energy in J of the loads with the indices `of_inputs`."""
-    loads = tuple(loads_of(scene, motion))
-    return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
-
-
-def explicit_power(
-    scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None
-) -> Scalar:
-    """Return the part of `rate_of_work` without accelerations, in W: of loads without a potential, and of
-    potentials that depend on time or on inputs.
-
-    sum F.v + L.omega + Q_k u_k loads without a potential dV/dt at fixed poses potentials that depend on time
-    F_i.v + L_i.omega + Q_i u - dV_i/dt loads whose potential depends on inputs, in place of that potential
-
-    `loads`: the scene's loads at this motion, if already known.
-    """
-    by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(
-        scene, motion, potential_energy
-    )
-    return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
-
-
-def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
-    """Return the rate of the scene's own potential due to poses that move while `u = 0`. Its forces act on
-    the speeds, and so do no work in this motion.
-    """
-    if potential_of(scene, motion.pose()) is None:
-        return jnp.zeros_like(motion.t)
-    t, q = motion.t, motion.q.array
-    nu = coordinate_rates(scene, t, q, jnp.zeros_like(motion.u.array))
-    along = (t, q), (jnp.ones_like(t), nu)
-    held = motion.pose().bodies
-    whole = jax.jvp(lambda t, q: potential_of(scene, pose_at(scene, t, q)), *along)[1]
-    return (
-        whole
-        - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
-    )
-
-
-def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
-    """Return the power in W of the loads `of_inputs` minus the explicit rate of their stored energy."""
-    if not of_inputs:
-        return jnp.zeros_like(motion.t)
-    stored = explicit_rate(scene, motion, lambda scene, motion: stored_by_inputs(scene, motion, of_inputs))
-    return power_of_loads(scene, motion, among=of_inputs) - stored
-
-
-def power_of_loads(
-    scene: Scene,
-    motion: Motion,
-    *,
-    conservative: bool | None = None,
-    among: Indices | None = None,
-    loads: tuple[Load, ...] | None = None,
-) -> Scalar:
-    """Return `sum F.v + L.omega + Q_k u_k` in W, over the loads with a potential (`conservative=True`),
-    without one (`False`), or with the indices `among`.
-
-    `loads`: as in `explicit_power`.
-    """
-    total = resultants(scene, motion, conservative=conservative, among=among, loads=loads)
-    v = of_bodies(motion, "velocity")
-    omega = of_bodies(motion, "angular_velocity")
-    return jnp.sum(total.force * v) + jnp.sum(total.torque * omega) + total.direct @ motion.u.array
-
-
-def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
-    """Return `dV/dt` of a `potential` with fixed poses, and with the coordinates moving as at `u = 0`."""
-    q = motion.q.array
-    nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
-
-    def V(t, q):
-        held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
-        return potential(scene, held)
-
-    return jax.jvp(_only_what_is_needed(V, motion.t, q), (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
-
-
-def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """Return `f` reduced to the operations that its result needs, so that unused forces of the same loads may
-    lack a derivative.
-    """
-    pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
-    return lambda *given: pruned(*given)[0]

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import nan_is_a_mark
+from jourdain_jax.calculus.compilation import nan_is_a_mark
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.motion.rollout import rollout
 from jourdain_jax.motion.sensitivity import SensitivityWarning

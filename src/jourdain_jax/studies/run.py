@@ -22,8 +22,9 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from jourdain_jax.calculus.compilation import nan_is_a_mark
 from jourdain_jax.calculus.lazy_imports import version_of
-from jourdain_jax.calculus.reals import nan_is_a_mark, real_type
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.rollout import rollout
 from jourdain_jax.motion.trajectories.labels import OF_LANES
 from jourdain_jax.scene.arguments import warn

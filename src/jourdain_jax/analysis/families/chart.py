@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.families.critical import CriticalPoint, Special, followed_to, special_at
 from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, family
-from jourdain_jax.calculus.reals import Number, Scalar, compiled_quickly
+from jourdain_jax.calculus.compilation import compiled_quickly
+from jourdain_jax.calculus.reals import Number, Scalar
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.printing import Printed

@@ -26,7 +26,8 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
-from jourdain_jax.calculus.reals import Indices, compiled_quickly, largest, static
+from jourdain_jax.calculus.compilation import compiled_quickly
+from jourdain_jax.calculus.reals import Indices, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines

@@ -29,6 +29,7 @@ from jourdain_jax.analysis.families.equations import Look, Motions, Vector, size
 from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.spectrum import Modes
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, instant_of, places_of, unseen
+from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import (
     Flag,
@@ -38,7 +39,6 @@ from jourdain_jax.calculus.reals import (
     all_finite,
     checked_real,
     checked_whole,
-    compiled_quickly,
     known_numbers,
     largest,
     static,

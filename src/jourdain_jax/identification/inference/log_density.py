@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Indices, Scalar, compiled, holds, is_traced, real_type, static
+from jourdain_jax.calculus.compilation import compiled
+from jourdain_jax.calculus.reals import Indices, Scalar, holds, is_traced, real_type, static
 from jourdain_jax.identification.data.estimate import Estimate, Range, positive
 from jourdain_jax.identification.data.experiment import Data
 from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits

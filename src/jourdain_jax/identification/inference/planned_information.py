@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, compiled, is_traced, static
+from jourdain_jax.calculus.compilation import compiled
+from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, is_traced, static
 from jourdain_jax.identification.data.estimate import Estimate, Range
 from jourdain_jax.identification.data.experiment import Data, Experiment
 from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs

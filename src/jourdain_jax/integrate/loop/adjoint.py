@@ -62,7 +62,7 @@ from jourdain_jax.integrate.loop.step import near_rank_loss, put_near_rows, squa
 from jourdain_jax.integrate.loop.transitions import is_noted, reset_back, write_reset_back
 from jourdain_jax.integrate.loop.value_kernels import called
 from jourdain_jax.kernels.ffi import OfLane, of_lane, taken_in, write_handler
-from jourdain_jax.kernels.ir import Value
+from jourdain_jax.kernels.ir_value import Value
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:

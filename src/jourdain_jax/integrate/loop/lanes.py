@@ -24,7 +24,8 @@ from itertools import pairwise
 from typing import Any
 
 from jourdain_jax.calculus.reals import Indices
-from jourdain_jax.kernels.ir import Value, Writer
+from jourdain_jax.kernels.ir import Writer
+from jourdain_jax.kernels.ir_value import Value
 from jourdain_jax.kernels.math_functions import power
 from jourdain_jax.lowering.lowered_equations import Lowered
 

@@ -21,7 +21,8 @@ from itertools import groupby
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
+from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
+from jourdain_jax.calculus.derivatives import filled, is_zero
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.loop.handover import Found, Start, constant_rows
@@ -63,7 +64,7 @@ from jourdain_jax.kernels.ffi import (
     taken_in,
     write_handler,
 )
-from jourdain_jax.kernels.ir import Value
+from jourdain_jax.kernels.ir_value import Value
 
 Loop = Callable[[Start], Found]
 

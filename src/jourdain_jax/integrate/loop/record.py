@@ -16,7 +16,7 @@ from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, copied, each_row, room_of_lanes
 from jourdain_jax.integrate.loop.loop import COUNT, NEXT, OWN, STARTS, TIMES
 from jourdain_jax.kernels.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, of_lane, taken_in
-from jourdain_jax.kernels.ir import Value
+from jourdain_jax.kernels.ir_value import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 

@@ -10,7 +10,7 @@ shape (rows, knots). Lanes may share them: with T tables, lane i of N uses numbe
 
 from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter
 from jourdain_jax.kernels.ffi import Given, last_size, product
-from jourdain_jax.kernels.ir import Value
+from jourdain_jax.kernels.ir_value import Value
 
 # words of a job: pointers to tables and knots, their numbers, samples per table, knots per row
 WORDS_OF_SAMPLES = 6

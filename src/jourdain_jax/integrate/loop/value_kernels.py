@@ -26,14 +26,8 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import (
-    OtherDeviceError,
-    Rules,
-    differentiated_as,
-    filled,
-    is_zero,
-    with_rules,
-)
+from jourdain_jax.calculus.derivative_errors import OtherDeviceError
+from jourdain_jax.calculus.derivatives import Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, lanes_of
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.loop.lanes import MachineWriter

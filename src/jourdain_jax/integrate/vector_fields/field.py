@@ -29,8 +29,9 @@ from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.load_power import stored_by_inputs
 from jourdain_jax.structure.structure import Structure
-from jourdain_jax.structure.trace import event_resets, event_values, stored_by_inputs
+from jourdain_jax.structure.trace import event_resets, event_values
 
 _STATES = ("auto", "minimal", "full")
 

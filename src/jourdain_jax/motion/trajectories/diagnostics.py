@@ -6,15 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import (
-    Count,
-    Scalar,
-    eps_of,
-    largest,
-    passing_cutoff,
-    static,
-    with_nan_as_a_mark,
-)
+from jourdain_jax.calculus.compilation import with_nan_as_a_mark
+from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, static
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.integrate.inputs import Constant, Mode, Sampled

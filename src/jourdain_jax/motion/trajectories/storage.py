@@ -30,9 +30,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.compilation import with_nan_as_a_mark
 from jourdain_jax.calculus.files import FilePath, check_depth, check_place, opened, parsed, write_whole
 from jourdain_jax.calculus.lazy_imports import version_of
-from jourdain_jax.calculus.reals import at_index, described, with_nan_as_a_mark
+from jourdain_jax.calculus.reals import at_index, described
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.integrate.inputs import Inputs, Mode, Sampled
 from jourdain_jax.motion.retries import RERUN_FIELDS

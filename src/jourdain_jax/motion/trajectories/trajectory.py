@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.compilation import nan_is_a_mark
 from jourdain_jax.calculus.markers import nan_where
-from jourdain_jax.calculus.reals import checked_real, nan_is_a_mark
+from jourdain_jax.calculus.reals import checked_real
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at

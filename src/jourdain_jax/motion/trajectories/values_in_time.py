@@ -9,17 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import (
-    Count,
-    Scalar,
-    Speeds,
-    Vector3,
-    at_index,
-    is_traced,
-    static,
-    with_nan_as_a_mark,
-    with_usual_promotion,
-)
+from jourdain_jax.calculus.compilation import with_nan_as_a_mark, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at

@@ -1,0 +1,40 @@
+"""Attributes by which LLVM inlines functions of a GPU module: small ones, and those called once.
+
+Only in inlined functions do local values stay in registers.
+"""
+
+import re
+from collections import Counter
+
+
+def with_inlining(text: str) -> str:
+    """Return a module that inlines small functions and those called once, and marks all others `noinline`."""
+    parts = {
+        found[1]: found[0]
+        for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)
+    }
+    calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
+    sizes: dict[str, int] = {}
+
+    def sites(name: str) -> int:
+        return sum(counts[name] for counts in calls.values())
+
+    def size(name: str) -> int:
+        if name not in sizes:
+            written_out = {
+                inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)
+            }
+            sizes[name] = parts[name].count("\n") + sum(
+                count * size(inner) for inner, count in written_out.items()
+            )
+        return sizes[name]
+
+    def is_small(name: str) -> bool:
+        # inline a function on a GPU up to 10_000 lines in total
+        return sites(name) == 1 or sites(name) * size(name) <= 10_000
+
+    for name, part in parts.items():
+        if " internal " in (head := part.split("\n", 1)[0]):
+            plain = head.replace(" noinline", "").replace(" alwaysinline", "").removesuffix(" {")
+            text = text.replace(head, f"{plain} {'alwaysinline' if is_small(name) else 'noinline'} {{")
+    return text

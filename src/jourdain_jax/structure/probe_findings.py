@@ -1,0 +1,124 @@
+"""Probes of a scene, and what they show: which quantities vanish or change, and which speeds have no inertia."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jourdain_jax.calculus.reals import all_finite, at_index, eps_of, largest
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.probes import Probed, probed_on_graph
+from jourdain_jax.structure.rank import Scaled, scaled_states
+from jourdain_jax.structure.sampling import symmetric_configurations
+
+RANDOM_PROBES = 24
+
+
+def moves(rates: np.ndarray) -> bool:
+    """Return whether any rate is a number other than zero."""
+    return bool(np.any(np.isfinite(rates) & (rates != 0)))
+
+
+def exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
+    """Return whether any entry exceeds `tolerance` times the size of its row. Sizes are relative because
+    constraints may have any unit.
+    """
+    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
+    return bool(np.any(np.abs(difference) > tolerance * size))
+
+
+def sizes(found: Probed) -> np.ndarray:
+    """Return the largest entry of every row, at every state."""
+    return largest(found.A, 2)
+
+
+def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    try:
+        found = probed_on_graph(scene, t, q, u, u_other, generic)
+        if not found.in_calls:
+            return found
+        # the graph does not show how calls behave away from the probes, so a few distant states are probed
+        generator, count = np.random.default_rng(1), 16
+        far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
+        for first, _ in scene.coordinates.quaternions:
+            far[1][:, first : first + 4] = q[:count, first : first + 4]
+        u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
+        beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
+        return replace(
+            found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u))
+        )
+    except Unsupported as reason:
+        raise ValueError(
+            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
+            "that part a rule with `jax.custom_jvp`"
+        ) from None
+
+
+def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
+    """Return the quantities that are nonzero at distant states; for constraints, above round-off."""
+    some = np.sqrt(eps_of(found.A))
+    seen = {name for name, rates in found.vanishing.items() if moves(rates)} - {"rows at rest"}
+    rows = (
+        {"rows at rest"} if exceeds(found.vanishing["rows at rest"], some, speed_terms(found, u)) else set()
+    )
+    rows |= {"nonlinear"} if exceeds(found.A - found.A_other, some, sizes(found)[..., None]) else set()
+    return frozenset(seen | rows)
+
+
+def speed_terms(found: Probed, u: np.ndarray) -> np.ndarray:
+    """Return the sizes of the terms of every constraint at the probed speeds."""
+    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
+
+
+def at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
+    """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
+    symmetric = symmetric_configurations(scene)
+    t, q, u = (
+        np.concatenate([t, np.zeros(len(symmetric))]),
+        np.concatenate([q, symmetric]),
+        np.concatenate([u, u[:1].repeat(len(symmetric), 0)]),
+    )
+    generic = np.arange(len(t)) < RANDOM_PROBES
+    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
+
+
+def is_singular(M: np.ndarray) -> bool:
+    """Return whether scaled inertias are singular at all states."""
+    return bool(M.size) and bool(
+        np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M))
+    )
+
+
+def check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
+    """Raise ValueError for speeds along which free motion has no inertia at every generic state."""
+    moved = []
+    for A, M, c in zip(found.A, found.M, found.c, strict=True):
+        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
+        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
+        if not sizes.size or sizes[0] > 16 * len(M) * eps_of(M):
+            return
+        moved.append(np.abs(c * (free @ directions[:, 0])))
+    if not moved:
+        return
+    share = np.median([x / x.max() for x in moved], axis=0)
+    moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
+    names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
+    raise ValueError(
+        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
+        "constraint determines it; give a body that moves with it a mass (or inertia), add a constraint, or "
+        "omit the coordinate"
+    )
+
+
+def far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
+    """Return scaled rows at states on the geometric constraints whose coordinates differ from the given ones
+    by up to half a turn.
+    """
+    generator = np.random.default_rng(4)
+    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
+    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
+    for first, _ in scene.coordinates.quaternions:
+        turned[:, first : first + 4] = q[:, first : first + 4]
+    found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
+    good = np.isfinite(found.error) & all_finite(found.A, axis=(1, 2))
+    return at_index(scaled_states(found, typical), good)
