@@ -128,7 +128,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds if there is none."""
+    """Return speeds (m/s) by label: below, inside and above the stable range, else fixed ones."""
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
     if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on
@@ -168,7 +168,7 @@ _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=g
 
 
 def _interval(values, physical) -> dict | None:
-    """Return value, low, high and fraction of one speed; None if neither the bicycle nor any sample has it."""
+    """Return value, low, high and fraction of one speed; None if no bicycle or sample has it."""
     if np.isnan(values).all():
         return None
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))

@@ -3,10 +3,13 @@
     y: readings with standard deviations s;   theta(y): parameters
     covariance of theta = J diag(s^2) J',     J = d theta / d y
 
-    swung on a level axle       (I + m l^2) angle'' + m g l sin angle = 0        T = 2 pi sqrt((I + m l^2) / (m g l))
-    twisted on an upright rod   (n . I n) twist'' + k twist = 0                  T = 2 pi sqrt((n . I n) / k)
+    swung on a level axle      (I + m l^2) angle'' + m g l sin angle = 0
+                               T = 2 pi sqrt((I + m l^2) / (m g l))
+    twisted on upright rod     (n . I n) twist'' + k twist = 0
+                               T = 2 pi sqrt((n . I n) / k)
 
-n is the direction of the rod in axes of the part; the mass centre of a hung part lies below the rod. More
+m, I: mass and inertia of the part; l: distance of its mass centre from the axle; T: period; k: stiffness of
+the rod; n: its direction in axes of the part. The mass centre of a hung part lies below the rod. More
 hangings or plumb lines than unknowns are fitted by least squares. Readings are independent, but parameters
 from shared readings are not: all inertias share the stiffness of the rod, and the inertia about y depends on
 the mass centre. Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control
@@ -147,8 +150,9 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
     """Return wheelbase, trail and tilt of the steer axis from the lengths a of the rear frame and b of the
     fork, both across the steer axis, and d between the wheels along it,
 
-    w = (a + b) cos lam + d sin lam,    rR - rF = d cos lam - (a + b) sin lam = sqrt(d^2 + (a + b)^2) cos(lam + atan((a + b) / d)),
-    trail = (rF sin lam - b) / cos lam
+        w = (a + b) cos lam + d sin lam
+        rR - rF = d cos lam - (a + b) sin lam = sqrt(d^2 + (a + b)^2) cos(lam + atan((a + b) / d))
+        trail = (rF sin lam - b) / cos lam
     """
     if not by_table:
         w, lam, b = y["w"], jnp.deg2rad(90 - y["gamma"]), y["f"]

@@ -8,14 +8,18 @@ of quantity, part and number: `TtB2` is the twisting period of the rear frame B,
 | name | reading | unit |
 |---|---|---|
 | `dR nR`, `dF nF` | distance rolled by a wheel; number of turns | m |
-| `w gamma f`, or `h1`...`h5`, `d1`...`d4`, `d` | wheelbase, slope of the steer axis, fork offset; or heights and diameters on a level table | m, deg |
-| `mR mF mB mH`, or `mG mS` for `mH` | masses of wheels, rear frame, fork with handlebar; or of handlebar G and fork S separately | kg |
-| `lR TcR1`, `lF TcF1`, `TcB1`, `TcH1` | swung: from axle to middle of a wheel, period; frame and fork hang by the middle of their wheel | m, s |
-| `TtR1`, `TtF1` | twisted on an upright rod, about a diameter of the wheel | s |
-| `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, offset of the rod from the middle of the wheel, period; three hangings or more | deg, m, s |
+| `w gamma f` | wheelbase, slope of the steer axis, fork offset | m, deg |
+| or `h1`...`h5`, `d1`...`d4`, `d` | heights and diameters on a level table | m |
+| `mR mF mB mH` | masses of wheels, rear frame, fork with handlebar | kg |
+| or `mG mS` for `mH` | masses of handlebar G and fork S | kg |
+| `lR TcR1`, `lF TcF1` | wheel swung: from axle to its middle, period | m, s |
+| `TcB1`, `TcH1` | frame and fork swung, hung by the middle of their wheel: period | s |
+| `TtR1`, `TtF1` | wheel twisted on an upright rod, about a diameter: period | s |
+| `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, offset of the rod, period | deg, m, s |
 | `mP lP dP TtP1` | a steel bar of known inertia, which calibrates the rod | kg, m, s |
 | `h6 h7 d5 d6 l` | suspension point of handlebar G relative to the front axle; only with G and S | m |
 | `g` | gravity | m/s^2 |
+The offset of the rod is from the middle of the wheel. A part has three hangings or more.
 """
 
 import math

@@ -4,10 +4,10 @@
     p(s; v) = det(s^2 M + s v C1 + g K0 + v^2 K2) = a4 s^4 + a3 s^3 + a2 s^2 + a1 s + a0
 
 With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x), and polynomials in
-x determine
+x determine, with omega^2 = b1/b3,
 
     where an eigenvalue is zero             b0 = 0
-    where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if omega^2 = b1/b3 > 0)
+    where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if b1/b3 > 0)
     where two eigenvalues coincide          4 D0^3 - D1^2 = 0, with
         D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
         D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0

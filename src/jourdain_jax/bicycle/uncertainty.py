@@ -27,7 +27,7 @@ class ParameterSamples(eqx.Module):
     refused: dict[str, Array]  # violated condition, as a sentence -> number of samples
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
-        """Return one array of samples per parameter, for `jax.vmap` over a function of a dict of parameters."""
+        """Return one array of samples per parameter, for `jax.vmap` of a function of parameters by name."""
         return dict(zip(PARAMETER_NAMES, self.values.T, strict=True))
 
 

@@ -72,7 +72,7 @@ def _job(options) -> bool:
 
 
 def prefixes(names: list[str]) -> list[str]:
-    """Return file name prefixes for the figures, numbered where bicycle names repeat; empty for one bicycle."""
+    """Return prefixes of figure files, numbered if bicycle names repeat; empty for one bicycle."""
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     return (
         [

@@ -3,22 +3,25 @@
 model = "tilting-disc"                       # a name of `jourdain-jax models`
 t1 = 2.0                                     # s
 samples = 1000
-sampler = "sobol"                            # optional, as are `seed`, `save`, `keep_every`, and the tables `set`, `options`, `correlation`
+sampler = "sobol"                            # optional
 
 [set]                                        # parameters shared by all samples
 mass = 1.0
-[vary]                                       # parameters that vary: normal, uniform, log-normal, log-uniform, levels, table
+[vary]                                       # normal, uniform, log-normal, log-uniform, levels, table
 radius = { normal = [0.5, 0.01] }
 [start]                                      # same for coordinates and speeds, or numbers
 lean = { uniform = [-0.6, 0.6] }
 spin_rate = -3.0
-[outputs]                                    # end, largest, smallest, largest-magnitude, integral, event-time, happened; optional
+[outputs]                                    # end, largest, smallest, integral, event-time, ...; optional
 "final lean" = { end = "lean", unit = "rad" }
 fell = { happened = "fallen" }
 [options]                                    # of `jj.rollout`
 rtol = 1e-6
 [correlation]
 "radius lean" = 0.5
+
+`seed`, `save`, `keep_every`, and the tables `set`, `options` and `correlation` are optional. Other outputs:
+`largest-magnitude`, `happened`.
 """
 
 import json

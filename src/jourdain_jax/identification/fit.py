@@ -1,10 +1,11 @@
 """Identification: parameters and initial values of a scene from measured motions, by nonlinear least squares.
 
-    minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma,   theta within its bounds;   mean, s: of priors
+    minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma
 
-by Levenberg-Marquardt. Jacobians are computed in forward mode, run by run, and initial values of the runs are
-eliminated run by run. Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J.
-Wild, Nonlinear Regression (1989), chapter 3.
+over the unknowns theta within their bounds, by Levenberg-Marquardt; mean, s: of priors. Jacobians are
+computed in forward mode, run by run, and initial values of the runs are eliminated run by run. Source: D. W.
+Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989),
+chapter 3.
 
 Search for a minimum: from first guesses, over growing spans if these are far off, alternating with
 correlation times, and away from bounds.
@@ -203,12 +204,14 @@ def fit(
 
     **Examples**
 
-        truth, start, ts = jj.models.ChaplyginSleigh(offset=0.25), {"x_rate": 0.6, "heading_rate": 0.9}, jnp.linspace(0.0, 2.0, 21)
+        truth = jj.models.ChaplyginSleigh(offset=0.25)
+        start, ts = {"x_rate": 0.6, "heading_rate": 0.9}, jnp.linspace(0.0, 2.0, 21)
         motion = jj.simulate(truth, start, ts=ts)
-        data = jj.Experiment(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
+        # sigma: 0.01 m, 0.01 rad
+        data = jj.Experiment(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)
         found = jj.fit(jj.models.ChaplyginSleigh(), data, free={"offset": jj.bounds(0.05, 1.0)})
-        print(found)                                              # estimates with 95 % intervals, and undetermined combinations
-        found["offset"].value, found.scene.offset                 # near 0.25 m
+        print(found)                               # estimates with 95 % intervals
+        found["offset"].value, found.scene.offset  # near 0.25 m
     """
     guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: the number of first guesses")
     check_shooting(shooting)
@@ -347,7 +350,7 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
-    """Return which repeats have at least as many measured values as unknowns. Raises ValueError if none has."""
+    """Return which repeats have as many measured values as unknowns. Raises ValueError if none has."""
     known = [
         np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats))
         for run in runs

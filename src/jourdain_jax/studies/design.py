@@ -39,8 +39,9 @@ class Design(Printed):
     - `correlation`: pair of names -> correlation coefficient, for normal distributions; for others, of the
       normal scores of their ranks.
 
-        design = jj.studies.Design({"mass": jj.studies.Normal(12.0, 0.3), "radius": jj.studies.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
-        design.values(0, 8)["mass"]                               # of samples 0 to 7, in kg
+        vary = {"mass": jj.studies.Normal(12.0, 0.3), "radius": jj.studies.Uniform(0.3, 0.4)}
+        design = jj.studies.Design(vary, sampler="sobol", samples=1024, seed=7)
+        design.values(0, 8)["mass"]  # of samples 0 to 7, in kg
     """
 
     variables: Mapping

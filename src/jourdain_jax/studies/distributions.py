@@ -21,7 +21,7 @@ class Distribution:
     _positive: ClassVar[str] = ""  # name of the number that must be positive
 
     def __post_init__(self):
-        """Convert the numbers to floats. Raises ValueError for numbers that are not finite or out of range."""
+        """Convert the numbers to floats. Raises ValueError if one is not finite, or out of range."""
         kind, known = type(self).__name__, dict(vars(self))
         for name, value in known.items():
             known[name] = float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number"))

@@ -162,7 +162,7 @@ class OfEvent(Output):
 
 @dataclass(frozen=True)
 class EventTime(OfEvent):
-    """The time (s) at which the stop event `event` (default: any event) ended the motion; NaN if it did not."""
+    """The time (s) at which the stop event `event` (default: any) ended the motion; NaN if it did not."""
 
     unit = "s"
 

@@ -125,7 +125,7 @@ class StudyResult(Printed):
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Return means, covariances, histograms and extremes of the outputs over the samples that have them."""
+        """Return means, covariances, histograms and extremes of outputs, over the samples that have them."""
         grid = self.store.read_grid()
         if grid is None or not self._done:
             raise ValueError(
@@ -147,7 +147,7 @@ class StudyResult(Printed):
         return float(self.statistics.covariance[self._place(first), self._place(second)])
 
     def quantile(self, output: str, level: float) -> tuple[float, float]:
-        """Return two bounds of the quantile `level` (0 to 1) of an `output`: the edges of its histogram cell."""
+        """Return two bounds of the quantile `level` (0 to 1) of an `output`: edges of its histogram cell."""
         if not 0 <= level <= 1:
             raise ValueError(f"`level` is {level}, expected a number from 0 to 1")
         self._place(output)

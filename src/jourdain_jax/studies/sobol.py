@@ -4,7 +4,7 @@ With independent samples A_j, B_j, and AB_j^i equal to A_j except for quantity i
 al. 2010):
 
     S_i  = mean_j f(B_j) (f(AB_j^i) - f(A_j)) / V    first order: reduction of V if i is fixed (table 2, b)
-    ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)     total: remainder if all others are fixed (2, f; Jansen 1999)
+    ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)     total: remainder if all others are fixed (2, f; Jansen)
 
 V is the variance over all A_j and B_j; f is taken relative to its mean, which reduces the errors. Intervals:
 standard errors from groups of samples drawn again with replacement (Efron's bootstrap), times the normal
@@ -59,7 +59,8 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     """Return Sobol' indices of a quantity from its `values` on a design with sampler "saltelli", whose
     variables are called `names`.
 
-        design = jj.studies.Design({"a": jj.studies.Uniform(-1.0, 1.0), "b": jj.studies.Uniform(0.0, 1.0)}, sampler="saltelli", samples=4 * 1024)
+        vary = {"a": jj.studies.Uniform(-1.0, 1.0), "b": jj.studies.Uniform(0.0, 1.0)}
+        design = jj.studies.Design(vary, sampler="saltelli", samples=4 * 1024)
         at = design.values()
         print(jj.studies.sobol_indices(at["a"] + at["b"] ** 2, design.names))
 

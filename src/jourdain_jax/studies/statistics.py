@@ -92,7 +92,7 @@ class Tally:
 
     @classmethod
     def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
-        """Return the tally of the first `lanes` of a block, from the results and values (samples, outputs)."""
+        """Return the tally of the first `lanes` of a block, from results and values (samples, outputs)."""
         with jax.enable_x64(True):
             counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
         failed = np.zeros(0, np.int64)

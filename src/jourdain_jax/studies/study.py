@@ -58,8 +58,10 @@ class Study(Printed):
 
         disc = jj.models.TiltingDisc()
         start = {"lean": jj.studies.Uniform(-0.6, 0.6), "spin_rate": -3.0}
-        study = jj.Study(disc, vary={"radius": jj.studies.Normal(0.5, 0.01)}, start=start, sampler="sobol", samples=1024)
-        result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.studies.End("lean", "rad"), "fallen": jj.studies.Happened("fallen")})
+        vary = {"radius": jj.studies.Normal(0.5, 0.01)}
+        study = jj.Study(disc, vary=vary, start=start, sampler="sobol", samples=1024)
+        outputs = {"lean": jj.studies.End("lean", "rad"), "fallen": jj.studies.Happened("fallen")}
+        result = study.run("discs.zarr", t1=2.0, outputs=outputs)
         print(result)
 
     Raises ValueError for unknown names and for quantities that cannot vary. Needs the extra `studies`.
@@ -271,7 +273,8 @@ class Study(Printed):
 
         - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 
-            found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.studies.End("lean", "rad")}, parameters=("gravity",))
+            outputs = {"final lean": jj.studies.End("lean", "rad")}
+            found = study.mean_gradients(t1=2.0, outputs=outputs, parameters=("gravity",))
             found.of("final lean", "radius.sigma")
 
         Raises ValueError for unknown names.

@@ -84,7 +84,7 @@ class Task:
         return np.asarray(self.span["ts"])
 
     def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
-        """Return start values (including shared ones) and parameters, from the columns of the design by name."""
+        """Return start values (including shared ones) and parameters, from columns of the design by name."""
         starts = {
             name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)
         }

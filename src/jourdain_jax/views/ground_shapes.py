@@ -86,7 +86,7 @@ def floor_under(low, high) -> float:
 
 
 def _mesh(grid: np.ndarray) -> dict:
-    """Return the triangles between neighbouring points of a grid, without triangles that have a NaN corner."""
+    """Return the triangles between neighbouring points of a grid; none has a NaN corner."""
     triangles = quads(grid)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
     return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))]}
 

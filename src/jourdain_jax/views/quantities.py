@@ -1,4 +1,4 @@
-"""Plots of named quantities over time, with quantile bands for rollouts, and of families against a parameter."""
+"""Plots of named quantities over time, quantile bands of rollouts, and families against a parameter."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -87,7 +87,8 @@ def plot(
 
     **Examples**
 
-        motions = [jj.simulate(jj.models.TiltingDisc(), {"lean": 0.3, "spin_rate": spin}, t1=3.0) for spin in (-3.0, -4.0)]
+        disc, starts = jj.models.TiltingDisc(), [{"lean": 0.3, "spin_rate": spin} for spin in (-3.0, -4.0)]
+        motions = [jj.simulate(disc, start, t1=3.0) for start in starts]
         figure, axes = jj.plot(motions, "lean", units={"lean": "deg"}, labels=["slow", "fast"])
     """
     if path is not None:
@@ -252,7 +253,7 @@ def _scene(motion: Trajectory | Rollout):
 def _draw(
     axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str
 ) -> None:
-    """Draw a line, or for a rollout the bands (widest and palest first) and the median. `y`: from `_values`."""
+    """Draw a line, or the median and bands (widest, palest first) of a rollout. `y`: from `_values`."""
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
     if many:

@@ -146,8 +146,10 @@ class Accelerometer(Instrument):
     """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2. At
     rest it points up and has the magnitude of g.
 
-        imu = jj.identification.Sensor(jj.identification.Accelerometer("frame", (0.3, 0.0, 0.1)), bias=jj.Estimate((0.0, 0.0, 0.0)))
-        jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2
+        frame = jj.identification.Accelerometer("frame", (0.3, 0.0, 0.1))
+        imu = jj.identification.Sensor(frame, bias=jj.Estimate((0.0, 0.0, 0.0)))
+        # a: (times, 3), m/s^2
+        jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})
 
     - `body`: name of the body. `point`: position from its mass centre, in the body's frame, m.
     - `gravity`: g in m/s^2, in the inertial frame.
@@ -203,7 +205,9 @@ class Accelerometer(Instrument):
 class LoadCell(Instrument):
     """A load cell under a rolling contact: the force of the ground on the body, in N.
 
-        jj.Experiment(ts, {"plate": force}, 2.0, start=start, sensors={"plate": jj.identification.LoadCell("front")})                # force: (times, 3), N
+        plate = jj.identification.LoadCell("front")
+        # force: (times, 3), N
+        jj.Experiment(ts, {"plate": force}, 2.0, start=start, sensors={"plate": plate})
 
     - `contact`: name of the contact.
 

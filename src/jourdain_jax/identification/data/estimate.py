@@ -18,9 +18,11 @@ covariance (the marginal).
 Unknowns within bounds as vectors x of any real numbers, with the factor by which densities change:
 
     unbounded  theta = x
-    positive   theta = exp x                                  log |d theta / dx| = x
-    bounds     theta = low + (high - low) / (1 + exp(-x))     log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
-    memory     of a correlation time: the same for arcsin rho, rho = exp(-h / theta), h: the shortest interval
+    positive   theta = exp x
+                   log |d theta / dx| = x
+    bounds     theta = low + (high - low) / (1 + exp(-x))
+                   log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
+    memory     a correlation time: as `bounds` for arcsin rho, rho = exp(-h / theta), h: the shortest interval
 
 Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference
 manual of that year.

@@ -33,7 +33,8 @@ class Experiment(eqx.Module):
     """Measurements of one run of a scene; several runs are a list of these.
 
         gyro = jj.identification.Sensor("heading_rate", lag=0.01)
-        Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": gyro})
+        sigma = {"x": 0.01, "gyro": 0.02}
+        jj.Experiment(ts, {"x": x, "gyro": w}, sigma, start={"x_rate": 0.6}, sensors={"gyro": gyro})
 
     **Arguments**
 

@@ -37,7 +37,9 @@ Stated: TypeAlias = Number | Sequence[Number] | Estimate
 class Sensor(eqx.Module):
     """A sensor of a channel: `reading(t) = gain y(t - delay) + bias`, `lag y' + y = quantity`.
 
-        Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=0.01)
+        delay = jj.Estimate(0.02, range=jj.bounds(0.0, 0.1))
+        bias = jj.Estimate(0.0, per_run=True)
+        Sensor("lean_rate", gain=jj.Estimate(1.0), bias=bias, delay=delay, lag=0.01)
 
     - `quantity`: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one
       instant) such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: the coordinate or
@@ -93,7 +95,9 @@ class Actuator(eqx.Module):
     """An actuator that drives an input from its command: `input(t) = gain y(t - delay) + bias`, `lag y' + y =
     command`.
 
-        inputs={"steer_torque": jj.identification.Actuator(jj.Sampled(ts, command), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=jj.Estimate(0.03))}
+        delay = jj.Estimate(0.02, range=jj.bounds(0.0, 0.1))
+        motor = jj.identification.Actuator(jj.Sampled(ts, command), delay=delay, lag=jj.Estimate(0.03))
+        inputs = {"steer_torque": motor}
 
     - `command`: `Sampled`, with its first value at all earlier times.
     - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers or `Estimate`, as in

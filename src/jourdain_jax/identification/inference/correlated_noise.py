@@ -1,11 +1,13 @@
 """Correlated noise: an Ornstein-Uhlenbeck process in each channel, which is an AR(1) process at equal
 intervals.
 
-    E e(t) e(t') = sigma^2 exp(-|t - t'| / tau),        rho_k = exp(-(t_k - t_j) / tau),      j: the last sample before k that is not missing
-    whitened     w_k = (r_k - rho_k r_j) / sqrt(1 - rho_k^2),      w = r at the first sample:  independent, of variance one where r = e / sigma
+    E e(t) e(t') = sigma^2 exp(-|t - t'| / tau)
+    rho_k = exp(-(t_k - t_j) / tau)
+    w_k = (r_k - rho_k r_j) / sqrt(1 - rho_k^2),     w = r at the first sample
 
-This is exact at uneven times and across missing samples. An unknown correlation time tau minimises, at the
-estimates of all other unknowns,
+e: noise; r = e / sigma; j: the last sample before k that is not missing. The whitened residuals w are
+independent, of variance one. This is exact at uneven times and across missing samples. An unknown correlation
+time tau minimises, at the estimates of all other unknowns,
 
     sum w^2 / 2 + sum log sqrt(1 - rho_k^2) + log det(J_w' J_w) / 2
 
@@ -109,7 +111,7 @@ class Chains:
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
-    """Return `log det(J'J) / 2` for unknowns divided by `size`. Each undetermined direction adds a constant."""
+    """Return `log det(J'J) / 2` for unknowns divided by `size`; undetermined directions add constants."""
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts
     members = len(size)

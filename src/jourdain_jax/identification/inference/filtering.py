@@ -1,13 +1,16 @@
 """The likelihood of measurements of disturbed motions, by an extended Kalman filter.
 
-    x = (independent coordinates, independent speeds y),   y' = f(t, x) + w,   E w(t) w(t')' = W delta(t - t'),   W = diag(process noise)
+    x = (independent coordinates, independent speeds y),   y' = f(t, x) + w
+    E w(t) w(t')' = W delta(t - t'),   W = diag(process noise)
 
-    between samples   x <- x(t_k+1),   P <- F P F' + sum_j h w_j B_j W B_j',   B_j = F F_j^-1 [0; 1]        F_j = d x(s_j) / d x(t_k)
-    at a sample             r = value - reading(x),   S = H P H' + R,   K = P H' S^-1,   H = d reading / d x
-                            x <- x + K r,   P <- (1 - K H) P (1 - K H)' + K R K'
-    log L                   - sum (r' S^-1 r + log det S + n log 2 pi) / 2
+    between samples   x <- x(t_k+1),   P <- F P F' + sum_j h w_j B_j W B_j'
+                      B_j = F F_j^-1 [0; 1],   F_j = d x(s_j) / d x(t_k),   F = d x(t_k+1) / d x(t_k)
+    at a sample       r = value - reading(x),   S = H P H' + R,   K = P H' S^-1,   H = d reading / d x
+                      x <- x + K r,   P <- (1 - K H) P (1 - K H)' + K R K'
+    log L             - sum (r' S^-1 r + log det S + n log 2 pi) / 2
 
-s_j, w_j: nodes and weights of Gauss and Legendre between two samples. Dependent coordinates and speeds follow
+P: covariance of x; R: of the n readings; h: interval between two samples, with nodes s_j and weights w_j of
+Gauss and Legendre. Dependent coordinates and speeds follow
 from the constraints. The result is exact for linear scenes; otherwise it is of first order in the spread of
 x. Source: A. H. Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.3; G. J. Bierman,
 Factorization Methods for Discrete Sequential Estimation (1977), section II.6 (Joseph's form of P).
@@ -82,7 +85,8 @@ def filtered_log_likelihood(
 
     **Example**
 
-        jj.identification.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
+        noise = {"heading_rate": 0.01}  # (rad/s)^2 / s
+        jj.identification.filtered_log_likelihood(sleigh, run, process_noise=noise)
     """
     settled = replace(as_fit_options(scene, options, by_name, "filtered_log_likelihood"), events=False)
     scene = as_scene(scene)

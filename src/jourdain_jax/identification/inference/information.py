@@ -14,11 +14,11 @@ V_0 by about their sizes. Source: G. A. F. Seber and C. J. Wild, Nonlinear Regre
 
 Numbers that depend on the estimates of a fit have estimates, standard errors and intervals to first order:
 
-    y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
+    y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))
 
-A number can be determined although its parts are not: it has a standard error if g has no part in
-undetermined directions. Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973),
-section 6a.2 (the delta method).
+C: covariance of the estimates; q: quantile. A number can be determined although its parts are not: it has a
+standard error if g has no part in undetermined directions. Source: C. R. Rao, Linear Statistical Inference
+and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
 
 Poorly determined combinations of unknowns ("sloppy" directions):
 
@@ -114,7 +114,7 @@ class Information:
 def variances(
     shared: np.ndarray, own: np.ndarray, follow: np.ndarray
 ) -> Float[np.ndarray, "*members places"]:
-    """Return variances of shared unknowns and of the runs' own unknowns, from the blocks of an `Information`."""
+    """Return variances of shared unknowns and of unknowns of runs, from the blocks of an `Information`."""
     of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum(
         "...kij,...jl,...kil->...ki", follow, shared, follow
     )

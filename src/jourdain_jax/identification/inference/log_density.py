@@ -1,6 +1,7 @@
 """The posterior density of the unknowns of a fit, as a function of any real numbers, for samplers.
 
-    log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
+    log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|
+    theta = constrain(x),   x = centre + F z
 
 L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from
 a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the shortest
@@ -250,9 +251,10 @@ def log_density(
 
     **Example**
 
-        density = jj.identification.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
+        found = jj.fit(scene, data, free=("radius",))
+        density = jj.identification.log_density(scene, data, free=("radius",)).whitened(found)
         sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
-        draws = density.named(positions)["radius"]                               # m, at the sampled positions (draws, unknowns)
+        draws = density.named(positions)["radius"]  # m; positions: (draws, unknowns)
     """
     settled = as_fit_options(scene, options, by_name, "log_density")
     scene = as_scene(scene)

@@ -102,8 +102,10 @@ def profile(one: Profile, error: float) -> str:
 
 
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body{{font:15px/1.45 sans-serif;max-width:980px;margin:2em auto;padding:0 1em;color:#222}}pre{{font-size:13px;white-space:pre-wrap}}
-figure{{display:inline-block;margin:.4em .6em .4em 0;vertical-align:top}}figcaption{{font-size:13px;max-width:460px}}h2{{margin-top:1.6em}}
+body{{font:15px/1.45 sans-serif;max-width:980px;margin:2em auto;padding:0 1em;color:#222}}
+pre{{font-size:13px;white-space:pre-wrap}}
+figure{{display:inline-block;margin:.4em .6em .4em 0;vertical-align:top}}
+figcaption{{font-size:13px;max-width:460px}}h2{{margin-top:1.6em}}
 </style></head><body><h1>{title}</h1>{sections}</body></html>
 """
 

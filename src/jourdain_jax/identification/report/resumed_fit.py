@@ -2,28 +2,30 @@
 
 Predictions for other runs.
 
-error = prediction - value, rms^2 = mean error^2, R^2 = 1 - sum error^2 / sum (value - mean)^2 over all
-available samples of a channel
+    error = prediction - value,   rms^2 = mean error^2,   R^2 = 1 - sum error^2 / sum (value - mean)^2
 
-Shared unknowns are held at their estimates. Unknowns of a run (start values, numbers of its sensors) are
-fitted to that run.
+Means and sums are over all available samples of a channel. Shared unknowns are held at their estimates.
+Unknowns of a run (start values, numbers of its sensors) are fitted to that run.
 
 The share of each sample in the information on an unknown.
 
-    estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i       C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted
-    share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k          w_k: weight of sample k, one over the square of its sigma
+    estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i
+    share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k
 
-Shares account for the estimation of all other unknowns. Those of all samples and priors add up to one.
-Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted; w_k: weight of
+sample k, one over the square of its sigma. Shares account for the estimation of all other unknowns. Those of
+all samples and priors add up to one. Source: R. D. Cook and S. Weisberg, Residuals and Influence in
+Regression (1982), section 2.2.
 
 Profile likelihood: the objective as a function of one unknown, minimised over all others.
 
-    rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, held at x; inflation: as in the covariance, for the loss and for
-    interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom              estimated sigmas
+    rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, held at x
+    interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom
 
-bounded: both ends exist; one-sided: one of them; flat: none, the data do not determine the unknown. Each
-point starts from the solution of its inner neighbour. Correlation times are held. Source: D. J. Venzon and S.
-H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25 (2009) 1923.
+inflation: as in the covariance, for the loss and for estimated sigmas; bounded: both ends exist; one-sided:
+one of them; flat: none, the data do not determine the unknown. Each point starts from the solution of its
+inner neighbour. Correlation times are held. Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37
+(1988) 87; A. Raue et al., Bioinformatics 25 (2009) 1923.
 """
 
 from collections.abc import Iterable, Sequence

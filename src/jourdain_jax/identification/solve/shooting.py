@@ -1,10 +1,11 @@
 """Multiple shooting: runs are divided into pieces with their own starts, joined by continuity.
 
-    piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
-    continuity                              x(t_i+1; s_i, theta) = s_i+1                            an equation, not a residual
+    piece i of a run      motion x(t; s_i, theta) from t_i to t_i+1, from the state s_i;   s_0: start
+    continuity            x(t_i+1; s_i, theta) = s_i+1
 
-With delayed sensors, pieces overlap: a sample belongs to the piece that contains its earliest possible time,
-and that piece extends beyond t_i+1. The output of a sensor's low-pass filter is part of s.
+Continuity is an equation, not a residual. With delayed sensors, pieces overlap: a sample belongs to the piece
+that contains its earliest possible time, and that piece extends beyond t_i+1. The output of a sensor's
+low-pass filter is part of s.
 
 Over a short piece a motion depends almost linearly on its unknowns, even if the whole run is chaotic. Source:
 H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder,

@@ -237,7 +237,7 @@ def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> Non
 
 
 def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
-    """Return the minimum with all gaps closed, by sequential quadratic programming from the present pieces."""
+    """Return the minimum with all gaps closed, by sequential quadratic programming from these pieces."""
     unknowns, control = problem.unknowns, problem.asked.control
 
     def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
