@@ -11,7 +11,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax import Contact
-from jourdain_jax.analysis.statements import Check
+from jourdain_jax.analysis.verification import Check
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.trajectories.diagnostics import Diagnostics, Energies
 from jourdain_jax.scene import description

@@ -20,10 +20,12 @@ from small_scenes import OnLine, OnPlane
 from test_mutants import Mutant
 
 import jourdain_jax as jj
-from jourdain_jax.integrate import event_search, state_projection
+from jourdain_jax.integrate import constraint_projection, event_search
 from jourdain_jax.integrate.loop import (
     adjoint,
+    event_adjoint,
     loop,
+    loop_function,
     native_motion,
     projection_kernel,
     rate_functions,
@@ -221,13 +223,17 @@ def a_bead_stays_on_its_circle():
 
 def a_start_is_put_onto_its_rows():
     scene = Round()
-    usual = state_projection.usual_sizes(scene, False, True)
+    usual = constraint_projection.usual_sizes(scene, False, True)
     assert usual.program is not None
     t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
-    q_near, _ = jax.jit(lambda q: state_projection.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
+    q_near, _ = jax.jit(lambda q: constraint_projection.put_positions(scene, t, q, jnp.ones(2, bool), usual))(
+        q
+    )
     assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
     u_near, _ = jax.jit(
-        lambda u: state_projection.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual)
+        lambda u: constraint_projection.put_speeds(
+            scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual
+        )
     )(u)
     assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
 
@@ -611,7 +617,7 @@ MUTANTS = [
     ),
     Mutant(
         "an event at a number for a time",
-        adjoint,
+        event_adjoint,
         "event_back",
         "-total / rate",
         "total / rate",
@@ -620,7 +626,7 @@ MUTANTS = [
     ),
     Mutant(
         "the level of an event forgotten",
-        adjoint,
+        event_adjoint,
         "event_back",
         "w.where(usable, more, 0.0)",
         "w.number(0.0)",
@@ -665,7 +671,7 @@ MUTANTS = [
     ),
     Mutant(
         "the tangent at the time of an event",
-        adjoint,
+        event_adjoint,
         "event_back",
         "dt * w.load(f, i)",
         "0.0 * dt",
@@ -674,7 +680,7 @@ MUTANTS = [
     ),
     Mutant(
         "the tangent of an event forgotten",
-        adjoint,
+        event_adjoint,
         "_moved_back",
         "w.where(usable, w.load(out, i), 0.0)",
         "w.number(0.0)",
@@ -683,7 +689,7 @@ MUTANTS = [
     ),
     Mutant(
         "an event that stays while its tangent moves",
-        adjoint,
+        event_adjoint,
         "_moved_back",
         "w.load(added, asked)",
         "0.0 * g_dt",
@@ -729,7 +735,7 @@ MUTANTS = [
     ),
     Mutant(
         "rates after an event in the mode before",
-        adjoint,
+        event_adjoint,
         "reset_back",
         'w.at(after, of["mode"].start), modes',
         "modes, modes",
@@ -738,7 +744,7 @@ MUTANTS = [
     ),
     Mutant(
         "rates after an event forgotten",
-        adjoint,
+        event_adjoint,
         "reset_back",
         "w.load(g, i) * w.load(f_after, i)",
         "0.0 * w.load(g, i)",
@@ -747,7 +753,7 @@ MUTANTS = [
     ),
     Mutant(
         "what moves an event forgotten",
-        adjoint,
+        event_adjoint,
         "reset_back",
         "w.load(out, i) + w.load(by_event, i)",
         "w.load(out, i)",
@@ -757,7 +763,7 @@ MUTANTS = [
     Mutant(
         "cotangents of another event's time",
         adjoint,
-        "_write_transition_back",
+        "write_transition_back",
         '"passed", lane) - 1.0',
         '"passed", lane)',
         ON_BACK,
@@ -792,7 +798,12 @@ MUTANTS = [
     ),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (loop.kernel, adjoint.kernel_back, state_projection._kernel, rate_functions.reason_against_derivatives)
+KEPT = (
+    loop_function.kernel,
+    adjoint.kernel_back,
+    constraint_projection._kernel,
+    rate_functions.reason_against_derivatives,
+)
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.equations.projection import BY_AUTODIFF
-from jourdain_jax.integrate.state_projection import row_functions
+from jourdain_jax.integrate.constraint_projection import row_functions
 from jourdain_jax.kernels import ffi
 from jourdain_jax.program import interpret
 from jourdain_jax.program.eager import eval_numpy

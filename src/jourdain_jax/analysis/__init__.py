@@ -4,11 +4,12 @@
 share. Open `report.py` or `linearize.py` first.
 """
 
+from jourdain_jax.analysis.derivative_checks import derivative_exists
 from jourdain_jax.analysis.energy import Energy, EnergyBalance
 from jourdain_jax.analysis.linearize import Linearization
 from jourdain_jax.analysis.report import Report
-from jourdain_jax.analysis.statements import Verification, derivative_exists
 from jourdain_jax.analysis.steady import SteadyMotion
+from jourdain_jax.analysis.verification import Verification
 
 __all__ = [
     "Energy",

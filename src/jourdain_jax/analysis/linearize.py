@@ -15,33 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
+from jourdain_jax.analysis.families.eigenvalue_derivatives import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
+from jourdain_jax.analysis.linear_matrices import matrices_of, own_rate
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
-    eliminated,
-    inverse,
-    others,
-    perturbations,
     perturbed_names,
     privileged_at,
     privileged_speeds,
-    smallest_pivot,
 )
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import (
-    Count,
-    Indices,
-    Numbers,
-    Scalar,
-    all_finite,
-    array_module,
-    holds,
-    is_traced,
-    largest,
-    static,
-)
+from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, holds, is_traced, static
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.state_projection import State
@@ -271,88 +256,12 @@ def _about(
     independent = tuple(name for name in names if name not in following)
     speeds = tuple(scene.speed_names.entries[i] for i in y)
     if coordinates is None:
-        coordinates = tuple(name for name in independent if _own_rate(scene, name) in y)
-    matrices = _matrices(scene, q, v, D, mass, independent, y, coordinates)
+        coordinates = tuple(name for name in independent if own_rate(scene, name) in y)
+    matrices = matrices_of(scene, q, v, D, mass, independent, y, coordinates)
     states, inputs = (*independent, *speeds), scene.inputs.entries
     return Linearization(
         **matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f)
     )
-
-
-def _matrices(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coordinates: Labels) -> dict:
-    """Return the contents of `Linearization`."""
-    at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
-    kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
-    (S, turned), constant = perturbations(scene), at.udot[chosen]
-    change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
-
-    # derivatives along every perturbation (ds, du, df), and perturbations as functions of the independent
-    # ones
-    along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
-    T = eliminated(
-        along[np.concatenate([at.geometric, at.phi])],
-        np.concatenate([kept, count + chosen, count + m + np.arange(len(at.f))]),
-    )
-    pivots = (
-        smallest_pivot(along[at.geometric], others(kept, count)),
-        smallest_pivot(along[at.phi], count + others(chosen, m)),
-    )
-
-    # rows of A and B: rates of the independent ds in axes that rotate with the unperturbed motion, and of the
-    # privileged speeds; a rotation ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq =
-    # (B q0dot) ds
-    rates = (S + 4 * turned @ q).T[kept] @ (along[at.qdot] @ T - turned @ v[at.qdot] @ T[:count])
-    rates = xp.concatenate([rates, along[constant] @ T])
-    n = len(kept) + len(y)
-    A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
-    found = dict(
-        zip(
-            ("M", "C", "K", "F", "coupling"),
-            _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates),
-            strict=True,
-        )
-    )
-    acceleration = largest(v[constant])
-    residual = xp.maximum(acceleration, largest(change))
-    found |= {
-        "A": A,
-        "B": B,
-        "acceleration": acceleration,
-        "residual": residual,
-        "pivot": xp.minimum(*pivots),
-    }
-    return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
-
-
-def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates: Labels):
-    """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass`: for the privileged
-    speeds.
-    """
-    count, k, xp = len(independent), len(coordinates), array_module(A)
-    p = np.array([independent.index(name) for name in coordinates], int)
-    # (ds, pdot, other privileged speeds) = change x
-    kept = count + _speeds_beside(scene, y, coordinates)
-    change = xp.concatenate([xp.eye(count, A.shape[0]), A[p], xp.eye(A.shape[0])[kept]])
-    back = inverse(change)
-    rates, forced = (change @ A @ back)[count:], (change @ B)[count:]
-    M = back[count:, count:].T @ mass @ back[count:, count:]
-    K, C, F = -M @ rates[:, :count], -M @ rates[:, count:], M @ forced
-    beside = others(p, count)
-    neglected = [
-        _relative(M[:k, k:], M[:k, :k]),
-        _relative(C[:k, k:], C[:k, :k]),
-        _relative(K[:k, beside], K[:k, p]),
-    ]
-    return M[:k, :k], C[:k, :k], K[:k, p], F[:k], xp.max(xp.stack(neglected))
-
-
-def _relative(neglected, kept):
-    """Return the ratio of the largest neglected entry to the largest kept one, or the entry itself if all
-    kept ones are zero.
-    """
-    xp = array_module(kept)
-    size = largest(kept)
-    return largest(neglected) / xp.where(size > 0, size, 1.0)
 
 
 @compiled_quickly
@@ -374,29 +283,3 @@ def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
     """Return eigenvalues by ascending real part."""
     values = jnp.linalg.eigvals(matrix)
     return values[jnp.lexsort((values.imag, values.real))]
-
-
-def _own_rate(scene: Scene, name: str) -> int | None:
-    """Return the index of the speed that is the rate of the perturbation `name`; None for a scene with
-    user-defined speeds.
-    """
-    if scene.speeds is not None:
-        return None
-    speed = f"{name}_rate" if name in scene.coordinate_names.entries else name.replace("_turn_", "_omega_")
-    return scene.speed_names.entries.index(speed)
-
-
-def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
-    """Return the positions in y of the privileged speeds other than the rates of the named coordinates."""
-    if len(coordinates) == len(y):
-        return np.zeros(0, int)  # as many as there are freedoms: their rates replace all of y
-    own = [_own_rate(scene, name) for name in coordinates]
-    beside = [j for j, speed in enumerate(y) if speed not in own]
-    if len(beside) + len(coordinates) == len(y):
-        return np.array(beside, int)
-    raise ValueError(
-        f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the "
-        f"privileged speeds of `{type(scene).__name__}` "
-        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates whose "
-        "rates are privileged, or give `privileged` with the rates of these coordinates"
-    )

@@ -4,14 +4,7 @@ inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
                e.e = 1                                                per gravity
 potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i with a potential V_i
 derivatives    d/ds of every statement along one direction in (parameters, t, q, u): autodiff against central differences; no kink
-
-Checks of derivatives of accelerations and constraint forces: existence, forward against reverse mode, and
-central differences.
-
-Their results: comparisons, each with size, threshold and culprit.
 """
-
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -19,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, static, tiny_of
-from jourdain_jax.dynamics.accelerations import reductions
-from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.instant import constraint_rows
+from jourdain_jax.analysis.derivative_checks import along, central_difference
+from jourdain_jax.analysis.verification import Check, check
+from jourdain_jax.calculus.reals import Scalar, largest, tiny_of
 from jourdain_jax.equations.kinematics import (
     coordinate_rates,
     motion_at,
@@ -31,279 +22,14 @@ from jourdain_jax.equations.kinematics import (
     partial_velocities,
     pose_at,
 )
-from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.rows import position_rows, velocity_rows
-from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
+from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import Labels
-from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import loads_of, potential_of
-from jourdain_jax.structure.structure import plain_row_lengths, usual_rows
-
-# relative to the size of the compared quantities, in double and in single precision
-THRESHOLDS = {
-    "inertia": (1e-10, 1e-5),
-    "potentials": (1e-10, 1e-4),
-    "derivatives": (1e-6, 1e-2),
-    "reductions": (1e-10, 1e-4),
-    "forms": (1e-10, 1e-4),
-    "virtual power": (1e-10, 1e-4),
-    "Newton": (1e-10, 1e-4),
-    "energy": (1e-9, 1e-4),
-    "jvp against vjp": (1e-11, 1e-4),
-    "differences": (1e-6, 2e-2),
-}
-
-
-class Check(eqx.Module):
-    """One comparison: its relative size, threshold and culprit."""
-
-    name: str = static()
-    value: float
-    threshold: float
-    culprit: str = static()  # body, load, constraint, form or reduction with the largest value
-    note: str = static(default="")
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the value is within its threshold."""
-        return bool(self.value <= self.threshold)
-
-    def as_dict(self) -> dict:
-        """Return the check as plain data; a value that is not finite is None."""
-        value = float(self.value) if np.isfinite(self.value) else None
-        return vars(self) | {"value": value, "passed": self.passed}
-
-
-def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """Return the check called `name` (a key of `THRESHOLDS`), given one number per suspect. NaN counts as
-    larger than any number.
-    """
-    threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
-    if not values:
-        return Check(name, 0.0, threshold, "nothing", note)
-    sizes = {suspect: float(value) for suspect, value in values.items()}
-    culprit = max(sizes, key=lambda suspect: np.inf if np.isnan(sizes[suspect]) else sizes[suspect])
-    return Check(name, sizes[culprit], threshold, culprit, note)
-
-
-def along(f: Callable, arguments, point, direction, u) -> tuple:
-    """Return the value and derivative of `f(arguments, point)` along a direction, its values at -2h, -h, h
-    and 2h, and the increment h, which depends on the speeds `u`.
-    """
-    h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
-    ends = [
-        _value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction))
-        for k in (-2, -1, 1, 2)
-    ]
-    return *_pushed(f, arguments, point, direction), ends, h
-
-
-@eval_numpy
-def _value(f: Callable, arguments, point):
-    return f(arguments, point)
-
-
-@eval_numpy
-def _pushed(f: Callable, arguments, point, direction):
-    return jax.jvp(lambda point: f(arguments, point), (point,), (direction,))
-
-
-def central_difference(along: list, h: float):
-    """Return the fourth-order central difference for values at -2h, -h, h, 2h."""
-    return (along[0] - 8 * along[1] + 8 * along[2] - along[3]) / (12 * h)
-
-
-class Verification(Printed, eqx.Module):
-    """All checks at one state; `print` shows them as a table."""
-
-    scene: str = static()
-    checks: tuple[Check, ...]
-    not_applicable: Labels = static()  # reductions that do not apply at this state
-    mistakes: str = static(default="")  # the table of `jj.check`
-
-    @property
-    def certifies(self) -> bool:
-        """Return whether passing means agreement to round-off of double precision. Single precision shows
-        only gross errors.
-        """
-        return all(check.threshold <= THRESHOLDS[check.name][0] for check in self.checks)
-
-    @property
-    def passed(self) -> bool:
-        """Return whether every check passed."""
-        return all(check.passed for check in self.checks)
-
-    def largest(self, *names: str) -> float:
-        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero
-        without checks.
-        """
-        values = [check.value for check in self.checks if check.name in names]
-        return float(np.max(values)) if values else 0.0
-
-    def as_dict(self) -> dict:
-        """Return the result as plain data: the largest values by kind, and every check."""
-        return {
-            "max_disagreement": self.largest("reductions", "forms", "Newton"),
-            "virtual_power": self.largest("virtual power"),
-            "energy_balance": self.largest("energy", "potentials"),
-            "gradient_error": self.largest("jvp against vjp", "differences", "derivatives"),
-            "passed": self.passed,
-            "certifies": self.certifies,
-            "not_applicable": list(self.not_applicable),
-            "checks": [check.as_dict() for check in self.checks],
-        }
-
-    def _text(self) -> str:
-        lines = [f"Verification of {self.scene}: {'passed' if self.passed else 'FAILED'}"]
-        for check in self.checks:
-            verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
-            lines.append(
-                f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}"
-                + (f"; {check.note}" if check.note else "")
-            )
-        if not self.certifies:
-            lines.append(
-                "  single precision: gross errors show, but passing certifies nothing; verify in "
-                "double precision (JAX_ENABLE_X64=1)"
-            )
-        if self.not_applicable:
-            lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
-        return "\n".join([*lines, self.mistakes]).rstrip()
-
-
-def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
-    """Return whether accelerations have a derivative along a change of the parameters and coordinates.
-
-    They have none if the change makes dependent constraints independent: `(1 - A A+) dA (1 - A+ A)` is not
-    zero.
-
-    **Arguments**
-
-    - `direction`: an object of the scene's class whose fields hold the change of each parameter (zero for
-      constant ones); `dq`: the change of the coordinates.
-    - `inputs`: values of the scene's inputs (default: zero).
-
-    It needs concrete numbers, so it does not run under jit or vmap.
-    """
-    if jax.tree.structure(direction) != jax.tree.structure(scene):
-        raise ValueError(
-            f"`direction` is {described(direction)}, expected a `{type(scene).__name__}` whose "
-            "fields hold the change of each parameter"
-        )
-    A, dA, size = _row_change(
-        scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene)
-    )
-    if A.size == 0:
-        return True
-    P = np.asarray(pseudo_inverse(jnp.asarray(A)))
-    split = (np.eye(len(A)) - A @ P) @ dA @ (np.eye(A.shape[1]) - P @ A)
-    return bool(largest(split) <= 1e3 * rank_cutoff(A.dtype) * (size + largest(dA)))
-
-
-@eval_numpy
-def _row_change(scene, t, q, u, direction, dq, inputs, typical):
-    moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-
-    def A(parameters, q):
-        rows = constraint_rows(eqx.combine(parameters, fixed), t, q, u, inputs)
-        return jax.lax.stop_gradient(row_scale(rows.A, typical))[:, None] * rows.A
-
-    value, change = jax.jvp(A, (moving, q), (eqx.filter(direction, eqx.is_inexact_array), dq))
-    return value, change, jnp.max(jnp.abs(value), initial=1.0)
-
-
-def gradient_checks(
-    scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int
-) -> list[Check]:
-    """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
-    the coordinates, arbitrary in the speeds, and relative to the values in the parameters.
-
-    Returns an empty list if no reduction applies.
-    """
-    # its Hessian of a Hessian costs more than all others together
-    names = tuple(name for name in names if name != "gibbs-appell")
-    if not names:
-        return []
-    generator = np.random.default_rng(seed)
-    moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-    relative = jax.tree.map(
-        lambda x: jnp.asarray(generator.normal(size=x.shape) * np.where(x == 0, 1.0, x), x.dtype), moving
-    )
-    weights = jnp.asarray(generator.normal(size=2 * u.shape[0]), u.dtype)
-    du = jnp.asarray(generator.normal(size=u.shape), u.dtype)
-    dq = coordinate_rates(scene, t, q, Z @ du) - coordinate_rates(scene, t, q, jnp.zeros_like(u))
-    left_out = (
-        "parameters omitted: changing them makes redundant constraints independent, so accelerations have no"
-        " derivative there"
-    )
-    cases = (relative, ""), (jax.tree.map(jnp.zeros_like, relative), left_out)
-    case = next(
-        (
-            case
-            for case in cases
-            if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)
-        ),
-        None,
-    )
-    if case is None:
-        note = "omitted: the constraints lose rank at this state, so accelerations have no derivative there"
-        return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
-    change, note = case
-    arguments, point, direction = (
-        (names, weights, t, inputs, fixed, usual_rows(scene)),
-        (moving, q, u),
-        (change, dq, du),
-    )
-    value, forward, ends, h = along(_outcome, arguments, point, direction, u)
-    size = np.abs(value) + np.abs(forward) + 1e-3 * np.sum(np.abs(weights))
-    found = []
-    for name, other in (
-        ("jvp against vjp", _reverse(arguments, point, direction)),
-        ("differences", central_difference(ends, h)),
-    ):
-        errors = np.abs(forward - other) / size
-        found.append(
-            check(
-                name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note
-            )
-        )
-    return found
-
-
-def _outcome(arguments, point) -> Float[Array, "reductions"]:
-    """Return a random combination of accelerations and constraint forces, by every reduction."""
-    names, weights, t, inputs, fixed, usual = arguments
-    parameters, q, u = point
-    scene = eqx.combine(parameters, fixed)
-    equations, rows = equations_and_rows(scene, t, q, u, inputs)
-    rows = rows.judged_by(usual)
-    found = [by_reduction(reductions(scene)[way], scene, t, q, u, equations, rows) for way in names]
-    return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
-
-
-def by_reduction(way, scene, t, q, u, equations, rows):
-    """Apply one reduction to shared equations and constraints."""
-    return (
-        way.accelerations(scene, t, q, u, equations, rows)
-        if isinstance(way, GibbsAppell)
-        else reduce(way, equations, rows)
-    )
-
-
-@eval_numpy
-def _reverse(arguments, point, direction):
-    value, pull = jax.vjp(lambda point: _outcome(arguments, point), point)
-    return jax.vmap(lambda way: _dot(pull(way)[0], direction))(jnp.eye(value.size, dtype=value.dtype))
-
-
-def _dot(a, b):
-    return sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def statement_checks(

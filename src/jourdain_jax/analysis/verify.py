@@ -21,13 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.statements import (
-    Verification,
-    by_reduction,
-    check,
-    gradient_checks,
-    statement_checks,
-)
+from jourdain_jax.analysis.derivative_checks import by_reduction, gradient_checks
+from jourdain_jax.analysis.statements import statement_checks
+from jourdain_jax.analysis.verification import Verification, check
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions

@@ -57,10 +57,7 @@ TABLE = {
             "eulerdamp autoreset nativeccd island multiccd energy invdiscrete sleep"
         ),
         off=dict.fromkeys(("spring", "damper", "passive", "actuation", "clampctrl"), "enable")
-        | {
-            "fwdinv": "disable enable",
-            "override": "disable",
-        },
+        | {"fwdinv": "disable enable", "override": "disable"},
         words={"gravity": ("enable", "disable")},
     ),
     "default": Holds(

@@ -28,122 +28,35 @@ Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
 
 import math
-import operator
-from functools import reduce
 from typing import Any, NamedTuple
 
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, Number, StepWriter, each_row
+from jourdain_jax.integrate.event_values import (
+    Values,
+    ahead,
+    any_of,
+    at_start,
+    chosen,
+    falls_through,
+    first_event,
+    is_flat,
+    lowest,
+    no_event,
+    reach_of_noise,
+    trial,
+)
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_row
 from jourdain_jax.integrate.loop.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
 from jourdain_jax.integrate.relation_sides import leaving, on_their_way
 
 RUNNING, LOCATING = -1, -2  # codes of a running motion, and of one that locates an event
 MOST_STEPS = 72
 DIFFERENTIABLE = 2
-# a value that falls through zero at less than this part of its mean rate counts as a multiple root
-FLAT = 1e-8
-LEAVES = 0.6  # exponent of round-off
-LATE = 0.98  # fraction of a step: a later dip is left to the next step
-
-Values = Any  # one per event
-
-
-def any_of(found: Values):
-    """Return whether any condition holds."""
-    return reduce(operator.or_, found)
-
-
-def no_event(values: Values):
-    """Return whether all values are positive, which NaN is not."""
-    return reduce(operator.and_, [c > 0.0 for c in values])
-
-
-def chosen(w, index, values: Values):
-    """Return the value with this index, by default the first."""
-    found = values[0]
-    for i in range(1, len(values)):
-        found = w.where(w.equal(index, i), values[i], found)
-    return found
 
 
 def _each(w, condition, a: Values, b: Values) -> tuple:
     return tuple(w.where(condition, x, y) for x, y in zip(a, b, strict=True))
-
-
-def reach_of_noise(w, span):
-    """Return the time in which a value rises by as much as round-off may make it negative at the start."""
-    return w.eps**LEAVES * w.magnitude(span)
-
-
-def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
-    """Return the events that happened at a start, and values near zero there that a step `h` leaves there."""
-    sunk, sinks, noise = [], [], reach_of_noise(w, span)
-    for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
-        rate, change = slope * direction, w.magnitude(b - a)
-        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # what a straight line changes it by
-        level = ~(a > 0.0) & (change > 0.0) & (straight * w.magnitude(h) <= noise * change)
-        rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
-        sunk.append(~(a > 0.0) & ~rises)
-        sinks.append(rises & ~(b > 0.0))
-    return sunk, sinks
-
-
-def first_event(w, before: Values, after: Values):
-    """Return the index of the first event to happen, by its secant."""
-    best, first = None, 0.0
-    for i, (b, a) in enumerate(zip(before, after, strict=True)):
-        share = b / (b - a)
-        share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
-        if best is not None:
-            first = w.where(share < best, i, first)
-        best = share if best is None else w.where(share < best, share, best)
-    return first
-
-
-def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and
-    s = 1, the ends of a step h."""
-    m_0, m_1, rise = h * slope_a, h * slope_b, b - a
-    return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
-
-
-def falls_through(w, h, a, slope_a, b, slope_b):
-    """Return the fraction of a step at which the cubic, or else the straight line, falls to zero."""
-    m, A, B = cubic(h, a, slope_a, b, slope_b)
-    s = line = a / (a - b)
-    for _ in range(4):
-        s = s - (a + s * (m + s * (A + s * B))) / (m + s * (2.0 * A + s * (3.0 * B)))
-    left = a + s * (m + s * (A + s * B))
-    return w.where((s > 0.0) & (s < 1.0) & (w.magnitude(left) < 1e-3 * (a - b)), s, line)
-
-
-def trial(w, t, c, step, last, guess) -> tuple:
-    """Return the next trial time in a step of length `step`, and whether the last one is near enough. `t` and
-    `c` are times and values of a bracket. The first trial divides it by the fraction `guess`. With `last` the
-    search ends at a finite value."""
-    eps = w.eps
-    (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
-    width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
-    xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
-    safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (
-        c_2 - c_3
-    )
-    share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
-    share = w.where(w.magnitude(share) < math.inf, share, 0.5)
-    least = w.smaller(tiny / w.magnitude(width), 0.5)
-    # Near in time by the slope, and small relative to the other end: one alone is not enough for flat or
-    # jumping values, nor is the mean slope of the whole step before any trial.
-    slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
-    slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
-    small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (
-        w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2)
-    )
-    zero = w.equal(c_1, 0.0)  # at the event, or beyond it if the value stays zero
-    near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
-    closed = (w.magnitude(width) <= 2.0 * tiny) | last
-    clipped = w.smaller(w.larger(share, least), 1.0 - least)
-    return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
 
 
 class Search(NamedTuple):
@@ -225,37 +138,6 @@ def _follow(
     for name, values in rows.items():
         p.put(f"search_{name}", _each(w, changes, values, p.every(f"search_{name}")))
     return first
-
-
-def is_flat(w, c_dot, slope):
-    """Return whether a value has no slope at its zero, relative to its mean `slope` over the step."""
-    return w.magnitude(c_dot) <= FLAT * slope
-
-
-def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
-    """Return the fraction of a step `h` at which the first value that dips below zero between the
-    ends is lowest; 1 if there is none: p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s =
-    -m_0/(A + sqrt(A^2 - 3 B m_0))."""
-    share = None
-    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
-        m_0, A, B = cubic(h, a, slope_a, b, slope_b)
-        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
-        value = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (m_0 < 0.0) & (h * slope_b > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
-        found = w.where(dips, s, 1.0)
-        share = found if share is None else w.smaller(share, found)
-    return share
-
-
-def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half the fraction of a step `h`, at most a half, for which values
-    rising from zero stay positive."""
-    share = w.number(0.5)
-    for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
-        m, A, B = cubic(h, a, slope_a, b, slope_b)
-        back = m / (w.root(w.larger(A * A - 4.0 * B * m, 0.0)) - A)  # half of the root of m + A s + B s^2
-        share = w.where(sinking & (back > 0.0) & (back < share), back, share)
-    return share
 
 
 def monitored(

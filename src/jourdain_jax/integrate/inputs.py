@@ -1,186 +1,35 @@
 """Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
 
-A function of time is traced in every call that receives it. Captured values (arrays, traced numbers) and
-plain numbers in sums, products, quotients and comparisons become arguments of a program and have derivatives.
-The remaining operations are compared by value. A new function with the same operations but other numbers
-compiles nothing; a function whose globals changed is a new program.
-
-A step evaluates an input only a few times and could miss a short feature at any tolerance. `Sampled`
-inputs are piecewise linear with knots at their sample times. Steps end at knots, so every step has a smooth
-input. Knots may be skipped where the remaining polygon deviates from them by at most
-
-    max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
-
-Knots are chosen greedily: lines from one to the next must pass all knots in between within that distance.
-
-Both steps at a knot evaluate the input there. Each takes derivatives with respect to time and knot times from
-the line on its own side (`SeenFromWithin`), so step ends need not move with the knots.
+Functions become programs (`time_programs.py`); steps end at the knots of samples (`input_knots.py`).
 """
 
-from collections.abc import Callable, Hashable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.compilation import compiled
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.calculus.reals import (
-    PerLane,
     as_real,
     checked_unless_traced,
     described,
     in_default_precision,
     is_traced,
-    largest,
     real_type,
 )
+from jourdain_jax.integrate.time_programs import FunctionOfTime, for_programs, traced
 from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.program.calls import description
 from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.outside_names import now_read_by
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import checked_samples
 from jourdain_jax.structure.probes import looked_at
 from jourdain_jax.structure.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.structure.structure import structure_of
-
-_TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # differentiable in a nonzero number
-
-
-class TimeProgram:
-    """Operations of a function of time without its numbers; equal if the operations are equal."""
-
-    def __init__(self, closed: ClosedJaxpr, real):
-        taken: list[tuple[Var, Literal]] = []
-
-        def lifted(atoms):
-            return [
-                lift(x) if isinstance(x, Literal) and x.aval.shape == () and x.aval.dtype == real else x
-                for x in atoms
-            ]
-
-        def lift(number: Literal) -> Var:
-            taken.append((Var(number.aval), number))
-            return taken[-1][0]
-
-        jaxpr = closed.jaxpr
-        equations = [
-            e.replace(invars=lifted(e.invars)) if e.primitive.name in _TAKE_NUMBERS else e for e in jaxpr.eqns
-        ]
-        outputs = lifted(jaxpr.outvars)
-        arguments = [*(v for v, _ in taken), *jaxpr.constvars, *jaxpr.invars]
-        self.numbers = np.array([number.val for _, number in taken], real)  # not part of comparisons
-        self.closed = ClosedJaxpr(
-            jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), []
-        )
-        self._key = description(self.closed)
-        self._hash = hash(self._key)
-
-    @property
-    def shapes(self) -> list[tuple[int, ...]]:
-        """Return the shapes of the arguments before the time: plain numbers and captured values."""
-        return [x.shape for x in self.closed.in_avals[:-1]]
-
-    def __call__(self, numbers, held, t):
-        """Return the value at time t; `numbers`: the plain numbers; `held`: the captured values."""
-        given = zip((*numbers, *held, t), self.closed.in_avals, strict=True)
-        return jaxpr_as_fun(self.closed)(*(jnp.asarray(x, like.dtype) for x, like in given))[0]
-
-    def __hash__(self):
-        return self._hash
-
-    def __eq__(self, other):
-        return self is other or (isinstance(other, TimeProgram) and self._key == other._key)
-
-    def does_the_same_as(self, other: "TimeProgram") -> bool:
-        """Return whether both are traces of one known function, ignoring derivative rules."""
-        return self._key == other._key or _without_rules(self._key) == _without_rules(other._key)
-
-
-def _without_rules(described):
-    """Return a description without custom derivative rules."""
-    if not isinstance(described, tuple):
-        return described
-    if (
-        len(described) == 4
-        and isinstance(described[0], Primitive)
-        and described[0].name.startswith("custom_")
-    ):
-        primitive, inputs, parameters, outputs = described
-        kept = tuple(
-            (name, _without_rules(value))
-            for name, value in parameters
-            if isinstance(value, tuple | str | int | None)
-        )
-        return primitive, inputs, kept, outputs
-    return tuple(map(_without_rules, described))
-
-
-class FunctionOfTime(eqx.Module):
-    """Input as a function of time: its operations, their plain numbers, and captured arrays."""
-
-    program: TimeProgram = eqx.field(static=True)
-    numbers: Float[Array, "*lanes numbers"]
-    held: tuple
-
-    def __call__(self, t):
-        """Return the value at time t."""
-        return self.program(self.numbers, self.held, t)
-
-
-def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time with its captured values, or None unless its value is a number; and its
-    shape.
-
-    A function is traced again if it is new, or if a value that it reads has changed (`scene/identity.py`).
-    """
-    try:
-        kept = _trace(function)
-    except TypeError:  # not hashable
-        kept = _Trace()
-    now = (now_read_by(function), real) if kept.again else (None,)
-    if now[0] is not None and kept.now == now:
-        return kept.found
-    closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))
-    found = None
-    if getattr(shape, "shape", None) == ():
-        program = TimeProgram(closed, real)
-        if kept.program is None or not kept.program.does_the_same_as(program):
-            kept.program = program
-        found = FunctionOfTime(
-            kept.program, jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts)
-        )
-    if kept.again and found is not None and not is_traced(found):
-        kept.now, kept.found = now, (found, shape)
-    kept.again = True
-    return found, shape
-
-
-class _Trace:
-    """Last trace of a function, and the values it then read."""
-
-    def __init__(self) -> None:
-        self.again = False
-        self.now: Hashable = None
-        self.found: tuple[FunctionOfTime | None, object] = (None, None)
-        self.program: TimeProgram | None = None
-
-
-@lru_cache(maxsize=64)
-def _trace(function: Callable) -> _Trace:
-    return _Trace()
-
-
-def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
-    """Compile `f` for a set of input programs; the least recently used is dropped."""
-    return lru_cache(maxsize=16)(lambda programs: compiled(f, options))
 
 
 class Sampled(eqx.Module):
@@ -390,91 +239,3 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
                     f"input `{name}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s, but velocity"
                     f" constraints depend on it: {SPEEDS_WOULD_JUMP}"
                 )
-
-
-def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Return the knots (times since `t0`) at which steps must end, of all samples in `holders`, in the order
-    of the motion, without the times `ts`, then at least one infinite time. None without samples."""
-    samples = [
-        x
-        for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled))
-        if isinstance(x, Sampled) and len(x.ts) > 1
-    ]
-    if not samples:
-        return None
-    t1, ts = jax.lax.stop_gradient((t1, ts))
-    direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
-    # tolerance of the polygon relative to the range of values; times nearer than 1e-12 of the span coincide
-    share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
-    # the choice of knots has no derivative, but their times do
-    since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
-    ends = jnp.sort(
-        jnp.concatenate(
-            [(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]
-        )
-    )
-    number = jax.lax.stop_gradient(since)
-    after = jnp.clip(jnp.searchsorted(ends, number), 1, len(ends) - 1)
-    is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
-    since = jnp.sort(jnp.where(is_end | (number < 0) | (number > span), jnp.inf, since))
-    number = jax.lax.stop_gradient(since)
-    repeated = jnp.concatenate([jnp.zeros(1, bool), number[1:] - number[:-1] <= near])
-    return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
-
-
-def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return the knots at which steps must end, for lines that differ by at most `share` of the range."""
-    t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
-    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
-
-    def next_knot(carry, here):
-        t_a, v_a, t_b, v_b, low, high = carry  # anchor, last knot, range of slopes that pass all knots since
-        t_k, v_k = here
-        slope = (v_k - v_a) / (t_k - t_a)
-        straight = (slope >= low) & (slope <= high)
-        t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
-        least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
-        low, high = (
-            jnp.where(straight, jnp.maximum(low, least), least),
-            jnp.where(straight, jnp.minimum(high, most), most),
-        )
-        return (t_a, v_a, t_k, v_k, low, high), ~straight
-
-    start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
-    _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
-    # `bent` at a knot marks the one before as a step end
-    return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
-
-
-class SeenFromWithin(eqx.Module):
-    """Sampled input within one step: at a knot it continues the line of this step."""
-
-    sampled: Sampled
-    middle: PerLane  # middle of the step, s; infinite if there is none
-
-    def __call__(self, t):
-        """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
-        ts, values = self.sampled.ts, self.sampled.values
-        at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
-        # shift t towards the middle of the step, by 2.0**-10 of the distance, to select the side of a knot
-        at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
-        k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
-        after = jnp.minimum(k + 1, len(ts) - 1)
-        on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (
-            values[after] - values[k]
-        )
-        return jnp.where(at < knots[0], values[0], jnp.where(at > knots[-1], values[-1], on_line))
-
-
-def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples continued within the step around this time (s; infinite: no step)."""
-
-    def within(channel):
-        sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel
-        return (
-            SeenFromWithin(sampled, jax.lax.stop_gradient(middle))
-            if isinstance(sampled, Sampled)
-            else channel
-        )
-
-    return Inputs(tuple(within(channel) for channel in inputs.channels))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import PerLane
-from jourdain_jax.integrate.inputs import seen_from_within
+from jourdain_jax.integrate.input_knots import seen_from_within
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField, Watched
 
 

@@ -21,15 +21,16 @@ from jourdain_jax.integrate.arrays.array_functions import joined
 from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.explicit_steps import Method, method_of
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
+from jourdain_jax.integrate.inputs import Inputs, Mode, Sampled, in_phases
 from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.handover import Start
-from jourdain_jax.integrate.loop.lanes import Form
-from jourdain_jax.integrate.loop.loop import OF_SAMPLES, flow
+from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, flow
 from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import driven, may_jump
 from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved
+from jourdain_jax.integrate.time_programs import FunctionOfTime
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered_equations import Lowered

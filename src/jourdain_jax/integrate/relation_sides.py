@@ -1,6 +1,7 @@
 """Sides of relations (`lowering/sides.py`) at a start, and when a number leaves zero."""
 
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, Number, StepWriter, each_row
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_row
 from jourdain_jax.integrate.loop.transitions import slowest
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module, eps_of
+from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
-from jourdain_jax.integrate.inputs import knots_between
-from jourdain_jax.integrate.state_projection import State, Usual
+from jourdain_jax.integrate.input_knots import knots_between
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference

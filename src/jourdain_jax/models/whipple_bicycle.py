@@ -157,10 +157,7 @@ class WhippleBicycle(Scene):
         """Return shapes: bars from the hubs to the steer axis for frame and fork; the rider's mass centre as
         a ball.
         """
-        on_axis = lambda z: (
-            self.w + self.c + z * jnp.tan(self.lam),
-            z,
-        )
+        on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)
         head, top, hub, saddle = (
             on_axis(-2.1 * self.rF),
             on_axis(-2.6 * self.rF),

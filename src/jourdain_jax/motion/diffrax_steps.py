@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, PyTree
 from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE
 from jourdain_jax.calculus.derivatives import by_modes
 from jourdain_jax.calculus.reals import at_index, static
-from jourdain_jax.integrate import event_search, integrands, result_codes
+from jourdain_jax.integrate import event_values, integrands, result_codes
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
 from jourdain_jax.integrate.own_steps import reason_against_watching
@@ -211,7 +211,7 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
     w = ArrayWriter(t0)
     step = w.eps**0.25 * (t1 - t0)
     values, along = jax.jvp(moved, (jnp.zeros_like(t0),), (jnp.full_like(t0, 0.5),))
-    sunk, sinks = event_search.at_start(w, values, along, moved(step / 2), step, jnp.sign(t1 - t0), t1 - t0)
+    sunk, sinks = event_values.at_start(w, values, along, moved(step / 2), step, jnp.sign(t1 - t0), t1 - t0)
     each = zip(sunk, sinks, along, strict=True)
     return jnp.stack([below | (falls & ~(rate * step > 0.0)) for below, falls, rate in each])
 

@@ -2,19 +2,7 @@
 
 Both return the states at the saved times, which of them were reached, and where and why the motion ended.
 Speeds are then computed, and everything is returned as a `Trajectory`.
-
-Two further checks set result codes, also inside `jit` and for each sample of a batch.
-
-*Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about
-`atol + rtol |y|` per step in each number y of the state. If errors of this size in all numbers change the
-energy by dE, N steps change it by about N dE, and round-off by about N eps of it. Over all models, at
-tolerances from 1e-4 to 1e-11, no drift exceeded half of N dE. A drift of ten times N dE and at least 1 % of
-the varying energy therefore means an error, such as an unnoticed singular position.
-
-*Constraints.* Redundant constraints that the start satisfies may contradict each
-other later, unless phi_0 = 0:
-
-    A u + phi_0 = 0,   rank A < number of rows:   an omitted constraint holds only if phi_0 is in the range of A
+Drift of energy and constraints sets further result codes (`drift.py`).
 """
 
 from collections.abc import Callable
@@ -28,18 +16,24 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.compilation import RUN_SELDOM
 from jourdain_jax.calculus.markers import entered, lanes_first, left
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, at_index, eps_of, in_default_precision
-from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
-from jourdain_jax.integrate.implicit_steps import FixedStepMethod
-from jourdain_jax.integrate.inputs import Inputs, Mode, for_programs, in_phases
+from jourdain_jax.integrate.inputs import Inputs, Mode, in_phases
 from jourdain_jax.integrate.loop import native_motion, value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved, times_fit
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
-from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant, Integrated
+from jourdain_jax.integrate.time_programs import for_programs
+from jourdain_jax.integrate.vector_fields.field import ByProgram
 from jourdain_jax.kernels.scalar_program import unsupported
-from jourdain_jax.motion.trajectories import diagnostics
+from jourdain_jax.motion.drift import (
+    MOST_STEP_ERRORS,
+    conserves,
+    energies_near,
+    energy_lost,
+    rows_violated,
+    step_errors,
+)
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases
 from jourdain_jax.scene.modes import Modes
@@ -188,7 +182,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
             jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)),
             pivot,
             (at.t, y),
-            _step_errors(setup, free, y) if puts_back else None,
+            step_errors(setup, free, y) if puts_back else None,
         )
 
     # append start and end to the saved states, so that this is compiled once
@@ -288,15 +282,6 @@ def _phases(
     )
 
 
-def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
-    """Return the distance by which a projection moved a state from `free` to `y`, in tolerances of a step."""
-    rtol, atol = setup.tolerances
-    parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
-    return jnp.max(
-        jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts])
-    )
-
-
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     """Check parameters, bodies, contacts and the start. A faulty sample gets a NaN
     start, so that it ends at once.
@@ -335,65 +320,3 @@ def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     code = jnp.where(finite(start.q, start.u), code, result_codes.BAD_START)
     code = jnp.where(begun.timely, code, result_codes.BAD_TIMES)
     return jnp.where(begun.right, code, result_codes.BAD_PARAMETER).astype(jnp.int32)
-
-
-MOST_STEP_ERRORS = 10  # times the change from N steps at their tolerance
-
-
-def conserves(setup: Setup) -> bool:
-    """Return whether T + V is constant along a motion with step-size control.
-
-    False if work is integrated, because it may be a small difference of large powers whose errors
-    step-size control does not bound.
-    """
-    return (
-        setup.field.conserves
-        and all(setup.field.stops)
-        and not isinstance(setup.integrator.solver, FixedStepMethod)
-    )
-
-
-def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
-    """Return T and V (J) at states, and again with each coordinate and speed increased by
-    the possible error of a step.
-    """
-    field, scene, inputs, fixed, _ = args
-    rtol, atol = setup.tolerances
-    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
-    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
-    at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))
-    # loads of dense matrices may be callbacks without batching
-    found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
-    return found.reshape(2, -1, 2)
-
-
-def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
-    """Return whether T + V changed by more than the errors of N `steps` explain."""
-    at, off = energies
-    T, V = at.T
-    E, error = T + V, jnp.sum(jnp.abs(off - at) + eps_of(at) * jnp.abs(at), axis=1)
-    most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # ignores NaN
-    return most[4] + most[5] > jnp.fmax(
-        diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3]
-    )
-
-
-def rows_violated(
-    setup: Setup,
-    t: Float[Array, "times"],
-    q: Float[Array, "times coordinates"],
-    u: Float[Array, "times speeds"],
-) -> Flag:
-    """Return whether some constraint is violated at some of these states, ignoring unreached ones (NaN).
-
-    |phi| > 1 % of max over time of (|phi - A u| + |A| |u|)
-    """
-    scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
-
-    def left_and_size(state):
-        phi, A = linearised_rows(scene, *state, inputs(state[0]))
-        return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
-
-    left, size = jax.lax.map(left_and_size, states)  # constraints may be callbacks without batching
-    # 1 % is far more than steps at loose tolerances leave
-    return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

@@ -27,12 +27,13 @@ from jourdain_jax.calculus.reals import (
     real_type,
 )
 from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import DOPRI8, TSIT5, Method, Taylor, diffrax, order_for
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.integrate.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.integrate.own_steps import own_steps
 from jourdain_jax.integrate.setup import LONGEST, MEMORY, Setup, times_fit
-from jourdain_jax.integrate.state_projection import State, Usual
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options

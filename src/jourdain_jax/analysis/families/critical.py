@@ -1,18 +1,17 @@
-"""Eigenvalues and special points of steady motions as functions of the scene's parameters p, by the implicit
-function theorem.
+"""Special points of steady motions as functions of the scene's parameters p, by the implicit function theorem.
 
-    eigenvalue s     ds = y' dF x,    F x = s x,  y' F = s y',  y' x = 1,    dF with the change of the steady motion, J dz = -R_p dp
-    special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
+    G(X, p) = 0,   dX = -G_X+ G_p dp,   X = (z, a, b, w)
+    G = ( R,  C a,  C b,  F (a b) - (a b) S(w),  size and phase of a and b )
 
-    F (a b) = (a b) S(w)         pair on the imaginary axis: F (a + i b) = i w (a + i b);   double root: F a = w a, F b = w b + a;
-                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that
-                                 continue at the same parameters
+    pair on the imaginary axis   F (a + i b) = i w (a + i b)
+    double root                  F a = w a,  F b = w b + a
+    zero eigenvalue              F a = 0,  F b = 0, with b along the steady motions that continue at the same
+                                 parameters
 
-R, J, F, C, z: as in `equations.py`. G and its derivatives are one scalar program. It has redundant,
+R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue. G and its derivatives are one scalar program. It has redundant,
 consistent rows: G_X has full column rank, and its pseudo-inverse is computed by Q R.
 """
 
-from functools import cached_property
 from itertools import combinations
 
 import equinox as eqx
@@ -21,20 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, Look, SteadyEquations, numbered
+from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyEquations
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
-from jourdain_jax.analysis.families.special_points import SURE
+from jourdain_jax.analysis.families.special_program import SpecialProgram, program_of
 from jourdain_jax.analysis.families.spectrum import null_space
-from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Indices, largest, static
+from jourdain_jax.calculus.reals import largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
-from jourdain_jax.program.derivative import derivatives
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
-from jourdain_jax.scene.identity import once_per_class
-from jourdain_jax.scene.names import Labels, as_names
-from jourdain_jax.scene.parameter_fields import parameters_of
-from jourdain_jax.scene.printing import Printed, complex_numbers, table
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.printing import Printed, complex_numbers
 from jourdain_jax.scene.scene import Scene
 
 Unknowns = Float[Array, "all_unknowns"]
@@ -50,108 +44,6 @@ SHAPES = {
     ZERO: ((0, 0, 0, 0),) * 2,
     DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0)),
 }  # S = w (first) + (second), by rows
-
-
-class Sensitivities(Printed, eqx.Module):
-    """Derivatives of one eigenvalue with respect to every parameter; `found["c"]` is one of them. They
-    include the effect of the change of the steady motion.
-    """
-
-    mode: str = static()
-    eigenvalue: complex  # 1/s
-    condition: float  # |y' x| of unit left and right vectors: zero at a double root, which has no derivative
-    by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
-    code: int
-    held: Labels = static()  # quantities that identify the motion and keep their values
-
-    def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
-        """Return the derivative with respect to a parameter."""
-        return self.by_parameter[name]
-
-    def _text(self) -> str:
-        head = (
-            f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g},"
-            f" {MEANINGS[self.code]}"
-        )
-        rows = [
-            (name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()
-        ]
-        return "\n".join(
-            [head, f" derivatives at constant {', '.join(self.held) or 'nothing'}:", *table(rows)]
-        )
-
-
-@of_known_numbers
-def sensitivities(
-    small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels
-) -> Sensitivities:
-    """Return derivatives of the eigenvalue s of small motions about a steady state with respect to all
-    parameters, by two reverse passes.
-    """
-    scene, state, f = small
-    equations = SteadyEquations(
-        scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f)
-    )
-    z = equations.start
-    look = equations(z)
-    if not largest(look.R) < 1e-6:
-        raise ValueError(
-            f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no "
-            "derivatives; find a steady one by `jj.steady`"
-        )
-    fixed = _held(equations, look, as_names(held))
-    (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
-    apart = np.abs(values - s)
-    x, y = right[:, np.argmin(apart)], left[:, np.argmin(np.abs(same - s))]
-    condition = float(np.abs(y @ x))
-    single = condition > 1e-6 and np.partition(np.append(apart, np.inf), 1)[1] > SURE * (1 + abs(s))
-    y = y / (y @ x)
-
-    program = _program(equations)
-    X, zero = np.concatenate([equations.at(z), x.real, x.imag, np.zeros(4)]), np.zeros(len(look.R), complex)
-
-    def pulled(of_rows, of_rates):
-        """Return derivatives of `of_rows . R + of_rates . F x` with respect to all numbers."""
-        weights = np.concatenate([of_rows, of_rates, 1j * of_rates])
-        real, imag = (np.asarray(program.pulled(X, part)) for part in (weights.real, weights.imag))
-        return (real + 1j * imag)[: len(equations.given)]
-
-    by_all = pulled(zero, y)
-    inverse = np.linalg.pinv(np.vstack([look.J, np.eye(len(z))[fixed]]), rcond=1e-9)
-    by_all = by_all + pulled(-(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)], 0 * y)
-    if not single:
-        by_all = by_all * np.nan
-    at = numbered(scene)
-    by_parameter = {
-        name: np.reshape(by_all[getattr(at, name) :][: np.size(value)], np.shape(value))
-        for name, value, _ in parameters_of(scene)
-    }
-    return Sensitivities(
-        mode,
-        s,
-        condition,
-        by_parameter,
-        FOUND if single else SINGULAR,
-        tuple(equations.unknowns[k] for k in fixed),
-    )
-
-
-def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
-    """Return the unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise
-    speeds in their order, then coordinates.
-    """
-    beside = null_space(look.J)
-    count, speeds = beside.shape[1], equations.scene.speed_names.entries
-    chosen: list[int] = []
-    for k in map(equations.index, named or sorted(equations.unknowns, key=lambda name: name not in speeds)):
-        if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
-            chosen.append(k)
-    if not len(chosen) == count >= len(named):
-        raise ValueError(
-            f"the steady motions near this one have {count} freedoms; name {count} quantities "
-            f"in `held` that distinguish them ({', '.join(named)} do not)"
-        )
-    return chosen
 
 
 class CriticalPoint(Printed, eqx.Module):
@@ -190,52 +82,13 @@ class CriticalPoint(Printed, eqx.Module):
         )
 
 
-class _Program:
-    """Three quantities with their derivatives: R, the residual of `F (a b) = (a b) S`; C a; and C b. They are
-    functions of all numbers, a, b, and S (by rows).
-    """
-
-    def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
-        graph, (rows, rates, states, of_states, places) = instant.graph, of
-        x, m = [instant.columns[k] for k in states], len(states)
-        given = [graph.input(f"special {k}", True) for k in range(2 * m + 4)]
-        a, b, S = given[:m], given[m:-4], given[-4:]
-        moved, nodes, beside = [instant.v[k] for k in (*rates, *of_states)], [instant.v[k] for k in rows], []
-        for direction, p, q in ((a, S[0], S[2]), (b, S[1], S[3])):
-            found = derivatives(graph, moved, dict(zip(x, direction, strict=True)))
-            nodes += [
-                graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d)))
-                for f, c, d in zip(found, a, b, strict=False)
-            ]
-            beside += found[m:]
-        nodes, variables = [*nodes, *beside], [*instant.given, *given]
-        self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
-        self.values, self.rows = differentiable(graph, nodes, variables), len(nodes)
-        self.pulled = jax.jit(
-            lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows))[: self.rows])[0]
-        )
-
-    @cached_property
-    def of(self) -> Sloped:
-        """Return values of the equations with derivatives, from z, a, b and S."""
-        return Sloped(*self._sloped)
-
-
-def _program(equations: SteadyEquations) -> _Program:
-    of = equations.rows, equations.rates, equations.states, equations.of_states, equations.places
-    return _program_of(equations.scene, equations.instant, tuple(tuple(part.tolist()) for part in of))
-
-
-_program_of = once_per_class(_Program)
-
-
 class Special(eqx.Module):
     """The equations of a special point, and the family's point from which it is followed as parameters
     change.
     """
 
     equations: SteadyEquations = static()
-    program: _Program = static()
+    program: SpecialProgram = static()
     kind: str = static()
     X: Unknowns
 
@@ -438,4 +291,4 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
         a = np.linalg.svd(moved)[2][-1]
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
-    return Special(equations, _program(equations), point.kind, X)
+    return Special(equations, program_of(equations), point.kind, X)

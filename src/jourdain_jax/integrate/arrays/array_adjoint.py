@@ -19,7 +19,8 @@ from jourdain_jax.calculus.reals import Count
 from jourdain_jax.integrate.arrays.array_loop import Going, Loop, numbers
 from jourdain_jax.integrate.event_search import MOST_STEPS
 from jourdain_jax.integrate.explicit_steps import Method
-from jourdain_jax.integrate.loop.adjoint import event_back, is_located, step_back
+from jourdain_jax.integrate.loop.adjoint import step_back
+from jourdain_jax.integrate.loop.event_adjoint import event_back, is_located
 from jourdain_jax.integrate.loop.handover import Start
 from jourdain_jax.integrate.loop.lanes import Lanes
 from jourdain_jax.integrate.loop.record import Slot

@@ -18,9 +18,10 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.integrate import integrands
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter, Pointer, Rows
-from jourdain_jax.integrate.event_search import chosen
+from jourdain_jax.integrate.event_values import chosen
 from jourdain_jax.integrate.inputs import Constant, Inputs, Mode
-from jourdain_jax.integrate.loop.lanes import Form, copied, each_row
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import copied, each_row
 from jourdain_jax.integrate.vector_fields.field import Integrated
 
 

@@ -24,8 +24,9 @@ from jourdain_jax.integrate.arrays.implicit_stages import tried_by_equations
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
+from jourdain_jax.integrate.loop.form import CONTROL, Form
 from jourdain_jax.integrate.loop.handover import Found, Start, constant_rows
-from jourdain_jax.integrate.loop.lanes import CONTROL, Form, Lanes
+from jourdain_jax.integrate.loop.lanes import Lanes
 from jourdain_jax.integrate.loop.step import IDLE, step, tried_by_stages
 
 

@@ -21,25 +21,19 @@ from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.handover import Found, Start
-from jourdain_jax.integrate.loop.loop import differentiated
-from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start, moved
+from jourdain_jax.integrate.loop.loop_function import differentiated
+from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start
+from jourdain_jax.integrate.loop.time_shift import moved
 from jourdain_jax.integrate.setup import Begun, Setup
 from jourdain_jax.integrate.vector_fields.field import Integrated
 
 
 def loop_of(
-    method: Method | ImplicitMethod,
-    setup: Setup,
-    begun: Begun,
-    of_events: dict[str, Any],
+    method: Method | ImplicitMethod, setup: Setup, begun: Begun, of_events: dict[str, Any]
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion. `of_events`: the events of the form."""
     goals, knots, field, y0 = setup.goals(setup.ts), setup.knots, setup.field, begun.y0
-    args, most, eps = (
-        integrands.within(goals[0], begun.args),
-        setup.most_steps(knots),
-        float(eps_of(y0.q)),
-    )
+    args, most, eps = (integrands.within(goals[0], begun.args), setup.most_steps(knots), float(eps_of(y0.q)))
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
     modes = modes_at_start(setup.inputs)

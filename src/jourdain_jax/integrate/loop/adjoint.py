@@ -7,9 +7,7 @@ pass, with a fixed step size,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
 
-and if a motion ended at a stop event, at the time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, first
-
-    s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
+and before that, if a motion ended at a stop event, over the event (`event_adjoint.py`).
 
 In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by
 cotangents of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g'
@@ -18,7 +16,6 @@ Its change is d(dS)/dx, where dS is the sum of states times g' and of their tang
 are g' for the states and g for their tangents.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -31,11 +28,12 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.event_search import RUNNING, chosen, slope_is_flat
+from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.loop.event_adjoint import write_event_back, write_transition_back
+from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.handover import Start, constant_rows
 from jourdain_jax.integrate.loop.lanes import (
-    Form,
     Lanes,
     MachineWriter,
     Number,
@@ -45,24 +43,15 @@ from jourdain_jax.integrate.loop.lanes import (
     each_row,
     set_goal,
 )
-from jourdain_jax.integrate.loop.loop import (
-    COUNT,
-    MOST_KERNELS,
-    TIMES,
-    begin_lane,
-    goal_of,
-    with_tangents,
-    write_functions,
-    write_job,
-)
+from jourdain_jax.integrate.loop.loop import COUNT, TIMES, begin_lane, goal_of, write_functions, write_job
+from jourdain_jax.integrate.loop.loop_function import MOST_KERNELS, with_tangents
 from jourdain_jax.integrate.loop.rate_functions import write_pulled
-from jourdain_jax.integrate.loop.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
+from jourdain_jax.integrate.loop.record import GOALS, TO_STATES, Slot, prepare, write_record
 from jourdain_jax.integrate.loop.samples import pass_knot
 from jourdain_jax.integrate.loop.step import near_rank_loss, put_near_rows, squares_of, weighted
-from jourdain_jax.integrate.loop.transitions import is_noted, reset_back, write_reset_back
+from jourdain_jax.integrate.loop.transitions import write_reset_back
 from jourdain_jax.integrate.loop.value_kernels import called
-from jourdain_jax.kernels.ffi import OfLane, of_lane, taken_in, write_handler
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ffi import of_lane, write_handler
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
@@ -79,10 +68,10 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
         _write_project_back(w, form)
     _write_step_back(w, form, method, len(asked))
     if form.has_events:
-        _write_event_back(w, form, len(asked))
+        write_event_back(w, form, len(asked))
     if form.goes_on:
         write_reset_back(w, form, asked)
-        _write_transition_back(w, form, len(asked))
+        write_transition_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), memory, job)
         w.give(w.null)
@@ -268,114 +257,6 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
         for number, q_moves in reversed(list(enumerate(moves))):
             w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
             copied(w, count, out, g)
-
-
-def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `event_back(job, state, who, g, by_known)`, which calls the Python function `event_back` with
-    cotangents of the end's time from the job.
-    """
-    with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
-        located = is_located(w, Lanes(w, form, state))
-        with w.when(w.any(located)):
-            g_t = w.room(1 + len(form.moving))
-            with w.each_lane() as lane:
-                number = w.load(who, lane, "i64")
-                end = _cotangents_of_end(w, form, job, w.where(number >= 0, number, 0))
-                taken_in(w, 1 + len(form.moving), end.after(form.integrated), g_t, lane)
-            event_back(w, form, asked, state, located, g_t, g, by_known)
-
-
-def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `reset_back(job, state, who, left, g, by_known)`, which calls the Python function `reset_back`
-    with cotangents of the transition's time from the job.
-    """
-    with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
-        lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
-        w.store(w.where(is_noted(w, form, w.load(left)), w.load(left), 0.0), numbers)
-        each_row(w, 1 + len(form.moving), g_t, lambda i: 0.0)
-        with w.each_lane() as lane:
-            number = w.load(who, lane, "i64")
-            with w.when(w.load(numbers, lane, "double").differs(0.0) & (number >= 0)):
-                passed = lanes.of("passed", lane) - 1.0
-                lanes.set("passed", lane, passed)
-                with w.when(passed < float(form.transitions)):
-                    end, first = (
-                        _cotangents_of_end(w, form, job, number),
-                        w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving)),
-                    )
-                    for part in range(1 + len(form.moving)):
-                        g_of = w.load(end.place(first + part * form.transitions), type="double")
-                        w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))
-        reset_back(w, form, asked, state, left, g_t, g, by_known)
-
-
-def _cotangents_of_end(w: MachineWriter, form: Form, job: Value, lane: Value) -> OfLane:
-    """Return the cotangents of the end of a sample and of the times of its transitions."""
-    return of_lane(w, w.load(job, TO_ENDS, "ptr"), w.load(job, COUNT, "i64"), form.ends, lane)
-
-
-def is_located(w: StepWriter, lanes: Lanes) -> Number:
-    """Return which lanes ended at an event located by a search."""
-    return w.equal(lanes["code"], result_codes.EVENT) & (lanes["accepted"] > 0.0)
-
-
-def event_back(
-    w: StepWriter,
-    form: Form,
-    asked: int,
-    state: Number,
-    located: Number,
-    g_t: Number,
-    g: Number,
-    by_known: Number,
-) -> None:
-    """Turn cotangents of a state at a fixed time into cotangents at the time and state of an event."""
-    lanes, count = Lanes(w, form, state), form.integrated
-    f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
-    values, rates, weights = (w.room(form.events) for _ in range(3))
-    t = lanes["t"]
-    w.run("rates", state, t, state, f, pivots)
-    if form.moving:  # the tangent and its rates at a fixed time
-        dy, dt = w.at(state, form.y), lanes["dt"]
-        each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(w.differs(dt, 0.0), dt * w.load(f, i), 0.0))
-        lanes["dt"] = w.number(0.0)
-        w.run("rates", state, t, state, f, pivots)
-    w.run("events", state, t, state, f, values, rates)
-    rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(form.events)])
-    usable = located & w.differs(rate, 0.0) & (w.magnitude(rate) < math.inf)
-    each_row(w, asked + 1, added, lambda i: 0.0)
-    total = w.load(g_t)
-    if form.moving:
-        total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
-    for i in range(count):
-        total = w.fma(w.load(g, i), w.load(f, i), total)
-    flat = located & slope_is_flat(w, lanes, rate) & w.differs(total, 0.0)
-    by_value = w.where(usable & ~flat, -total / rate, 0.0)
-    for i in range(form.events):
-        w.store(w.where(w.equal(lanes["event"], i), by_value, 0.0), weights, i)
-    w.run("pull_events", state, t, state, weights, out, added)
-
-    def with_event(before: Number, more: Number) -> Number:
-        return before + w.where(flat, math.nan, w.where(usable, more, 0.0))
-
-    each_row(w, count, g, lambda i: with_event(w.load(g, i), w.load(out, i)))
-    each_row(w, asked, by_known, lambda i: with_event(w.load(by_known, i), w.load(added, i)))
-
-
-def _moved_back(
-    w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int
-) -> Number:
-    """Return the time derivative of an event's contribution to a tangent. It changes the cotangents `g` of
-    the state and adds to the others.
-    """
-    (g, g_dt), (out, added) = cotangents, rooms
-    given, count = w.room(form.integrated + 2), form.integrated
-    copied(w, count, g, given)
-    w.store(g_dt, given, count)
-    w.store(lanes["event"], given, count + 1)
-    w.run("pull_moved", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
-    each_row(w, count, g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
-    return w.load(added, asked)
 
 
 @lru_cache(maxsize=MOST_KERNELS)

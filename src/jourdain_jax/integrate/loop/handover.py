@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.integrate.event_search import RUNNING
-from jourdain_jax.integrate.loop.lanes import PROGRESS, Form
+from jourdain_jax.integrate.loop.form import PROGRESS, Form
 
 Numbers = tuple[PerLane, ...]  # one number per row
 

@@ -1,45 +1,26 @@
-"""The loop over steps in machine code, as a function of JAX: from starts and times
-to save, to states and ends.
+"""The loop over steps in machine code: from starts and times to save, to states and ends.
 
 Lanes run in several threads, in the widest registers. When a sample has ended, the next one takes its lane. A
 single motion runs in narrow registers, whose instructions are faster. Results do not depend on the width. A
 call takes two arrays with one row per sample: the rows of `Form.given`, and the times to save. It returns the
 states at these times, and the rows of the final progress with the number of times reached in order. Tables
 and knots of sampled inputs come first (`samples.py`).
-
-The derivative of a motion is a motion of states with their tangents. The loop itself finds the tangent of an
-event's time; all other times are numbers (`native_motion.py`). Tolerances and the first step have no
-derivative, nor have samples.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import lru_cache, partial
 from itertools import groupby
 
-import jax
-import jax.numpy as jnp
-
-from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
-from jourdain_jax.calculus.derivatives import filled, is_zero
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
-from jourdain_jax.integrate.loop.handover import Found, Start, constant_rows
+from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import (
-    Form,
     Lanes,
     MachineWriter,
     arguments_of_samples,
     room_of_lanes,
     set_goal,
 )
-from jourdain_jax.integrate.loop.rate_functions import (
-    check_derivatives,
-    write_events,
-    write_projection,
-    write_rates,
-)
+from jourdain_jax.integrate.loop.rate_functions import write_events, write_projection, write_rates
 from jourdain_jax.integrate.loop.samples import (
     WORDS_OF_SAMPLES,
     begin_samples,
@@ -48,9 +29,8 @@ from jourdain_jax.integrate.loop.samples import (
     write_sampled_inputs,
 )
 from jourdain_jax.integrate.loop.step import IDLE, write_step
-from jourdain_jax.integrate.loop.taylor import TaylorSteps, products
+from jourdain_jax.integrate.loop.taylor import TaylorSteps
 from jourdain_jax.integrate.loop.transitions import write_reset
-from jourdain_jax.integrate.loop.value_kernels import called
 from jourdain_jax.kernels.ffi import (
     Given,
     OfLane,
@@ -65,8 +45,6 @@ from jourdain_jax.kernels.ffi import (
     write_handler,
 )
 from jourdain_jax.kernels.ir_value import Value
-
-Loop = Callable[[Start], Found]
 
 # Words of a job, shared by all threads: number of samples, number of times, index of the next sample, size of
 # a kernel's scratch memory in doubles (`ffi.py`), on a GPU a pointer to the shared rows and the number of
@@ -335,93 +313,3 @@ def _save(
         handed_out(w, form.returned, lanes.pointer, lane, end)
         w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end.place(form.returned))
         w.run("begin", job, lanes.pointer, who, lane)
-
-
-MOST_KERNELS = 64  # number of cached kernels; their machine code lives as long as the process
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
-    """Return the kernel of the integrated form, by a tableau or by Taylor series of an order."""
-    steps = method if order is None else TaylorSteps(order)
-
-    def shapes(*arguments):
-        return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
-
-    run = called(
-        lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form), constant=constant_rows(form)
-    )
-
-    @jax.custom_batching.custom_vmap
-    def motion(start: Start) -> Found:
-        states, end = run(*start.of_samples, (*start.y, *start.numbers()), start.goals)
-        return Found.of(form, states, end[:-1], end[-1:])
-
-    @motion.def_vmap
-    def motions(count, batched: Sequence, start: Start):
-        (given,) = batched
-        found = jax.vmap(
-            motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count
-        )(start)
-        return found.shared(given)
-
-    return motion
-
-
-OF_SAMPLES = (
-    "machine code does not differentiate with respect to samples of an input; use `jj.simulate(...,"
-    ' backend="xla")`'
-)
-
-
-def flow(form: Form, method: Method, order: int | None) -> Loop:
-    """Return the motion by a kernel. `order`: order of a Taylor series, which replaces the tableau."""
-
-    def motion(form: Form) -> Loop:
-        # above 36_000 products of coefficients, Taylor steps with second derivatives
-        # are replaced by the tableau
-        too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
-        return kernel(form, method, None if too_many else order)
-
-    def check(form: Form, along: Start) -> None:
-        if not all(map(is_zero, along.of_samples[:1])):
-            raise DifferentiationModeError(OF_SAMPLES)
-        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
-
-    return differentiated(motion, form, check)
-
-
-def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
-    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`
-    raises an error if that form is not supported.
-    """
-    own = jax.custom_jvp(motion(form))
-
-    @partial(own.defjvp, symbolic_zeros=True)
-    def rule(primals, tangents):
-        (start,), (along,) = primals, tangents
-        check(form, along)
-        raised, more = with_tangents(form, start, along)
-        both = differentiated(
-            motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check
-        )(more)
-        found, d = (
-            Found(*(part[half] for part in both[:4]), both.rest)
-            for half in (slice(len(start.y)), slice(len(start.y), None))
-        )
-        return found, d._replace(rest=jnp.zeros_like(found.rest))
-
-    return own
-
-
-def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
-    """Return the form and the start with these tangents added."""
-    every = (tuple(range(len(start.known[0]))), *form.moving)
-    moves = [[not is_zero(dx) for dx in part] for part in along.known]
-    moving = tuple(
-        tuple(i for i, does in zip(of, part, strict=True) if does)
-        for of, part in zip(every, moves, strict=True)
-    )
-    known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
-    more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
-    return replace(form, moving=(*form.moving, *moving)), more

@@ -1,23 +1,14 @@
-"""One motion by machine code: when it applies, arguments of the kernel, and
-quantities derived from its results.
+"""One motion by machine code: whether machine code applies, arguments of the kernel, and results.
 
-Inputs that are functions of time become part of the scalar program: time and their
-numbers replace their values.
+Inputs that are functions of time become part of the scalar program: time and their numbers replace their
+values. `time_shift.py` has the derivatives with respect to times.
 
     u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
-
-Times may have derivatives. Machine code integrates between fixed times, and states are then shifted along
-their rates to the differentiable times. Let z be the state and all arguments of its rates, and G the rate of
-z. Shifting z by a time d of value zero,
-
-    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to second order
-
-The start is shifted to its fixed time, t_0 - d, the results are shifted forward.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import islice
 from typing import Any
 
@@ -26,26 +17,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import Indices, Scalar, Shape, real_type
 from jourdain_jax.integrate.explicit_steps import Method, code_at_end
-from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
+from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop import taylor
 from jourdain_jax.integrate.loop.adjoint import flow_back
+from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.handover import Found, Start
-from jourdain_jax.integrate.loop.lanes import Form
 from jourdain_jax.integrate.loop.rate_functions import check_derivatives, event_program
 from jourdain_jax.integrate.loop.time_functions import driven
-from jourdain_jax.integrate.loop.value_kernels import values_of_nodes
+from jourdain_jax.integrate.loop.time_shift import moved, rates_of_all
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Passed, Setup, Solved
+from jourdain_jax.integrate.time_programs import FunctionOfTime
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported
-from jourdain_jax.program.derivative import on_its_own
 from jourdain_jax.program.graph import Unsupported
-
-Unknowns = Float[Array, "z"]
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
@@ -78,64 +66,6 @@ def _shapes(channel: FunctionOfTime) -> list[Shape]:
 
 def _each(part, shape: Shape) -> list:
     return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
-
-
-def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return a function of z and a time displacement that shifts z along its `rates`. The value of the
-    displacement is zero: it only carries derivatives.
-    """
-
-    def moving_with_time(slope: Callable) -> Callable:
-        @jax.custom_jvp
-        def same(z, d, v):
-            return v
-
-        @partial(same.defjvp, symbolic_zeros=True)
-        def rule(at, tangents):
-            (z, _, v), (_, dd, dv) = at, tangents
-            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(z, v), dd)
-
-        return same
-
-    along = moving_with_time(lambda z, v: jax.jvp(rates, (z,), (v,))[1])
-    back = moving_with_time(lambda z, g: jax.vjp(rates, z)[1](g)[0])
-
-    def push(arguments, tangents):
-        (z, d), (dz, dd) = arguments, tangents
-        dz = jnp.zeros_like(z) if dz is None else dz
-        return z, along(z, d, dz if dd is None else dz + scaled(rates(z), dd))
-
-    def pull(perturbed, arguments, found, g):
-        (z, d), (_, varies) = arguments, perturbed
-        g = back(z, d, g)
-        return g, jnp.sum(scaled(rates(z), g)) if varies else None
-
-    return with_rules(lambda z, d: z, Rules(push, pull))
-
-
-def _rates(form: Form) -> Callable[[Unknowns], Unknowns]:
-    """Return the rates of z, which holds the state, time, the known numbers, and the slopes of samples. Rates
-    of the known numbers are zero.
-    """
-    graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
-    fixed, t, y, inputs = form.split(variables)
-    work = [graph.input("work", True)] if form.with_work else []
-    slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
-    z = [*y, *work, t, *fixed, *inputs, *slopes]
-    of_inputs = dict(zip(form.sampled, slopes, strict=True))
-    known = [graph.zero] * len(fixed) + [of_inputs.get(i, graph.zero) for i in range(len(inputs))]
-    return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
-
-
-@jax.custom_jvp
-def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
-    """Return the product, which is zero for a zero factor `by`, whatever the slope."""
-    return jnp.where(by == 0.0, 0.0, slope * by)
-
-
-@scaled.defjvp
-def _scaled_jvp(primals, tangents):
-    return scaled(*primals), scaled(tangents[0], primals[1]) + scaled(primals[0], tangents[1])
 
 
 # Limit on evaluated operations. Measured compile times: 15,000 operations of a chain of 128 trailers in 2.8 s
@@ -256,7 +186,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
     """Return a function that shifts a state at time t along its rates by a time d. The value of d is zero:
     it only carries derivatives.
     """
-    others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(_rates(form))
+    others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(rates_of_all(form))
 
     def moved_by(y, t, d):
         known = known_of(args)

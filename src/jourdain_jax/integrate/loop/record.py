@@ -13,7 +13,8 @@ from typing import NamedTuple
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, copied, each_row, room_of_lanes
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, copied, each_row, room_of_lanes
 from jourdain_jax.integrate.loop.loop import COUNT, NEXT, OWN, STARTS, TIMES
 from jourdain_jax.kernels.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, of_lane, taken_in
 from jourdain_jax.kernels.ir_value import Value

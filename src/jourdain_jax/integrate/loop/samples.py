@@ -8,7 +8,8 @@ input, padded with infinite times. Knots, the times at which steps must end (`in
 shape (rows, knots). Lanes may share them: with T tables, lane i of N uses number i T / N.
 """
 
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter
 from jourdain_jax.kernels.ffi import Given, last_size, product
 from jourdain_jax.kernels.ir_value import Value
 

@@ -33,9 +33,11 @@ import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.event_search import LOCATING, RUNNING, any_of, monitored
+from jourdain_jax.integrate.event_search import LOCATING, RUNNING, monitored
+from jourdain_jax.integrate.event_values import any_of
 from jourdain_jax.integrate.explicit_steps import Aim, Method, aimed, judged, taken
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, Number, StepWriter, copied, each_row
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, copied, each_row
 from jourdain_jax.integrate.loop.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.integrate.relation_sides import first_sides
 

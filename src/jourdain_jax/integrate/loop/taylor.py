@@ -26,7 +26,8 @@ from itertools import combinations
 from typing import NamedTuple
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, stated
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, stated
 from jourdain_jax.integrate.loop.rate_functions import known_values, outputs_of
 from jourdain_jax.kernels.ir_value import Value
 from jourdain_jax.kernels.math_functions import exponential, logarithm

@@ -22,7 +22,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.loop.lanes import Form, Lanes, MachineWriter, Number, StepWriter, copied, each_row
+from jourdain_jax.integrate.loop.form import Form
+from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, Number, StepWriter, copied, each_row
 from jourdain_jax.integrate.loop.rate_functions import Outputs, given_values, known_values
 from jourdain_jax.kernels.ir_value import Value
 from jourdain_jax.kernels.scalar_program import as_real, written_in_turn

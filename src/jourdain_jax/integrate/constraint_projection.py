@@ -1,0 +1,209 @@
+"""Projection of coordinates or of speeds onto the constraints, by machine code if possible, otherwise by XLA.
+XLA also computes the derivatives.
+
+With machine code, constraints and mass matrix are functions that JAX can differentiate: a derivative contains
+two calls instead of the traced scene.
+
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
+    d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs
+                                 J: derived on the graph (`integrate/loop/value_kernels.py`)
+"""
+
+from functools import lru_cache, partial
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.derivatives import differentiated_as
+from jourdain_jax.calculus.reals import Entries, Speeds, rank_cutoff, real_type, static
+from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
+from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.integrate.loop import projection_kernel
+from jourdain_jax.integrate.loop.projection_kernel import Rows, write
+from jourdain_jax.integrate.loop.value_kernels import called, entries, values_of_nodes
+from jourdain_jax.kernels import ffi
+from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.assembly import coordinate_bounds
+from jourdain_jax.structure.probes import coordinates_on_rows
+from jourdain_jax.structure.row_program import RowProgram, row_program
+from jourdain_jax.structure.sampling import NEARLY_INSIDE
+from jourdain_jax.structure.structure import (
+    closure_lengths,
+    plain_row_lengths,
+    structure_whatever_its_faults,
+    usual_rows,
+)
+
+
+class Usual(eqx.Module):
+    """Typical sizes of constraints and coordinates, and properties of the constraints."""
+
+    closures: Float[Entries, "closures"]
+    # in scaled speeds, or in plain speeds if constraints determine the free speeds
+    rows: Float[Entries, "rows"]
+    width: Float[Entries, "coordinates"]  # of the domain
+    # bounds of coordinates that constraints determine; infinite if unbounded
+    low: Float[Entries, "coordinates"]
+    high: Float[Entries, "coordinates"]
+    affine: bool = static()  # constraints are affine in the speeds
+    determined: bool = static()  # constraints determine the free speeds
+    program: RowProgram | None = static()  # program for projection by machine code; None: use XLA
+
+
+def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
+    """Return the sizes for the parameters of a scene; `determined`: as in `Usual`; `native`: whether
+    machine code may project states.
+    """
+    low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
+    width = np.where(high > low, high - low, 1.0).astype(real_type())
+    program = row_program(scene) if native and not ffi.reason_against() else None
+    try:
+        rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
+        # the stated domain, slightly widened, for coordinates on which constraints depend
+        bounded, more = (
+            coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries],
+            NEARLY_INSIDE * (high - low),
+        )
+        low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
+        affine = structure_whatever_its_faults(scene).affine
+        return Usual(
+            closure_lengths(scene),
+            rows,
+            width,
+            low.astype(width.dtype),
+            high.astype(width.dtype),
+            affine,
+            determined,
+            program,
+        )
+    except ValueError:  # the scene is invalid, which is reported when its structure is requested
+        norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
+        return Usual(
+            np.zeros(geometric + norms),
+            np.zeros(len(names_of_rows(scene))),
+            width,
+            -np.inf * width,
+            np.inf * width,
+            False,
+            False,
+            None,
+        )
+
+
+def put_positions(
+    scene: Scene, t, q, free, usual: Usual, known: tuple | None = None
+) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+    """Return the coordinates on the geometric constraints nearest to q, and the residual, without repeating
+    the projection if both are `known`.
+    """
+    if usual.program is not None and not usual.program.g:
+        return q, jnp.zeros(0, q.dtype)
+
+    def by_xla(by: RowFunctions, scene, t, q, free, lengths):
+        near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
+        return near_q, by.closures(by.given(scene), t, near_q)[0]
+
+    given = scene, jnp.asarray(t), q, free, usual.closures
+    if known is None:
+        return _by_either(usual, "positions", False, by_xla)(*given)
+
+    def of_known(_, *given):
+        return by_xla(functions_of_rows(usual), *given)
+
+    return differentiated_as(of_known, lambda known, *_: known)(known, *given)
+
+
+def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:
+    """Return the speeds on the velocity constraints nearest to u, and the residual."""
+    affine, determined = usual.affine, usual.determined
+    if usual.program is not None and not usual.program.phi:
+        return u, jnp.zeros(0, u.dtype)
+
+    def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
+        near_u = project_speeds(
+            scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by
+        )
+        return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
+
+    kind = "determined speeds" if determined else "speeds"
+    return _by_either(usual, kind, affine or determined, by_xla)(
+        scene, jnp.asarray(t), q, u, inputs, free, usual.rows
+    )
+
+
+def functions_of_rows(usual: Usual) -> RowFunctions:
+    """Return the constraint functions for projection by XLA, derivatives and searches."""
+    return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
+
+
+def _by_either(usual: Usual, kind, affine: bool, by_xla):
+    of_rows = partial(by_xla, functions_of_rows(usual))
+    if usual.program is None or (rows := Rows(usual.program, kind, affine)).reason_against():
+        return of_rows
+    return differentiated_as(of_rows, partial(_put, rows))
+
+
+@lru_cache(maxsize=64)
+def _kernel(rows: Rows, given_in: np.dtype):
+    count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
+    return called(lambda w: write(w, rows, cutoff), lambda *_: ((count,),), effort=1)
+
+
+def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
+    """Return the projected quantities and the residual, by machine code."""
+    real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
+    found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
+    return found[: len(rows.moving)], found[len(rows.moving) :]
+
+
+@lru_cache(maxsize=64)
+def row_functions(program: RowProgram) -> RowFunctions:
+    """Return g and G, phi and A, and M, by the program; parts without machine code
+    use automatic differentiation.
+    """
+    nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
+    if (
+        unsupported(program.graph, nodes)
+        or program.graph.operations(nodes) > projection_kernel.LARGEST_PROGRAM
+    ):
+        return BY_AUTODIFF
+    rows, speeds = len(program.phi), len(program.u)
+    closures, coordinates = len(program.g), len(program.q)
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    at = [*parameters, program.t, *program.q]
+
+    def matrix(entries: dict[tuple[int, int], int], rows: int, columns: int) -> list[int]:
+        return [entries.get((i, k), program.graph.zero) for i in range(rows) for k in range(columns)]
+
+    of_closures = values_of_nodes(program.graph, [*program.g, *matrix(program.G, closures, coordinates)], at)
+    of_rows = values_of_nodes(
+        program.graph, [*program.phi, *matrix(program.A, rows, speeds)], [*at, *program.u, *program.inputs]
+    )
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    of_masses = values_of_nodes(program.graph, matrix(M, speeds, speeds), at)
+
+    def parameters_of(scene: Scene):
+        found = entries(scene, program.parameters)
+        return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
+
+    def in_a_row(given, t, *vectors):
+        first = parameters_of(given) if isinstance(given, Scene) else given
+        return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
+
+    def closures_at(given, t, q):
+        found = of_closures(in_a_row(given, t, q))
+        return found[:closures], found[closures:].reshape(closures, coordinates)
+
+    def rows_at(given, t, q, u, inputs):
+        found = of_rows(in_a_row(given, t, q, u, inputs))
+        return found[:rows], found[rows:].reshape(rows, speeds)
+
+    def masses_at(given, t, q):
+        return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
+
+    return RowFunctions(
+        closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of
+    )

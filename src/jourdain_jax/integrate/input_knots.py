@@ -1,0 +1,109 @@
+"""Knots of sampled inputs, at which steps end.
+
+A step evaluates an input only a few times and could miss a short feature at any tolerance. `Sampled`
+inputs are piecewise linear with knots at their sample times. Steps end at knots, so every step has a smooth
+input. Knots may be skipped where the remaining polygon deviates from them by at most
+
+    max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
+
+Knots are chosen greedily: lines from one to the next must pass all knots in between within that distance.
+
+Both steps at a knot evaluate the input there. Each takes derivatives with respect to time and knot times from
+the line on its own side (`SeenFromWithin`), so step ends need not move with the knots.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.calculus.reals import PerLane, largest
+from jourdain_jax.integrate.inputs import Inputs, Sampled
+
+
+def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
+    """Return the knots (times since `t0`) at which steps must end, of all samples in `holders`, in the order
+    of the motion, without the times `ts`, then at least one infinite time. None without samples."""
+    samples = [
+        x
+        for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled))
+        if isinstance(x, Sampled) and len(x.ts) > 1
+    ]
+    if not samples:
+        return None
+    t1, ts = jax.lax.stop_gradient((t1, ts))
+    direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
+    # tolerance of the polygon relative to the range of values; times nearer than 1e-12 of the span coincide
+    share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
+    # the choice of knots has no derivative, but their times do
+    since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
+    ends = jnp.sort(
+        jnp.concatenate(
+            [(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]
+        )
+    )
+    number = jax.lax.stop_gradient(since)
+    after = jnp.clip(jnp.searchsorted(ends, number), 1, len(ends) - 1)
+    is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
+    since = jnp.sort(jnp.where(is_end | (number < 0) | (number > span), jnp.inf, since))
+    number = jax.lax.stop_gradient(since)
+    repeated = jnp.concatenate([jnp.zeros(1, bool), number[1:] - number[:-1] <= near])
+    return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
+
+
+def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
+    """Return the knots at which steps must end, for lines that differ by at most `share` of the range."""
+    t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
+    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
+
+    def next_knot(carry, here):
+        t_a, v_a, t_b, v_b, low, high = carry  # anchor, last knot, range of slopes that pass all knots since
+        t_k, v_k = here
+        slope = (v_k - v_a) / (t_k - t_a)
+        straight = (slope >= low) & (slope <= high)
+        t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
+        least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
+        low, high = (
+            jnp.where(straight, jnp.maximum(low, least), least),
+            jnp.where(straight, jnp.minimum(high, most), most),
+        )
+        return (t_a, v_a, t_k, v_k, low, high), ~straight
+
+    start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
+    _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
+    # `bent` at a knot marks the one before as a step end
+    return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
+
+
+class SeenFromWithin(eqx.Module):
+    """Sampled input within one step: at a knot it continues the line of this step."""
+
+    sampled: Sampled
+    middle: PerLane  # middle of the step, s; infinite if there is none
+
+    def __call__(self, t):
+        """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
+        ts, values = self.sampled.ts, self.sampled.values
+        at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
+        # shift t towards the middle of the step, by 2.0**-10 of the distance, to select the side of a knot
+        at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
+        k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
+        after = jnp.minimum(k + 1, len(ts) - 1)
+        on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (
+            values[after] - values[k]
+        )
+        return jnp.where(at < knots[0], values[0], jnp.where(at > knots[-1], values[-1], on_line))
+
+
+def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
+    """Return `inputs` with samples continued within the step around this time (s; infinite: no step)."""
+
+    def within(channel):
+        sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel
+        return (
+            SeenFromWithin(sampled, jax.lax.stop_gradient(middle))
+            if isinstance(sampled, Sampled)
+            else channel
+        )
+
+    return Inputs(tuple(within(channel) for channel in inputs.channels))
