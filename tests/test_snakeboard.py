@@ -48,18 +48,24 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
         assert relative_error(motion[name], expected[key], size) <= tolerance("closed_form"), name
 
 
-def test_the_default_passes_wherever_a_step_ends_near_the_loss_of_rank():
+def test_a_retry_passes_wherever_a_step_ends_near_the_loss_of_rank():
     # a step that ends within round-off of parallel rows once met a jump of v/(1 - steer) in the accelerations
-    # and shrank to nothing
+    # and shrank to nothing; the scalar program, whose pivot vanishes there, ends and says how to go on
     times = np.linspace(0.0, oracle.RUN["t_end"], 9)
     for beyond in (0.0, 1e-15, 3e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, -1e-13, -1e-11):
         shifted = times + beyond * (np.arange(9) == 4)
-        motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12)
+        motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12, retry=True)
         assert motion.result == results.SUCCESS, beyond
         assert "cutoff 1e-08" in str(motion.reduction)
         assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance(
             "closed_form"
         ), beyond
+
+    alone = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-6, atol=1e-6)
+    assert alone.result == results.STEP_TOO_SMALL
+    assert alone["steer"][4 - 1] < np.pi / 2
+    with pytest.raises(jj.SimulationError, match="where constraints lose rank, pass retry=True"):
+        alone.raise_if_failed()
 
 
 def test_the_loss_of_rank_is_reported_not_hidden():

@@ -200,6 +200,20 @@ def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tm
     assert_same(run(path), whole)
 
 
+@pytest.mark.parametrize(
+    ("samples", "options"), [(10**12, {}), (3 * 10**9, {"keep_every": 1}), (10**13, {"keep_every": 1000})]
+)
+def test_a_study_that_its_disk_cannot_hold_is_refused_before_it_begins(samples, options, tmp_path):
+    many = jj.Study(jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5)}, samples=samples)
+    with pytest.raises(
+        ValueError, match=r"the results take [\d,.]+ GB, and the disk of `.*discs.zarr` has [\d,.]+ GB"
+    ):
+        many.run(
+            tmp_path / "new" / "discs.zarr", t1=1.0, ts=np.linspace(0.0, 1.0, 200), progress=False, **options
+        )
+    assert not os.listdir(tmp_path)
+
+
 def test_a_target_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")

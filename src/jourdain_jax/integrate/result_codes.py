@@ -44,7 +44,7 @@ MESSAGES = {
     ),
     STEP_TOO_SMALL: (
         "the step size shrank to zero near the last time: a singularity, a discontinuity, or "
-        "constraints that cannot be satisfied"
+        "constraints that cannot be satisfied; where constraints lose rank, pass retry=True"
     ),
     NOT_FINITE: (
         "the accelerations are not finite near the last time: a load, pose or constraint is NaN, or "

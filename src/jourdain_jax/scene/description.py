@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.code import functions_in, names_in
 from jourdain_jax.calculus.reals import all_finite, check_kind, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.names import as_names, check_names
-from jourdain_jax.scene.outside_names import functions_in, names_in
 
 METHODS = (
     "bodies",

@@ -17,7 +17,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
-from jourdain_jax.scene.outside_names import is_installed, names_in, names_of
+from jourdain_jax.calculus.code import is_installed, names_in, names_of
 from jourdain_jax.scene.scene import Scene
 
 

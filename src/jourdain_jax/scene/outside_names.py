@@ -13,10 +13,8 @@ of the class, and the global names and variables of enclosing functions that a m
 Values read by helper functions are not tracked. After `clear_caches` every scene is traced again.
 """
 
-import dis
 import enum
 import re
-import sys
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
@@ -24,7 +22,7 @@ from fractions import Fraction
 from functools import lru_cache, partial
 from operator import attrgetter, is_
 from pathlib import PurePath
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -32,10 +30,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.code import attribute, functions_in, is_installed, names_of
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.scene.names import Labels
 
-_VALUES = (
+_EXACTLY = (
     bool,
     int,
     float,
@@ -48,7 +46,6 @@ _VALUES = (
     Fraction,
     Decimal,
     re.Pattern,
-    np.dtype,
 )
 _CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_custom_jvp)
 
@@ -80,36 +77,27 @@ class NamesRead:
         return self, self._version
 
     def _look(self) -> None:
-        content: list[tuple] = []
-        looks: list[Callable] = []
-        sources: dict[
-            Callable, dict[str, None]
-        ] = {}  # the names to read by each: a module is read once for all functions
+        content: list[Hashable] = []
         functions: list[FunctionType] = []
+        readers: dict[Callable, dict[str, str]] = {}  # reader of names -> name -> the method that loads it
         for root in self._roots:
-            members = vars(root) if isinstance(root, type) else {"": root}
-            looks.append(members.values)
-            for name, member in list(members.items()):
-                content.append((name, _key_of(member)))
+            for name, member in (dict(vars(root)) if isinstance(root, type) else {"": root}).items():
+                content.append((name, _key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     functions.append(f)
-                    where = (
-                        f"`{root.__name__}.{name}`"
-                        if name
-                        else f"the function `{f.__qualname__}`"
-                        if self._strict
-                        else ""
-                    )
+                    whose = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
                     for names, read in names_of(f):
-                        found = [*map(read, names)]
-                        if names:
-                            sources.setdefault(read, {}).update(dict.fromkeys(names))
-                        content += [(n, _key_of(x, n, where)) for n, x in zip(names, found, strict=True)]
-                        functions += [x for x in found if isinstance(x, FunctionType)]
-        looks += [partial(map, read, names) for read, names in sources.items()]
+                        known = readers.setdefault(read, {})
+                        known |= {n: known.get(n) or whose * (bool(name) or self._strict) for n in names}
+        for read, names in readers.items():
+            for name, whose in names.items():
+                content.append((name, _key(x := read(name), whose, name)))
+                functions += [x] * isinstance(x, FunctionType)
+        looks: list[Callable] = [vars(root).values for root in self._roots if isinstance(root, type)]
+        looks += [partial(map, read, names) for read, names in readers.items()]
         looks.append(partial(map, attrgetter("__code__"), functions))
         seen = [x for look in looks for x in look()]
-        content.append(tuple(map(_Same, looks[-1]())))
+        content += map(_Same, looks[-1]())
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
         # last, so that a value that raises here raises again at the next call
         self._looks, self._seen = looks, seen
@@ -139,71 +127,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 def is_function(x) -> bool:
     """Return whether it is a function that may read values, rather than a module with numbers."""
-    return isinstance(x, FunctionType | MethodType | partial) or callable(_attribute(x, "__wrapped__"))
-
-
-def is_installed(name: str | None) -> bool:
-    """Return whether a module belongs to Python, to an installed package, or to this one."""
-    top = (name or "").partition(".")[0]
-    if top == "__main__":
-        return False
-    if top == __name__.partition(".")[0] or top in sys.stdlib_module_names:
-        return True
-    file = getattr(sys.modules.get(name or ""), "__file__", None) or ""
-    return "site-packages" in file or "dist-packages" in file
-
-
-def functions_in(member) -> list[FunctionType]:
-    """Return the Python functions in a member of a class, without wrappers of other modules."""
-    found, member = [], member.fget if isinstance(member, property) else member
-    while member is not None and not isinstance(member, type):
-        if isinstance(member, FunctionType) and (
-            member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")
-        ):
-            found.append(member)
-        names = ("__wrapped__", "__func__", "func", "method")  # Equinox stores methods as `method`
-        member = next((inner for name in names if callable(inner := _attribute(member, name))), None)
-    return found
-
-
-def _attribute(x, name: str):
-    """Return an attribute, or None if reading it fails: an object's `__getattr__` may raise any error, and so
-    may an unset variable.
-    """
-    try:
-        return getattr(x, name, None)
-    except Exception:
-        return None
-
-
-def names_of(f: FunctionType) -> tuple[tuple[Labels, Callable[[str], Any]], ...]:
-    """Return the names that a function itself loads, each set with a function that reads one: globals, and
-    variables of enclosing functions (None if not yet set).
-    """
-    # such as a counter of calls
-    written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
-    own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
-    cells = {
-        name: cell
-        for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True)
-        if name not in written
-    }
-    return (own, f.__globals__.get), (tuple(cells), lambda name: _attribute(cells[name], "cell_contents"))
-
-
-@lru_cache(maxsize=4096)
-def names_in(code: CodeType, operations: Labels | None = None) -> frozenset[str]:
-    """Return the names used by code, or by the given instructions only, including attributes and inner
-    functions.
-    """
-    own = frozenset(
-        code.co_names
-        if operations is None
-        else (i.argval for i in dis.get_instructions(code) if i.opname in operations)
-    )
-    return own.union(
-        *(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType))
-    )
+    return isinstance(x, FunctionType | MethodType | partial) or callable(attribute(x, "__wrapped__"))
 
 
 class _Same:
@@ -219,54 +143,47 @@ class _Same:
         return id(self.x)
 
 
-def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
-    """Return the key of a name's value. The key of a value with state is its identity; if `where` is given,
-    raises StatefulError instead.
+def _key(x: Any, whose: str = "", name: str = "") -> Hashable:
+    """Return the key of a value, or of one with state its identity. For the value of a `name` that a method
+    loads (`whose`), raises StatefulError instead.
     """
     try:
-        return key(x)
+        return _content(x)
     except StatefulError:
-        if not where:
+        if not whose:
             return _Same(x)
     what = (
         f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change unnoticed"
     )
+    if is_traced(x):
+        what = "which JAX is tracing (jit, grad, vmap) and which is not a field of the scene"
     raise StatefulError(
-        f"{where} reads `{name}`,"
-        f" {'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what};"
-        f" make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no"
-        " numbers, or replace it by a tuple of numbers"
+        f"{whose} reads `{name}`, {what}; make it a field, `{name}: ... = jj.parameter(...)`, or "
+        "`eqx.field(static=True)` if it holds no numbers, or replace it by a tuple of numbers"
     )
 
 
-def key(x: Any) -> Hashable:
-    """Return a key of a value without state: its type and value. The key of a function, module or class is
-    its identity.
-
-    **Raises** StatefulError for values that may change: arrays, containers, objects.
+def _content(x: Any) -> Hashable:
+    """Return type and value of an object without state; of a module, class or function its identity. Raises
+    StatefulError for values that may change: arrays, containers, objects.
     """
-    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | PurePath):
+    own = getattr(x, "__dict__", None) or {}
+    if type(x) in _EXACTLY or isinstance(x, np.number | np.bool_ | PurePath):
         return type(x), repr(x)
-    parts = _parts(x)
-    if parts is not None:
-        return type(x), tuple(map(key, parts))
-    if _is_constant(x):
-        return _Same(x)
-    raise StatefulError
-
-
-def _parts(x: Any) -> tuple | None:
-    """Return the contents of an immutable container; None for anything else."""
     if isinstance(x, slice):
-        return x.start, x.stop, x.step
-    if isinstance(x, partial):
-        return x.func, x.args, *x.keywords.items()
-    if isinstance(x, tuple | frozenset) and not getattr(x, "__dict__", None):
-        return tuple(x)
-    if isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
-        own = [(field.name, getattr(x, field.name, None)) for field in (fields(x) if is_dataclass(x) else ())]
-        return *own, *getattr(x, "__dict__", {}).items()
-    return None
+        parts = x.start, x.stop, x.step
+    elif isinstance(x, partial):
+        parts = x.func, x.args, *x.keywords.items()
+    elif isinstance(x, tuple | frozenset) and not own:
+        parts = tuple(x)
+    elif isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
+        slots = fields(x) if is_dataclass(x) else ()
+        parts = *own.items(), *((field.name, getattr(x, field.name, None)) for field in slots)
+    elif _is_constant(x):
+        return _Same(x)
+    else:
+        raise StatefulError
+    return type(x), tuple(map(_content, parts))
 
 
 def _is_constant(x: Any) -> bool:
@@ -276,4 +193,4 @@ def _is_constant(x: Any) -> bool:
     if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":
         return True
     # a user's wrapper class may have state
-    return callable(_attribute(x, "__wrapped__")) and is_installed(type(x).__module__)
+    return callable(attribute(x, "__wrapped__")) and is_installed(type(x).__module__)

@@ -1,4 +1,5 @@
-"""A bound on the memory of a process that computes a study: resident memory, and sizes of blocks and chunks.
+"""Bounds on a study: the disk of its folder, and the memory of its processes (resident memory, sizes of blocks
+and chunks).
 
 The need of a process is estimated before it compiles anything, and checked after every block:
 
@@ -12,6 +13,8 @@ trajectories.
 
 import ctypes
 import os
+import shutil
+from pathlib import Path
 from typing import Any
 
 COMPILED = 500e6  # bytes for compilers and compiled programs; the disc takes 220 MB, the bicycle 400 MB
@@ -76,4 +79,16 @@ def check(allowed: int) -> None:
         )
         raise MemoryError(
             f"{text}. Run the study again with more memory, fewer processes, or fewer times `ts`"
+        )
+
+
+def check_disk(path, need: float) -> None:
+    """Raise ValueError if the disk of a folder, which may not exist yet, has less than `need` bytes free."""
+    folder = Path(path).absolute()
+    free = shutil.disk_usage(next(above for above in (folder, *folder.parents) if above.exists())).free
+    if need > free:
+        raise ValueError(
+            f"the results take {need / 1e9:,.1f} GB, and the disk of `{path}` has {free / 1e9:,.1f} GB free; "
+            "take fewer samples, fewer outputs or a larger `keep_every`, save='statistics', or shares "
+            "(`shard`) on several disks"
         )

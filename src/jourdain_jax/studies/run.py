@@ -188,7 +188,7 @@ def _constants(task: Task) -> dict[str, tuple]:
     if task.stride > 1:
         found["saved_lane"] = (
             "saved_lane",
-            np.arange(0, len(task.design), task.stride, dtype=np.int32),
+            np.arange(0, len(task.design), task.stride),
             {"long_name": "lane whose trajectory is kept"},
         )
     return found
@@ -345,6 +345,8 @@ def run(
     `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
     numbers of samples and of failed ones, chunk by chunk.
     """
+    if not Store.is_taken(path):
+        memory.check_disk(path, len(task.design) / shard[1] * task.bytes_of_kept_lane)
     store = opened(task, path, chunk, command)
     with store.lock():
         done, torn = store.done()

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.code import functions_in, names_in
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.contact.held_rows import held_rows
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -26,7 +27,6 @@ from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels
-from jourdain_jax.scene.outside_names import functions_in, names_in
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
 # used in place of a mode: why a motion cannot continue
