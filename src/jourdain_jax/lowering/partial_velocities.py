@@ -1,12 +1,15 @@
 """Velocities, partial velocities and accelerations of the bodies at ydot = 0, as scalar expressions."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from jourdain_jax.lowering.elimination import eliminate
 from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian
 from jourdain_jax.program.graph import NodeList
 from jourdain_jax.program.polynomial import NormalForms
-from jourdain_jax.structure.trace import VelocityQuantities
+
+IN_EQUATIONS = ("mass", "inertia", "qdot", "force", "torque", "direct", "power")
 
 
 class Kinematics:
@@ -213,16 +216,14 @@ class Kinematics:
         return raw, self._at(raw)
 
     def _quantities(self) -> None:
-        """Evaluate all traced quantities at the dependent speeds and the fixed coordinates."""
+        """Evaluate the quantities in the equations at the dependent speeds and the fixed coordinates."""
         at, g = self.build.traced.at, self.graph
 
         def put(nodes):
             flat = self._at(g.substituted(nodes.ravel().tolist(), {} if self.free_z else self.known))
             return np.array(flat, np.int64).reshape(nodes.shape)
 
-        self.at = VelocityQuantities(
-            *(put(getattr(at, name)) for name in VelocityQuantities.__dataclass_fields__)
-        )
+        self.at = replace(at, **{name: put(getattr(at, name)) for name in IN_EQUATIONS})
         self.qdot = self.at.qdot.tolist()
 
     def _parts(self, nodes) -> tuple[list, list]:
@@ -231,6 +232,7 @@ class Kinematics:
         return rows[0], rows[1]
 
     def _shape(self, velocities, partial, rates) -> None:
-        self.at.v[...], self.at.omega[...] = self._parts(velocities)
+        v, omega = np.array(self._parts(velocities), np.int64)
+        self.at = replace(self.at, v=v, omega=omega)
         self.beta, self.gamma = [self._parts(p)[0] for p in partial], [self._parts(p)[1] for p in partial]
         self.a0, self.alpha0 = self._parts(rates)
