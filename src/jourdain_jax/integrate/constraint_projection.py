@@ -96,8 +96,8 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
 def put_positions(
     scene: Scene, t, q, free, usual: Usual, known: tuple | None = None
 ) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
-    """Return the coordinates on the geometric constraints nearest to q, and the residual, without repeating
-    the projection if both are `known`.
+    """Return the coordinates nearest to q that satisfy the geometric constraints, and the residual. `known`:
+    both, if already computed.
     """
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
@@ -117,7 +117,7 @@ def put_positions(
 
 
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:
-    """Return the speeds on the velocity constraints nearest to u, and the residual."""
+    """Return the speeds nearest to u that satisfy the velocity constraints, and the residual."""
     affine, determined = usual.affine, usual.determined
     if usual.program is not None and not usual.program.phi:
         return u, jnp.zeros(0, u.dtype)

@@ -11,7 +11,8 @@ r is quadratic in y and does no work, y.r = 0, so G = (r_y - r_y')/3. S follows 
 differentiation, whatever the reduction. One step uses S at the midpoint and Gonzalez's discrete gradient
 instead of grad H, so that H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0:
 
-    z_1 - z_0 = h S(z_m) gbar,   gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
+    z_1 - z_0 = h S(z_m) gbar,   z_m = (z_0 + z_1)/2
+    gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
 """
 
 import equinox as eqx
@@ -51,8 +52,8 @@ class DiscreteGradient(FixedStepMethod):
     """
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the minimal `field` of the state. Raises ValueError if the energy of the `scene` is not
-        constant, or there is no minimal state. `asked`: the requested state.
+        """Return the minimal `field` of the state. Raises ValueError if the `scene` has no constant energy or
+        no minimal state. `asked`: the requested state.
         """
         fault = _fault(scene, field, asked)
         if fault:

@@ -1,16 +1,19 @@
 """Discrete Lagrange-d'Alembert principle (DLA), as a map from (q_0, u_0) to (q_1, u_1).
 
-    dL/dqdot(q_0, u_0) + A(q_0)' lambda_0 = p^+ = -D_1 L_d(q_0, q_1) - f^-        phi_d(q_0, q_1) = 0         -> q_1, lambda_0
-    dL/dqdot(q_1, u_1) = p^- + A(q_1)' lambda_1,  p^- = D_2 L_d(q_0, q_1) + f^+   A(q_1) u_1 + phi_0 = 0      -> u_1, lambda_1
+    p^+ = -D_1 L_d(q_0, q_1) - f^-,   p^- = D_2 L_d(q_0, q_1) + f^+
+
+    q_1, lambda_0:   dL/dqdot(q_0, u_0) + A(q_0)' lambda_0 = p^+,   phi_d(q_0, q_1) = 0
+    u_1, lambda_1:   dL/dqdot(q_1, u_1) - A(q_1)' lambda_1 = p^-,   A(q_1) u_1 + phi_0 = 0
 
 At a node the momenta of the adjacent intervals differ only by a constraint impulse, p^+ - p^- = A' lambda:
 the DLA equations D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both therefore have the same projection onto the
 velocity constraints, which is the state between steps.
 
-    v = (q_1 - q_0)/h
-    midpoint:     L_d = h L(t_m, q_m, v),                               f^-+ = h/2 Q(t_m, q_m, v)           q_m = (q_0 + q_1)/2
-    trapezoidal:  L_d = h/2 (L(t_0, q_0, v) + L(t_1, q_1, v)),          f^- = h/2 Q(t_0, q_0, v), f^+ = h/2 Q(t_1, q_1, v)
-    constraints:  phi at the midpoint, or the mean of phi at both ends; for geometric constraints g(t_1, q_1)/h
+    v = (q_1 - q_0)/h,   q_m = (q_0 + q_1)/2
+    midpoint:     L_d = h L(t_m, q_m, v),                         f^- = f^+ = h/2 Q(t_m, q_m, v)
+    trapezoidal:  L_d = h/2 (L(t_0, q_0, v) + L(t_1, q_1, v)),    f^- = h/2 Q(t_0, q_0, v)
+                                                                  f^+ = h/2 Q(t_1, q_1, v)
+    constraints:  phi_d = phi at the midpoint, or its mean over both ends; g(t_1, q_1)/h for geometric ones
 
 L = T - V - dS/dt, with S the scene's `gauge`; Q the loads without a potential. Both rules are symmetric:
 L_d(q_0, q_1, h) = -L_d(q_1, q_0, -h).
@@ -134,17 +137,17 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
     `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete constraints `phi_d(q_k, q_k+1)
     = 0`, from the scene's Lagrangian L = T - V - dS/dt (S: its `gauge`) by automatic differentiation. `rule`:
     "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or "trapezoidal", `L_d = h/2 (L(q_0, v) + L(q_1,
-    v))`, v = (q_1 - q_0)/h, also for the velocity constraints; geometric constraints hold at every node; h in
-    s. Loads without a potential enter as discrete forces. The state between steps is (q, u) with u on the
-    constraints: the momentum at the node, projected.
+    v))`, v = (q_1 - q_0)/h, which also applies to velocity constraints. Geometric constraints hold at every
+    node; h in s. Loads without a potential enter as discrete forces. The state between steps is (q, u) with u
+    on the constraints: the momentum at the node, projected.
 
     It has order 2, is symmetric in time, and is variational without velocity constraints; it is then
     symplectic and preserves the momenta of symmetries. It needs speeds that are the coordinate rates, and
     constraints linear or affine in them.
 
-    Use it for long motions of reversible scenes whose coordinates suit L: energy errors stay bounded there.
-    In general they do not: a gauge term that changes no equation of motion, or a scene that is not
-    reversible, makes the energy drift. The implicit midpoint rule does not depend on the gauge.
+    Use it for long motions of reversible scenes whose coordinates suit L: energy errors then stay bounded.
+    The energy drifts if the scene is not reversible. A gauge term changes no equation of motion, but may also
+    make the energy drift. The implicit midpoint rule does not depend on the gauge.
 
     Source: J. Cortes and S. Martinez, Nonholonomic integrators, Nonlinearity 14 (2001) 1365; R. McLachlan and
     M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283; J. E. Marsden and M. West, Discrete mechanics and
@@ -161,8 +164,8 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """Return the full `field` of the state, without projection because the method satisfies the
-        constraints itself. Raises ValueError if it does not apply to the `scene`, or if another
-        state was requested (`asked`).
+        constraints itself. Raises ValueError if the method does not apply to the `scene`, or if another state
+        was requested (`asked`).
         """
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)

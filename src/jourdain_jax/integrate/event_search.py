@@ -1,28 +1,30 @@
-"""The first stop event of a step and its time, located by trials of shorter steps
-from the last state before it.
+"""Search for the first stop event of a step and its time, by shorter trial steps from the last state before
+the event.
 
 One source serves JAX arrays and machine code (`w`, `integrate/loop/step.py`). Values of events are lists.
 
-An event happens where its value falls through zero. A motion that starts with a value of zero (to round-off)
-continues if the value is positive after a first step h, whether its rate raises it or a later derivative:
+An event happens where its value falls through zero. A motion may start with a value of zero, to round-off. It
+continues if the value is positive after a first step h, raised by its rate or by a later derivative:
 
     |c_0| <= noise c_0'   or   |c_0|, |h c_0'| <= noise/h |c(h) - c_0|,   noise = eps^0.6 span
 
-Otherwise the step is halved, down to that noise, so that the search does not find the zero at the start. If
-the value is negative there, or none of these steps raises it, the event has happened at the start.
+c_0: value at the start; c_0': its rate; c(h): value after the step; span: time from start to end. If the
+value is not positive then, the step is halved, down to `noise`, so that the search skips the zero at the
+start. The event has happened at the start if the value is negative there or if no step raises it.
 
-All event values are positive at t_b, or rise from zero there, and at least one is not positive at t_a. NaN is
-not positive, so it lies beyond the event. Of the values that are not positive at t_a, the search follows the
-one whose secant from t_b falls to zero first. The first trial uses the cubic through values and rates at both
-ends, later ones Chandrupatla's method (inverse quadratic interpolation if safe, otherwise bisection). If a
-trial finds an earlier event, the search continues with that. A value may stay zero beyond the event: such an
-end of the bracket counts as negative, and the bracket is halved.
+Let t_b be the last time before the event, and t_a a time after it. All event values are positive at t_b, or
+rise from zero there; at least one value is not positive at t_a. NaN counts as not positive. Of the values
+that are not positive at t_a, the search follows the one whose secant from t_b falls to zero first. The first
+trial uses the cubic through values and rates at both ends, later ones Chandrupatla's method (inverse
+quadratic interpolation if safe, otherwise bisection). If a trial finds an earlier event, the search follows
+the earlier one. If a value stays zero after the event, that end of the bracket counts as negative, and the
+bracket is halved.
 
 Trial times have no derivatives. Near the event, Newton shifts follow,
 
     t <- t - c/cdot,   y <- y + (shift of t) f
 
-but not if c is NaN beyond it. `put_tangents` then sets the tangents of the event's time and state.
+unless c is NaN after the event. `put_tangents` then sets the tangents of the event's time and state.
 
 Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
@@ -161,7 +163,7 @@ def monitored(
         return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
     def armed(found: list[list[Number]]) -> list[list[Number]]:
-        """Exclude events that have not been left since they happened, and ignored ones."""
+        """Exclude ignored events, and events whose value has not left zero since they happened."""
         if not form.goes_on:
             return found
         found = leaving(w, form, p, found)
@@ -173,8 +175,9 @@ def monitored(
         ]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of events that were not left: rising above zero and falling
-        again in a step counts as new."""
+        """Reverse the sign of values that have not left zero since their event: a value that rises and falls
+        again in one step is a new event.
+        """
         if not form.goes_on:
             return found
         off = p.every("disarmed")
@@ -216,7 +219,8 @@ def monitored(
 
     w.if_any(changes, follow)
     search = search_of(form, p)
-    # trials start at the last state before the event; a step over a dip is repeated up to its bottom
+    # trials start at the last state before the event; a step over a dip is repeated up to the bottom of the
+    # dip
     found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
     over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
     stays = back | dips | restarts | over
@@ -249,11 +253,12 @@ def monitored(
     ends = found
     if form.goes_on:
         goes = goes_on(w, form, changed["event"]) & (found | over)
-        # an event just beyond the end of its step by rounding happens there; the saved state is that after it
+        # rounding may put an event just beyond its step: it happens at the end, and the state after it is
+        # saved
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
         follows = over & (p["passed"] + p["crossings"] > 0.0)
-        at_once = follows & ~goes  # right after a transition, which determines its time
+        at_once = follows & ~goes  # right after a transition, whose time it shares
         ends = at_once | (found & ~goes)
         p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
@@ -275,7 +280,7 @@ def monitored(
         why = w.where(why > 0.0, why, float(result_codes.TOO_MANY_TRANSITIONS))
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
-        # counted as trial steps, so that they end
+        # crossings count as trial steps, which limits their number
         changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
@@ -292,9 +297,9 @@ def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
 def put_tangents(
     w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number
 ) -> None:
-    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each
-    time tangent shifts the state along the directions e of which it is composed (values and rates before
-    the event; NaN without slope),
+    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each tangent
+    of time shifts the state along its directions e. Values and rates are those before the event; without
+    slope the tangents are NaN.
 
         dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0"""
     count, times = form.events, form.rows["dt"]

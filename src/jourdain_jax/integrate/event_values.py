@@ -1,5 +1,5 @@
-"""Formulas of the event search, from the values of events at the ends of a step: which event is first, where a
-value falls through zero, and the next trial time. `event_search.py` has the method and its source.
+"""Formulas of the event search on values at the ends of a step: the first event, the time at which a value
+falls through zero, and the next trial time. `event_search.py` has the method and its source.
 """
 
 import math
@@ -33,16 +33,18 @@ def chosen(w, index, values: Values):
 
 
 def reach_of_noise(w, span):
-    """Return the time in which a value rises by as much as round-off may make it negative at the start."""
+    """Return the time after which a rising value exceeds the round-off of a zero at the start."""
     return w.eps**LEAVES * w.magnitude(span)
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
-    """Return the events that happened at a start, and values near zero there that a step `h` leaves there."""
+    """Return which events happened at a start, and which values are near zero there and not positive after a
+    step `h`.
+    """
     sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate, change = slope * direction, w.magnitude(b - a)
-        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # what a straight line changes it by
+        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # change along a straight line
         level = ~(a > 0.0) & (change > 0.0) & (straight * w.magnitude(h) <= noise * change)
         rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
         sunk.append(~(a > 0.0) & ~rises)
@@ -94,8 +96,9 @@ def trial(w, t, c, step, last, guess) -> tuple:
     share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
-    # Near in time by the slope, and small relative to the other end: one alone is not enough for flat or
-    # jumping values, nor is the mean slope of the whole step before any trial.
+    # The trial is near enough if the value is near zero in time, by the slope, and small relative to the
+    # other end. One condition alone fails for flat or jumping values; so does the mean slope of a step before
+    # any trial.
     slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
     slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
     small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (
@@ -114,9 +117,9 @@ def is_flat(w, c_dot, slope):
 
 
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
-    """Return the fraction of a step `h` at which the first value that dips below zero between the
-    ends is lowest; 1 if there is none: p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s =
-    -m_0/(A + sqrt(A^2 - 3 B m_0))."""
+    """Return the fraction of a step `h` at the bottom of the first dip below zero between its ends; 1 without
+    a dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0)).
+    """
     share = None
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
         m_0, A, B = cubic(h, a, slope_a, b, slope_b)
@@ -129,8 +132,9 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half the fraction of a step `h`, at most a half, for which values
-    rising from zero stay positive."""
+    """Return half of the fraction of a step `h` in which values that rise from zero stay positive; at most a
+    half.
+    """
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
         m, A, B = cubic(h, a, slope_a, b, slope_b)

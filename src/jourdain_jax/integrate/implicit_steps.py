@@ -1,9 +1,9 @@
 """Implicit methods of this package's loop, with the equations of a step solved by Newton's method.
 
-Batches run under `vmap`. Structure-preserving methods preserve something exactly or nearly so (an
-energy, a quadratic integral, a symmetry under time reversal), but only with constant steps and without
-an error estimate, so they have a `step`. Between two times at which a step must end they take the fewest
-equal steps no longer than that.
+Batches run under `vmap`. Structure-preserving methods preserve an energy, a quadratic integral or a symmetry
+under time reversal, exactly or nearly. They need constant steps and have no error estimate, so they have a
+`step`. Between two times at which a step must end, they take the fewest equal steps that are not longer than
+`step`.
 """
 
 import abc
@@ -25,7 +25,7 @@ class Solution(NamedTuple):
 
     change: PyTree  # of the state; zero if the equations of the step were not solved
     error: PyTree | None  # None: the method has no estimate
-    solved: Flag  # whether they were
+    solved: Flag  # whether they were solved
 
 
 class ImplicitMethod(eqx.Module):

@@ -22,8 +22,9 @@ from jourdain_jax.integrate.inputs import Inputs, Sampled
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Return the knots (times since `t0`) at which steps must end, of all samples in `holders`, in the order
-    of the motion, without the times `ts`, then at least one infinite time. None without samples."""
+    """Return the knots of all samples in `holders` at which steps must end: times since `t0`, in the order of
+    the motion, without the times `ts`. At least one infinite time follows. None without samples.
+    """
     samples = [
         x
         for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled))
@@ -52,7 +53,7 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return the knots at which steps must end, for lines that differ by at most `share` of the range."""
+    """Return at which knots steps must end, if lines may miss samples by at most `share` of their range."""
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
@@ -71,7 +72,7 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
 
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
-    # `bent` at a knot marks the one before as a step end
+    # `bent` at a knot: a step ends at the knot before
     return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
 
 
@@ -96,7 +97,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples continued within the step around this time (s; infinite: no step)."""
+    """Return `inputs` whose samples continue the line of the step around `middle` (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

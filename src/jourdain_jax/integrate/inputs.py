@@ -62,7 +62,7 @@ class Constant(eqx.Module):
 
 
 class Mode(eqx.Module):
-    """Mode: the number of its value at the start, and after each transition."""
+    """Mode as an input: the number of its value at the start, and after each transition."""
 
     value: Float[Array | np.ndarray, ""]
     ts: Float[Array, "transitions"] | None = None  # s, times `direction`; infinite after the last one
@@ -108,8 +108,8 @@ class Inputs(eqx.Module):
         except (ValueError, TypeError, NotImplementedError) as error:
             said = str(error).splitlines()[0]
             raise ValueError(
-                "constraints depend on inputs and need their rates, but one cannot be differentiated "
-                f"({said}); pass it as `jj.Sampled`"
+                "constraints depend on inputs and need their rates, but an input cannot be differentiated "
+                f"({said}); pass that input as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
 
@@ -219,7 +219,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
             raise ValueError(
                 f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
-                "loads and potentials may switch"
+                "loads and potentials may depend on modes"
             )
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return

@@ -182,8 +182,8 @@ def own_steps(solver, **static) -> OwnSteps | None:
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
-    """Return the motion of `run`, whose times have no derivatives, with start and saved states shifted to the
-    setup's times so that they have derivatives.
+    """Return the motion of `run` with derivatives with respect to the setup's times. The times of `run` have
+    no derivatives, so start and saved states are shifted to the setup's times.
 
     A reached time equals its goal; the loop itself gives the time of a stop event. A time that was not
     reached keeps its distance from the start.
@@ -245,7 +245,7 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 def reason_against_watching(setup: Setup) -> str:
     """Return why steps do not monitor all relations of a scene's loads or stop events; empty if they do, or
-    there are none. JAX calls may hide some.
+    there are none. Parts kept as JAX calls may hide relations.
     """
     program = setup.field.lowered
     hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
@@ -323,10 +323,10 @@ def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowe
 def width(program: Lowered) -> int:
     """Return the number of samples of a lowered scene that run in lockstep.
 
-    A block lasts until its slowest sample ends, and its data should fit a core's fastest cache, so small
-    blocks are best if they have little overhead. On a CPU this is so if XLA compiles the whole loop into one
-    function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise it starts every
-    operation separately, and many samples must share that cost.
+    A block lasts until its slowest sample ends, and its data should fit a core's fastest cache. Small blocks
+    are therefore best if they have little overhead. On a CPU they have little if XLA compiles the whole loop
+    into one function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise XLA starts
+    every operation separately, and many samples must share that cost.
     """
     # larger loops use too much memory to become one function (the bicycle, with 2016 operations, still does)
     return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

@@ -1,7 +1,8 @@
 """Radau's method of order 5 for stiff motions: implicit, L-stable, three stages.
 
     z_i = h sum_j a_ij f(t_0 + c_j h, y_0 + z_j),   y_1 = y_0 + z_3
-    e = (1 - h g J)^-1 (g h f(t_0, y_0) + g/3 (-13 - 7 sqrt 6, -13 + 7 sqrt 6, -1) . z),   1/g the real eigenvalue of A^-1,   J = df/dy
+    e = (1 - h g J)^-1 (g h f(t_0, y_0) + g/3 (-13 - 7 sqrt 6, -13 + 7 sqrt 6, -1) . z)
+    J = df/dy,   1/g: the real eigenvalue of A^-1
 
 The stages are collocation at the Radau nodes c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1). The estimate e has
 order 3 and stays small for components that decay at once.

@@ -96,7 +96,7 @@ class Integrator(abc.ABC):
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
-        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it."""
+        """Return why XLA, not machine code, runs the loop over steps; empty if machine code runs it."""
 
     @abc.abstractmethod
     def solved(self, setup: "Setup", begun: "Begun") -> Solved:
@@ -130,8 +130,8 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
 
     def fitting(self) -> "Setup":
-        """Return the setup with times that any loop accepts: none beyond the end by round-off, and
-        inconsistent ones replaced by a short span.
+        """Return the setup with times that any loop accepts: round-off puts none beyond the end, and a short
+        span replaces inconsistent times.
         """
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
@@ -153,7 +153,7 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
 
     @property
     def reason_against_machine_code(self) -> str:
-        """Return why XLA compiles the loop over steps instead of machine code; empty if machine code runs it."""
+        """Return why XLA, not machine code, runs the loop over steps; empty if machine code runs it."""
         return self.integrator.reason_against_machine_code(self)
 
     def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
@@ -176,7 +176,7 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as given: without derivatives, and without a batch axis if all samples share them."""
+    """Numbers of a motion as given: without derivatives, without batch axis if all samples share them."""
 
     times: dict  # as in a `Setup`
     known: tuple  # `native_motion.known_of`

@@ -1,4 +1,4 @@
-"""States on the constraints: projection of a start, with a search from other guesses, and contradictory values.
+"""States on the constraints: projection of a start, a search from other guesses, contradictory values.
 
     g(t, q) = 0,   phi(t, q, u) = 0
 
@@ -265,7 +265,7 @@ def may_contradict(
 
         rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: columns of the free variables
 
-    If this holds, there is no contradiction, except at isolated configurations.
+    If both equations hold, values contradict each other at most at isolated configurations.
     """
     # otherwise the constraints determine the dependent ones
     of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))

@@ -106,8 +106,8 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time with its captured values, or None unless its value is a number; and its
-    shape.
+    """Return a function of time with its captured values, and the shape of its value. The function is None
+    unless its value is one number.
 
     A function is traced again if it is new, or if a value that it reads has changed (`scene/identity.py`).
     """

@@ -1,6 +1,4 @@
-"""Choice of the vector field that a model integrates: minimal or full state, scalar program or dense matrices,
-and the reduction.
-"""
+"""Choice of the vector field that a model integrates: its state, scalar program or dense matrices, reduction."""
 
 from typing import Any
 

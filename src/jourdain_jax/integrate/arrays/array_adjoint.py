@@ -1,9 +1,9 @@
 """Reverse mode of the loop in JAX, by the source of machine code (`integrate/loop/adjoint.py`).
 
-The motion is integrated once more, and each trial step is recorded in a window of limited length.
-After the last window, each earlier one is integrated again, bit for bit, from the nearest checkpoint:
-a state at the beginning of a window. The number of checkpoints is limited, too; when it is reached,
-every second one is dropped.
+The motion is integrated once more, and its trial steps are recorded in a window of limited length. Then the
+steps of each earlier window are computed again, with equal bits, from the nearest checkpoint: a stored state
+at the beginning of a window. The number of checkpoints is limited, too; at the limit, every second checkpoint
+is dropped.
 """
 
 import math
@@ -27,7 +27,7 @@ from jourdain_jax.integrate.loop.record import Slot
 from jourdain_jax.integrate.loop.transitions import is_noted, reset_back
 
 SLOTS = (
-    # trial steps per window, or fewer if memory is short, but at least a sixteenth; the same for checkpoints
+    # most trial steps per window, and most checkpoints; short memory reduces both, down to a sixteenth
     256
 )
 

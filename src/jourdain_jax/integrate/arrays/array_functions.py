@@ -1,8 +1,8 @@
 """Rates, projection and stop events as JAX functions, which replace the scalar program of machine code.
 
-The source of a step differentiates the step; JAX differentiates only these functions. A state is followed by
-its tangents (`integrate/loop/lanes.py`), and so are the arrays shared by all steps: `pushed` returns the
-values of a function with all its tangents, by nested `jvp`.
+The source of a step differentiates the step; JAX differentiates only these functions. Tangents follow the
+state (`integrate/loop/form.py`) and the arrays shared by all steps. `pushed` returns the values of a function
+with all tangents, by nested `jvp`.
 """
 
 import math

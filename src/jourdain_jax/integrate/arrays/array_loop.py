@@ -6,7 +6,7 @@ differentiates only the rates,
 
     (y, dy)' = (f(y, p), df/dy dy + df/dp dp)
 
-For higher derivatives, tangents of these follow (`layout.py`).
+For higher derivatives, tangents of these numbers follow (`integrate/loop/form.py`).
 """
 
 from collections.abc import Sequence

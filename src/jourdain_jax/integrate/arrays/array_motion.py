@@ -52,7 +52,7 @@ def loop_of(
         stops=field.stops if of_events["has_events"] else (),
         sides=field.lowered.sides if field.lowered else (),
         **of_events,
-        compensated=most * eps > eps**0.5,  # the round-off of so many steps may exceed half of the digits
+        compensated=most * eps > eps**0.5,  # after so many steps, round-off may exceed half of the digits
     )
     known, rest = split(begun.args)
     numbers = jax.lax.stop_gradient(
@@ -62,7 +62,7 @@ def loop_of(
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """Return the motion as a function of its start; `at_once`: samples per block (0: all samples of `vmap`)."""
+    """Return the motion as a function of its start; `at_once`: samples per block, 0 for all of `vmap`."""
     return differentiated(
         lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
     )
@@ -102,8 +102,8 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """Run blocks of samples in sequence. Outside, the batch axis is first. Inside it is
-    last, except for known arrays.
+    """Run blocks of samples one after another. Outside of a block the batch axis is first; inside it is last,
+    except in known arrays.
     """
     given = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched)

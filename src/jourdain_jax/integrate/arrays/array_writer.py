@@ -1,7 +1,7 @@
 """Writer that evaluates the source of a step (`integrate/loop/step.py`) on JAX arrays.
 
 The batch axis is the last one, stages are one loop, so that the rates are compiled once, and a branch is
-`lax.cond`. A first trace of a branch or loop finds the memory to which it stores.
+`lax.cond`. Each branch or loop is traced first to find the memory that it changes.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """Step of an implicit method (`implicit_steps.py`) in JAX, under `vmap` for batches.
 
-Trial steps of the event search use the method, too; its last, tiny shifts are Tsit5 steps, which have the
-derivatives of the motion. A step whose equations are not solved has an infinite error. Methods with equal
-steps cannot repeat one: a rejection ends the motion with a result code.
+Trial steps of the event search use the method, too. The last, tiny shifts of the search are steps of Tsit5,
+which carry the derivatives of the motion. A step whose equations are not solved has an infinite error.
+Methods with equal steps cannot repeat one: a rejection ends the motion with a result code.
 """
 
 import math

@@ -5,9 +5,11 @@ All lanes of a block begin and end together here. On the forward pass every tria
 step was rejected or the lane had ended), and the number of times saved before it. On the backward
 pass, with a fixed step size,
 
-    Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
+    Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l
+    (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum_i G_i
 
-and before that, if a motion ended at a stop event, over the event (`event_adjoint.py`).
+k_j: slopes of the stages; g_1, g_0: cotangents of the state after and before the step; g_p: of the known
+numbers p. A motion that ended at a stop event first goes back over the event (`event_adjoint.py`).
 
 In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by
 cotangents of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g'

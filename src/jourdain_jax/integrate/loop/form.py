@@ -92,7 +92,7 @@ class Form:
 
     @property
     def squares(self) -> Indices:
-        """Return each constraint's squared part normal to the earlier ones and its squared size, alternating."""
+        """Return, for each constraint, its squared part normal to the earlier ones, then its squared size."""
         return self.program.squares if self.projects else ()
 
     @property

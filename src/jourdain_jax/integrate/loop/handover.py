@@ -25,7 +25,7 @@ def constant_rows(form: Form) -> dict[int, float]:
 
 
 class Start(NamedTuple):
-    """Input of a loop: one motion. The state and the known numbers are followed by their tangents (`Form`)."""
+    """Input of a loop: one motion. Tangents follow the state and the known numbers (`Form`)."""
 
     of_samples: tuple[Array, ...]  # tables and knots (`samples.py`); for a loop in JAX, only the knots
     control: Numbers  # rtol, atol, shortest, longest and first step, most steps
@@ -52,7 +52,7 @@ class Start(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Output of a loop: a motion; each part is followed by its tangents."""
+    """Output of a loop: a motion. Tangents follow each part."""
 
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
@@ -91,8 +91,8 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return the results of `vmap` without the batch axis of parts that do not need it, and flags of the
-        parts that keep it. `given`: flags of the start's parts with a batch axis.
+        """Remove the batch axis from results of `vmap` that do not need it. Also return a flag for each part:
+        whether it keeps the axis. `given`: the same flags of the start's parts.
 
         A tangent has a batch axis if anything on which it depends has one. All directions
         share the values of one motion.

@@ -21,7 +21,7 @@ class MachineWriter(Writer):
     Besides arithmetic and memory, the source uses the following operations. They are methods, so that a
     writer may implement them differently:
 
-        if_any(c, body)            run the body if c holds in any lane; the body distinguishes lanes by `where`
+        if_any(c, body)            run the body if c holds in any lane; the body selects lanes by `where`
         over_stages(n, body, x)    x <- body(i, x)
         each(rows, body)           run the body for every row, independently
 

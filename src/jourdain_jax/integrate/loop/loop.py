@@ -85,8 +85,8 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
 
 
 def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
-    """Compute all samples in this thread and others that it starts and joins; the last argument is
-    an array of samples and times.
+    """Compute all samples, in this thread and in threads that it starts and joins. The last argument is an
+    array of the times of each sample.
     """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
     of_samples, arguments, times = (
@@ -285,7 +285,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
                     of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
                 )
                 w.store(saved + 1, who, lane + w.lanes)
-                # never due again if an event was found just beyond the last time by rounding
+                # after the last time nothing is due, even if rounding puts an event just beyond it
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)
                 with w.when((saved + 1) < times):
                     lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))

@@ -48,8 +48,8 @@ def numbers_of(channel: FunctionOfTime) -> list:
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers` and all of `channel.held`, each number replaced by the next
-    replacement; None if there are none.
+    """Return `channel.numbers` and all of `channel.held`, with each number replaced by the next of `numbers`;
+    a part without replacements is None.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [

@@ -48,8 +48,8 @@ class Operands(NamedTuple):
         return tuple(is_shared for x, rank, is_shared in rows for _ in range(x.shape[-1] if rank else 1))
 
     def _joined(self, rows: list, dtype, laned: bool) -> Array:
-        """Return rows as one array, with or without batch axes. Neighbours with the same batch axes are
-        joined before they are given the others.
+        """Join rows to one array, with or without batch axes. Neighbours with equal batch axes are joined
+        first; then the missing axes are added.
         """
         found = []
         for _, some in groupby(rows, lambda row: np.shape(row[0])[: np.ndim(row[0]) - row[1]]):
@@ -66,14 +66,14 @@ class Operands(NamedTuple):
         return lax.concatenate(found, found[0].ndim - 1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
-        """Return the arrays for a CPU: the batch axis comes first, except in samples, which lanes may share."""
+        """Return the arrays for a CPU: the batch axis is first, except in samples that lanes share."""
         rows, last = self._rows(values), len(values) - self.others
         starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
         return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
 
     def given_once(self, *values: Array) -> list[Array]:
         """Return the arrays for a GPU: the shared rows of a start follow the others, without batch axis. If
-        all lanes share the times (the last operand), these have none either.
+        all lanes share the times (the last operand), the times have no batch axis either.
         """
         rows, last = self._rows(values), len(values) - self.others
         starts = [

@@ -199,7 +199,7 @@ class Rows:
         ]
 
     def reason_against(self) -> str:
-        """Return why this cannot be machine code; empty if it can."""
+        """Return why machine code does not project these variables; empty if it does."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
@@ -309,7 +309,7 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_moved(w: MachineWriter, of: Rows) -> None:
-    """Write `moved(state, L, c, B, d, weights, x)`: the variables after one step with the `factored` matrix."""
+    """Write `moved(state, L, c, B, d, weights, x)`: one step of the variables by the `factored` matrix."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
     with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):

@@ -1,14 +1,14 @@
 """Rates, projection and stop events of a lowered scene as machine code: functions of the rows of the lanes,
 the time since the start, and a state in memory.
 
-A state may be followed by its tangents; each function then also returns the tangents of its results. Further
-functions return cotangents:
+If tangents follow the state, each function also returns the tangents of its results. Further functions return
+cotangents:
 
-    d f(t, y, p) = df/dy dy + df/dp dp          p: known numbers of the rates, of which `Form.moving` have tangents
-    G_y = (df/dy)' g,   G_p += (df/dp)' g       for the requested p
+    d f(t, y, p) = df/dy dy + df/dp dp          p: known numbers; those of `Form.moving` have tangents
+    G_y = (df/dy)' g,   G_p += (df/dp)' g       g: cotangents of f; for the requested p
 
-For higher derivatives, tangents of all these follow along the next direction. Cotangents of a motion with its
-tangents give the second derivatives.
+Higher derivatives add the tangents of all these numbers along the next direction. Cotangents of a motion with
+its tangents give the second derivatives.
 """
 
 from collections.abc import Sequence

@@ -23,7 +23,7 @@ TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: the state, its derivatives, and finally the rows of a transition; `all`: their number."""
+    """Rows of a slot: the state, its derivatives, then the rows of a transition; `all`: their number."""
 
     y: int
     t: int
@@ -127,8 +127,8 @@ def _write_more_room(w: MachineWriter) -> None:
 
 
 def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
-    """Return slots that fit into a third of each thread's memory: while a record is replaced by one of twice
-    its size, both exist.
+    """Return slots that fit into a third of each thread's memory: a full record is copied to one of twice its
+    size, and both exist meanwhile.
     """
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)

@@ -1,11 +1,13 @@
 """Linear interpolation of sampled inputs in machine code:
 
-    f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
+    f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1}
     df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
 
+f is constant before the first sample and after the last.
+
 Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every sampled
-input, padded with infinite times. Knots, the times at which steps must end (`integrate/inputs.py`), have the
-shape (rows, knots). Lanes may share them: with T tables, lane i of N uses number i T / N.
+input, padded with infinite times. Knots, the times at which steps must end (`integrate/input_knots.py`), have
+the shape (rows, knots). Lanes may share them: with T tables, lane i of N uses number i T / N.
 """
 
 from jourdain_jax.integrate.loop.form import Form

@@ -2,7 +2,8 @@
 the search for a stop event.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
-    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
+    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts
+    h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
 This is the only source of a step. A writer object provides arithmetic, memory, branches and loops:
 `MachineWriter` (`lanes.py`) generates machine code, `ArrayWriter` (`integrate/arrays/array_writer.py`)
@@ -17,7 +18,8 @@ constraint then causes a velocity eps/sigma^2 across it, which dominates the err
 starts at sigma < 0.1, its stages are projected onto the constraints. Its error is the larger of two parts:
 the error along the constraints, less n^2, and the displacement by the projection, less n. Here n = 16
 eps/sigma^2, at most eps^0.4, for the smallest sigma of the stages; a displacement n across the constraints
-moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
+moves the state by n^2 along them. The position, not the tolerance, thus decides whether a motion passes a
+loss of rank.
 
 In single precision the state uses compensated summation (Kahan). Otherwise a state whose increments are below
 its last digit would stand still, undetected by the error estimate.

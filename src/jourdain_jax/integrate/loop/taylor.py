@@ -1,7 +1,8 @@
 """Steps by Taylor series: coefficients of a state along its motion, their radius, and the
 state at any time within it.
 
-    y(t + s) = sum_{k=0}^p y_k s^k,        h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
+    y(t + s) = sum_{k=0}^p y_k s^k
+    h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
 
 so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y)
 are written out order by order:
@@ -11,7 +12,7 @@ are written out order by order:
     c = a/b:       c_k = (a_k - sum_{j=1}^k b_j c_{k-j})/b_0
     c = sqrt(a):   c_k = (a_k - sum_{j=1}^{k-1} c_j c_{k-j})/(2 c_0)
     c = a^e:       c_k = sum_{j=1}^k (e j/k - (k - j)/k) a_j c_{k-j}/a_0             (a constant exponent e)
-    c = F(a, ..):  c_k = sum_{j=1}^k (j/k) a_j (dF/da)_{k-j} + ..                     with the derivative on the graph, for all other functions
+    c = F(a, ..):  c_k = sum_{j=1}^k (j/k) a_j (dF/da)_{k-j} + ..                     (dF/da: by the graph)
 
 Sums add the newest coefficients last, because all others are known long before. Source: A. Jorba and M. Zou,
 Experimental Mathematics 14 (2005) 99, sections 2 and 3.
@@ -151,14 +152,15 @@ Terms = list[tuple[tuple[int, ...], int]]
 
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
-    """Return nodes for the same numbers, equal to round-off, with fewer products of varying values, because
-    every coefficient of a product is a sum. `moving`: varying inputs.
+    """Return nodes of the same values, to round-off, with fewer products of varying factors: every
+    coefficient of a product costs a sum. `moving`: varying inputs.
 
     Sums and products are expanded into terms. Then the sharing that saves most products is applied
     repeatedly: x y if several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a disc
     with s, c = sin, cos of its lean take 12 products, and then 7, with p = v w/c and q = c u:
 
-        v (2 s w/c - 5/3 c u),  s (g + c u^2) + 6/5 c u w,  -2 v w/c      ->      2 s p - 5/3 v q,  g s + q (s u + 6/5 w),  -2 p
+           v (2 s w/c - 5/3 c u),   s (g + c u^2) + 6/5 c u w,   -2 v w/c
+        -> 2 s p - 5/3 v q,         g s + q (s u + 6/5 w),       -2 p
     """
     one, nodes = graph.one, graph.reachable(outputs)
     signs = {"add": (one, one), "sub": (one, graph.const(-1.0)), "neg": (graph.const(-1.0),)}
@@ -247,7 +249,7 @@ class TaylorSteps:
 
     @property
     def needed(self) -> int:
-        """Return the number of state vectors that a step keeps: the coefficients, and the rates at its end."""
+        """Return how many state vectors a step keeps: the coefficients, and the rates at its end."""
         return self.order + 2
 
     @property

@@ -1,4 +1,4 @@
-"""Inputs that are functions of time, on the scalar graph: their substitution into a program, and their jumps."""
+"""Functions of time as inputs, on the scalar graph: substitution into a program, and jumps."""
 
 import math
 from collections.abc import Iterable, Sequence

@@ -5,7 +5,7 @@ Arguments have no batch axis; under `vmap` the whole batch goes to one call. Man
 the widest registers; a single one runs in narrow registers, whose instructions are faster.
 Results do not depend on the width.
 
-    o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
+    o = f(x),   f'(x) v,   g f'(x),   f''(x) w v,   g f''(x) v          o: values of nodes, x: of variables
 
 Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
 programs that are too large, JAX differentiates the program run by XLA.
@@ -50,11 +50,11 @@ def called(
     effort: int = 2,
     constant: Mapping[int, float] | None = None,
 ) -> Callable:
-    """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: returns the
-    shapes of results for arguments.
+    """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: function from
+    arguments to the shapes of results.
 
     The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. If some rows
-    of a start are `constant`, one more argument holds all the others: vectors of the state, then numbers.
+    of a start are `constant`, one more argument holds the other rows: vectors of the state, then numbers.
     """
 
     @cache
@@ -122,7 +122,7 @@ def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
 def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
-    """Return the operands that `make` computes from operands of a call, and the context for a call with them."""
+    """Return the operands that `make` computes from those of a call, and the context of the new call."""
     made = jax.make_jaxpr(make)(*ctx.avals_in)
     lower = mlir.lower_fun(jaxpr_as_fun(made))
     return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)

@@ -1,8 +1,9 @@
 """The integrated state, and the interface of its rates.
 
-    minimal: qdot = N u + nu,  u = C y + c,  ydot = independent rows of udot     (velocity constraints hold exactly)
-    full:    qdot = N u + nu,  udot                                               (projected onto the constraints)
+    minimal: qdot = N u + nu,  u = C y + c,  ydot = independent rows of udot
+    full:    qdot = N u + nu,  udot
 
+The minimal state satisfies velocity constraints exactly; the full state is projected onto all constraints.
 Work of forces or constraints without a potential is integrated along with the state.
 """
 
@@ -45,16 +46,15 @@ class Formulation(eqx.Module):
     - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the
       scene's scalar program if there is one).
     - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by
-      construction:
-      "projection" (default) projects the state after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
-      the constraints, for comparison; None does nothing.
+      construction: "projection" (default) projects the state after each step; `jj.Baumgarte(alpha, beta)`
+      adds its terms to the constraints, for comparison; None does nothing.
 
     Raises ValueError for anything else.
 
     **Examples**
 
         rods = jj.models.DoublePendulumRods()
-        dense = jj.Formulation("full", reduction="kkt")                # all speeds, multipliers from one linear system
+        dense = jj.Formulation("full", reduction="kkt")   # all speeds, multipliers by one linear system
         motion = jj.simulate(rods, t1=0.2, formulation=dense)
         print(motion.state_form, motion.reduction)
     """
@@ -165,7 +165,7 @@ class VectorField(eqx.Module):
     conserves: bool = static()  # T + V is constant along every motion
     projects_positions: bool = static()
     projects_speeds: bool = static()
-    rows_may_contradict: bool = static()  # although the start satisfies all of them (`motion/integration.py`)
+    rows_may_contradict: bool = static()  # although the start satisfies all of them (`motion/drift.py`)
     of_inputs: Indices = static()  # indices of loads whose potential depends on inputs
     event_names: Labels = static()  # sorted
     stops: tuple[bool, ...] = static()  # whether each event ends the motion
@@ -243,7 +243,7 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
-        """Return all speeds, and a measure of how well the independent ones determine the others. It
+        """Return all speeds, and a measure of how well the independent ones determine the others. The measure
         changes its sign where they do not.
 
         For the full state it is the measure of the reduction, without a sign, or 1 if there is none.
