@@ -373,7 +373,8 @@ def page_of(entry: Entry, out: Path) -> str:
 
 ![{entry.title}: the motion, earlier times paler]({entry.name}.png)
 
-**What to look at.** {entry.look} To turn it and play it, open {{download}}`the 3D view <{entry.name}.html>` in a browser; `jj.show(motion)` makes one.
+**What to look at.** {entry.look} To turn it and play it, open {{download}}`the 3D view
+<{entry.name}.html>` in a browser; `jj.show(motion)` makes one.
 
 ## The lines that draw it
 
@@ -405,8 +406,10 @@ def index_of(chosen: list[Entry]) -> str:
     pages = "\n".join(entry.name for entry in chosen)
     return f"""# Gallery
 
-Each page has a picture, the lines that draw it, what to look at, and the source. Earlier times are drawn paler; lengths are in metres.
-A ball in a bowl, a robot with driven wheels and a disc on a hill stand, with their code, among the [rolling contacts](../../contacts.md).
+Each page has a picture, the lines that draw it, what to look at, and the source. Earlier times are drawn
+paler; lengths are in metres.
+A ball in a bowl, a robot with driven wheels and a disc on a hill stand, with their code, among the
+[rolling contacts](../../contacts.md).
 
 ::::{{grid}} 1 2 3 3
 :gutter: 2

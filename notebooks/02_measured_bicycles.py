@@ -37,8 +37,8 @@ from jourdain_jax.bicycle import (
 # ## One bicycle
 #
 # The benchmark bicycle of Meijaard, Papadopoulos, Ruina and Schwab (2007) has no uncertainty and published
-# results: stable from 4.29238253634111 to
-# 6.02426201538837 m/s. The linear matrices below come from the nonlinear model by automatic differentiation, not from the published formulas.
+# results: stable from 4.29238253634111 to 6.02426201538837 m/s. The linear matrices below come from the
+# nonlinear model by automatic differentiation, not from the published formulas.
 
 
 # %%

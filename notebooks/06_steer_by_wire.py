@@ -74,9 +74,9 @@ plt.show()
 # | number | what is known of it | here |
 # |---|---|---|
 # | lengths, masses, mass centres, wheels | measured | kept |
-# | inertia of the rear frame | taken from another bicycle, 1.64 and 1.94 kg m²; 2 and 2.7 are noted as fitting better | prior, as wide as that difference |
-# | inertia of rotor and fork about the steer axis | EC 45 flat, gear of 36: 0.012 to 0.024 kg m²; the fork's is noted twice, 0.036 apart | prior |
-# | torque of the motor for a command | differs from what was commanded, by how much is not known | estimated |
+# | inertia of the rear frame | another bicycle's, 1.64 and 1.94 kg m²; noted: 2 and 2.7 fit better | prior |
+# | inertia about the steer axis | rotor: 0.012 to 0.024 kg m²; fork: two notes, 0.036 apart | prior |
+# | torque of the motor | differs from the command by an unknown factor | estimated |
 # | friction and damping at the fork, damping of lean | 0.2 N m of friction when coasting | estimated |
 # | drift | always to one side, from an unknown source | a torque at the fork, estimated |
 # | encoder of the fork | "not properly installed" | its gain is estimated |
@@ -126,8 +126,10 @@ class SteerByWire(WhippleBicycle):
 
 
 nominal = SteerByWire(
-    w=1.036, c=0.0803, lam=np.deg2rad(18.2), rR=0.3498, mR=10.12, IRxx=0.1040, IRyy=0.1641, xB=0.462, zB=-0.698, mB=20.9, IBxx=1.64, IBzz=1.94, IBxz=0.654,
-    xH=0.944, zH=-0.595, mH=0.6, IHxx=0.0098, IHyy=0.0098, IHzz=0.00396, IHxz=-0.00044, rF=0.3498, mF=1.780, IFxx=0.0644, IFyy=0.1289,
+    w=1.036, c=0.0803, lam=np.deg2rad(18.2), rR=0.3498, mR=10.12, IRxx=0.1040, IRyy=0.1641,
+    xB=0.462, zB=-0.698, mB=20.9, IBxx=1.64, IBzz=1.94, IBxz=0.654,
+    xH=0.944, zH=-0.595, mH=0.6, IHxx=0.0098, IHyy=0.0098, IHzz=0.00396, IHxz=-0.00044,
+    rF=0.3498, mF=1.780, IFxx=0.0644, IFyy=0.1289,
     turned=0.0, friction=0.0, steer_damping=0.0, lean_damping=0.0, drift=0.0,
 )  # fmt: skip
 free = {
@@ -153,9 +155,11 @@ def run_of(window, sensors):
         "steer_rate": window["fork_rate"][0],
     }
     unknown = {
-        "lean": jj.Estimate(prior=Normal(start["lean"], 0.02)), "steer": jj.Estimate(prior=Normal(start["steer"], 0.03)),
-        "lean_rate": unbounded(0.3), "steer_rate": unbounded(0.5),
-    }  # fmt: skip
+        "lean": jj.Estimate(prior=Normal(start["lean"], 0.02)),
+        "steer": jj.Estimate(prior=Normal(start["steer"], 0.03)),
+        "lean_rate": unbounded(0.3),
+        "steer_rate": unbounded(0.5),
+    }
     values = {
         "lean_rate": np.where(ts < 0.0499, np.nan, window["lean_rate"]),
         "steer_rate": np.where(ts < 0.0499, np.nan, window["fork_rate"]),
@@ -361,14 +365,18 @@ assert from_3[:, 0].max() < 0.4 < 0.8 < from_3[:, 1].min()
 # %% [markdown]
 # ## What came out, and where the scene fails
 #
-# - Halves agree, with possible bodies, and predict each other to 0.02 rad/s of lean rate. From 3 m/s on, the frequency of weave is that of the damped
-#   exponentials to 0.4 rad/s; the authors' numbers put it 0.9 rad/s and more too high.
-# - The decay of weave is stronger than that of the exponentials, slightly at 5 m/s and by a factor of two at 2 m/s. There, friction stops the fork before the
-# window ends: the response is no exponential, and no equivalent damping stands for that. The authors' numbers
-# agree better with these decays.
-# - The moment of inertia of the frame about the vertical, 2.8 and 3.1 kg m², is near the 2.7 that the authors found to fit better; that about the roll axis
-#   is hardly known: its standard error is as large as its prior.
-# - A lean damping of 22 N m s/rad has no cause in a bicycle without a rider, and 0.027 s is long for a gyroscope. Both may stand for what this scene lacks,
-#   tyres that slip sideways; the carrier of the gyroscope may give way, too.
-# - Neighbouring residuals correlate by 0.4 (lean rate) and 0.6 (steer rate): they are no noise. Standard errors from how runs differ allow for that; they do
-#   not tell how far the numbers are from those of the bicycle.
+# - Halves agree, with possible bodies, and predict each other to 0.02 rad/s of lean rate. From 3 m/s on, the
+#   frequency of weave is that of the damped exponentials to 0.4 rad/s; the authors' numbers put it 0.9 rad/s
+#   and more too high.
+# - The decay of weave is stronger than that of the exponentials, slightly at 5 m/s and by a factor of two at
+#   2 m/s. There, friction stops the fork before the window ends: the response is no exponential, and no
+#   equivalent damping stands for that. The authors' numbers agree better with these decays.
+# - The moment of inertia of the frame about the vertical, 2.8 and 3.1 kg m², is near the 2.7 that the authors
+#   found to fit better. The moment about the roll axis is hardly known: its standard error is as large as its
+#   prior.
+# - A lean damping of 22 N m s/rad has no cause in a bicycle without a rider, and 0.027 s is long for a
+#   gyroscope. Both may stand for tyres that slip sideways, which this scene lacks; the carrier of the
+#   gyroscope may give way, too.
+# - Neighbouring residuals correlate by 0.4 (lean rate) and 0.6 (steer rate): they are no noise. Standard
+#   errors from how runs differ allow for that; they do not tell how far the numbers are from those of the
+#   bicycle.

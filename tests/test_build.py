@@ -200,5 +200,5 @@ def test_a_model_comes_back_from_its_file_without_tracing_the_scene(kind, tmp_pa
     assert str(loaded) == str(model)
     assert_array_equal(jj.simulate(loaded, t1=0.1).q_end, ended)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match="they differ in scene, sha256; build and save it again"):
+    with pytest.raises(ValueError, match="file and scene differ in scene, sha256; build and save it again"):
         jj.load_model(path, ChaplyginSleigh())

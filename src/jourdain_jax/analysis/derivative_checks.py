@@ -102,7 +102,7 @@ def gradient_checks(
 
     Returns an empty list if no reduction applies.
     """
-    # its Hessian of a Hessian costs more than all others together
+    # a Hessian of a Hessian would cost more than all other reductions together
     names = tuple(name for name in names if name != "gibbs-appell")
     if not names:
         return []

@@ -1,6 +1,7 @@
 """The energy of a scene, and whether it is conserved.
 
-E = T + V,   T = sum m v.v/2 + omega.I omega/2,   dE/dt = power of loads without a potential      (see `equations.power`)
+E = T + V,   T = sum m v.v/2 + omega.I omega/2
+    dE/dt = power of loads without a potential (`dynamics/power.py`)
 """
 
 from dataclasses import dataclass

@@ -10,10 +10,10 @@ D_k]` grow to a final dimension; the motion stays on a manifold of that dimensio
 depend on time or are not homogeneous, time counts as an additional coordinate with the field `(1, X_0)`; its
 dimension is omitted from the growth vector.
 
-`[X, Y] = DY X - DX Y` along the fields. Brackets of brackets need derivatives of derivatives: taken by
-eighth-order central differences (to about 1e-11), because every further derivative doubles the cost. Source:
-Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems
-VII (1994).
+`[X, Y] = DY X - DX Y` along the fields. Brackets of brackets need derivatives of derivatives, taken by
+central differences of eighth order (to about 1e-11): every further exact derivative would double the cost.
+Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical
+Systems VII (1994).
 
 Constraints and coordinate rates are linear functions of the speeds,
 
@@ -272,7 +272,7 @@ class _Fields:
         self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return values at many points, and a function of one direction per point that returns derivatives."""
+        """Return values at many points, and their derivatives as a function of one direction per point."""
         first = 1 - self.with_time
         padded = lambda a: np.pad(a, ((0, 0), (first, 0)))
         (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))

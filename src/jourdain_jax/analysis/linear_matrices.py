@@ -1,4 +1,4 @@
-"""Matrices of small motions: A and B of the first form, M, C, K and F of the second (formulas: `linearize.py`)."""
+"""Matrices of small motions: A, B of the first form and M, C, K, F of the second (`linearize.py`)."""
 
 import jax.numpy as jnp
 import numpy as np

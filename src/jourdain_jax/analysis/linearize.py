@@ -1,12 +1,13 @@
 """Small motions about a steady motion, on the constraint manifold.
 
     x = (independent coordinates, privileged speeds):              dx/dt = A x + B f
-    named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f,   M = W' (mass matrix) W
+    named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f
+                                                                   M = W' (mass matrix) W
 
 Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second form is
-Appell's equations for the named coordinates: the first form with the privileged speeds changed to (pdot, the
-others), times M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard,
-Multibody System Dynamics 33 (2015) 143.
+Appell's equations for the named coordinates: the first form in the speeds (pdot, other privileged speeds),
+times M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody
+System Dynamics 33 (2015) 143.
 """
 
 import equinox as eqx
@@ -46,9 +47,8 @@ class Modes(eqx.Module):
     eigenvalues: Complex[Array, "modes"]  # s, in 1/s
     shapes: Complex[Array, "parts modes"]  # (M s^2 + C s + K) shape = 0
     left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
-    condition: Float[
-        Array, "modes"
-    ]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
+    # |y' x| of unit left and right vectors of the first-order form: zero at a double root
+    condition: Float[Array, "modes"]
     scene: Scene
     named: Labels | None = static()
 
@@ -68,7 +68,7 @@ class Linearization(Printed, eqx.Module):
     K: Float[Array, "parts parts"]
     F: Float[Array, "parts inputs"]
     acceleration: Scalar  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
-    residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both are zero if it is steady
+    residual: Scalar  # larger of `acceleration` and |d2y/dt2| along the motion: zero if it is steady
     # largest coefficient of other coordinates in the second form, relative to those in M, C, K
     coupling: Scalar
     # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent speeds or
@@ -118,10 +118,10 @@ class Linearization(Printed, eqx.Module):
         return _roots(self._companion())
 
     def modes(self, names: Labels | None = None) -> Modes:
-        """Return the eigenvalues of `eigenvalues` with the shapes of their modes in the named coordinates
-        (without derivative).
+        """Return the values of `eigenvalues` with the shapes of their modes in the named coordinates, without
+        derivatives.
 
-        `names`: of the modes in this order; default: the `mode_names` of the scene, or "mode 1", ...
+        `names`: names of the modes, in this order; default: the `mode_names` of the scene, or "mode 1", ...
         """
         values, shapes, left, condition = _decomposed(self)
         return Modes(values, shapes, left, condition, self.about[0], names)

@@ -214,7 +214,7 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Return names of the coordinates that do not affect accelerations; for a quaternion, names of its parts."""
+    """Return names of coordinates without effect on accelerations; for a quaternion, names of its parts."""
     return entries_of(
         scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
     )

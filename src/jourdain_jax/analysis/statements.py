@@ -3,7 +3,8 @@
 inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
                e.e = 1                                                per gravity
 potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i with a potential V_i
-derivatives    d/ds of every statement along one direction in (parameters, t, q, u): autodiff against central differences; no kink
+derivatives    d/ds of every statement along one direction in (parameters, t, q, u): autodiff against
+               central differences; no kink
 """
 
 import equinox as eqx

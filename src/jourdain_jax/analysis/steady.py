@@ -1,11 +1,12 @@
 """Steady motions by root finding: privileged speeds are constant, and only coordinates without influence on
 them change.
 
-    g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
+    g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0
 
-Families of steady motions use the same equations (`motion_derivatives.py`). They are solved by
-Levenberg-Marquardt from the guess (`calculus/roots.py`). Steadiness of the result is judged by dy/dt and
-d2y/dt2 along the motion, without the list of ignorable coordinates.
+y: the privileged speeds; j: the coordinates that are not ignorable. Families of steady motions use the same
+equations (`motion_derivatives.py`). They are solved by Levenberg-Marquardt from the guess
+(`calculus/roots.py`). Steadiness of the result is judged by dy/dt and d2y/dt2 along the motion, without the
+list of ignorable coordinates.
 """
 
 from collections.abc import Mapping
@@ -65,7 +66,7 @@ class SteadyMotion(Printed, eqx.Module):
 
     state: State
     acceleration: Scalar  # largest remaining |dy/dt|
-    residual: Scalar  # largest of that, of |d2y/dt2| along the motion, and of the constraint residuals
+    residual: Scalar  # largest of `acceleration`, |d2y/dt2| along the motion and constraint residuals
     converged: Flag  # whether `residual` is below the root of round-off
 
     def __getitem__(self, name: str):
@@ -95,7 +96,8 @@ def steady(
     """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`. Only coordinates without influence on
     accelerations move.
 
-        steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
+        guess = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}
+        steady(disc, guess, held=("lean", "yaw_rate"))["spin_rate"]
 
     **Arguments**
 

@@ -1,17 +1,20 @@
 """Verification of a scene's equations at one state: independent formulations must give equal numbers.
 
-inertia            possible masses and inertias; orientations are rotations, directions of gravity unit vectors
-                                                                            (this and the next two: `statements`)
-potentials         every load with a potential is its gradient
+inertia            possible masses and inertias; rotation matrices; unit vectors as directions of gravity
+potentials         forces of loads with a potential are minus its gradient
 derivatives        of every body, load, potential and constraint: autodiff against central differences
 reductions         udot and A' lambda by every applicable reduction
-forms              M and h by Lagrange's energy derivatives and by the Gibbs function, against Jourdain's virtual power
-virtual power      Z' (M udot + h - Q) = 0 over the admissible virtual velocities, also per constraint           (18), (71)-(73)
-Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1); R from the constraints alone if none is built in
+forms              M and h by Lagrange's energy derivatives and by the Gibbs function, against Jourdain's
+                   virtual power
+virtual power      Z' (M udot + h - Q) = 0 over the admissible virtual velocities, also per constraint:
+                   eqs. (18), (71)-(73)
+Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1); R also from the constraints
+                   alone if no constraint is built into the coordinates
 energy             d(T + V)/dt along the motion, minus the power of loads without potential
 gradients          of udot and A' lambda: forward against reverse mode, and against central differences
 
-Everything is computed once and uncompiled, since compilation would take several times longer.
+`statements.py` has the first three. Everything is computed once and uncompiled, since compilation would take
+several times longer.
 """
 
 from collections.abc import Mapping

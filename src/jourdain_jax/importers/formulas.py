@@ -47,7 +47,7 @@ def sympy_package() -> Any:
 
 
 class Formulas:
-    """Named lists of expressions that are evaluated together, as a function of the values of their symbols."""
+    """Named lists of expressions, evaluated together as a function of the values of their symbols."""
 
     def __init__(self, lists: Mapping[Any, Any], leaves: Sequence[Any]):
         """Prepare the `lists` (or matrices) of expressions in the symbols `leaves`. Raises ValueError for a

@@ -48,9 +48,9 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     joints do not stop a motion; they become the `domain`.
 
     **Raises** ValueError, with the name, for an unreadable file, a moving body without mass, impossible
-    moments of inertia and repeated statements. Contents that change the motion and are not supported also
-    raise it, as do unknown ones, such as `tendon`, `armature`, `frictionloss` or a misspelt attribute, unless
-    `ignore` names them. A warning lists other omitted elements.
+    moments of inertia and repeated statements. Unless `ignore` names them, unknown contents also raise it,
+    such as a misspelt attribute, and unsupported contents that change the motion, such as `tendon`,
+    `armature` or `frictionloss`. A warning lists other omitted elements.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_labels(free))

@@ -60,7 +60,7 @@ def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
-    """Return principal moments about the centre for a mass of 1 kg. Cylinders and capsules have the axis z."""
+    """Return principal moments about the centre for 1 kg. The axis of cylinders and capsules is z."""
     if kind in ("sphere", "ellipsoid", "box"):
         squares = np.square(np.broadcast_to(size, 3))
         return (np.sum(squares) - squares) / (3 if kind == "box" else 5)

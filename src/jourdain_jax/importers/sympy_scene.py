@@ -145,7 +145,8 @@ def from_sympy(
         A = N.orientnew("A", "Axis", [q, N.y])
         P = O.locatenew("P", -l * A.z)
         O.set_vel(N, 0)
-        kane = KanesMethod(N, [q], [u], [q.diff() - u], bodies=[Particle("bob", P, m)], forcelist=[(P, -m * g * N.z)])
+        bob, weight = Particle("bob", P, m), (P, -m * g * N.z)
+        kane = KanesMethod(N, [q], [u], [q.diff() - u], bodies=[bob], forcelist=[weight])
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81}, name="Pendulum")
         print(jj.simulate(Pendulum(), {"q": 0.3}, t1=1.0))
     """

@@ -91,7 +91,8 @@ def from_urdf(
 
         class Robot(jj.from_urdf("robot.urdf", base="planar", motors=["left_wheel", "right_wheel"])):
             def contacts(self, pose):
-                return {side: jj.disc_contact(pose[f"{side}_wheel"], 0.033, axis="z") for side in ("left", "right")}
+                wheels = {side: pose[f"{side}_wheel"] for side in ("left", "right")}
+                return {side: jj.disc_contact(wheel, 0.033, axis="z") for side, wheel in wheels.items()}
 
     - `path`: of the file, or its text.
     - `base`: the motion of the root link: "fixed"; "planar", with coordinates `x`, `y` (m) and `heading`;

@@ -19,7 +19,8 @@ class Skate(Scene):
     """A skate (knife edge) on an incline: the smallest nonholonomic system with a force, one constraint in
     three coordinates.
 
-        xdot sin(heading) - ydot cos(heading) = 0,      heading'' = 0,   forward speed  v' = g sin(slope) cos(heading)
+        xdot sin(heading) - ydot cos(heading) = 0
+        heading'' = 0,   v' = g sin(slope) cos(heading)                  (v: forward speed)
 
     A turning skate drifts across the slope, not downhill. Neither xdot nor ydot can be privileged at every
     heading. Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972), ch. III.
@@ -135,7 +136,8 @@ def _forward(motion) -> Scalar:
 class Snakeboard(Scene):
     """The snakeboard: a board with a rotor, on two wheel pairs that steer by opposite angles.
 
-        -sin(heading +- steer) xdot + cos(heading +- steer) ydot +- l cos(steer) headingdot = 0        (front +, back -)
+        -sin(heading +- steer) xdot + cos(heading +- steer) ydot +- l cos(steer) headingdot = 0
+                                                                             (front: +, back: -)
 
     Two constraints, three degrees of freedom. At steer = +-pi/2 the constraints are parallel and the rank
     drops from 2 to 1. Motions pass smoothly: without torques the forward speed is c l cos(steer)/D and the

@@ -39,7 +39,8 @@ class DoublePendulumAngles(_DoublePendulum):
     """Planar double pendulum of two particles on massless rods, in the angles of the rods: no constraints,
     two degrees of freedom.
 
-        (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2'' + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
+        (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2''
+                           + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
         l2 th2'' + l1 cos(th1 - th2) th1'' - l1 sin(th1 - th2) th1'^2 + g sin(th2) = 0
 
     The same system as `DoublePendulumRods`. Source: L. D. Landau and E. M. Lifshitz, Mechanics, section 5,

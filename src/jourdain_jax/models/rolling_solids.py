@@ -21,7 +21,10 @@ class BallOnTurntable(Heavy):
     Its centre moves like a charge in a magnetic field: in a circle on the flat table, drifting *along* the
     slope of the tilted one.
 
-        R'' = n z x R' + g sin(tilt) x / (1 + kappa),    n = Om kappa / (1 + kappa)        (2/7 Om for a solid ball)
+        R'' = n z x R' + g sin(tilt) x / (1 + kappa)
+        n = Om kappa / (1 + kappa)                               (2/7 Om for a solid ball)
+
+    R: the centre; z, x: unit vectors normal to the table and downhill; Om: turn rate of the table.
 
     The speeds are quasi-velocities: the rates of the centre and the angular velocity in the axes of the
     table. In these the constraints are constant, and independent of the attitude, a quaternion needed only

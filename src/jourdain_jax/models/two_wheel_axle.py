@@ -3,7 +3,7 @@
     Method I    `TwoWheelAxleFree`         two free bodies, 12 coordinates, ten constraints (61)
     Method II   `TwoWheelAxleCoordinates`  seven coordinates, the five constraints (65)
     Method III  `TwoWheelAxleQuasi`        seven coordinates, two quasi-velocities (67), no constraints
-    the trap    `TwoWheelAxleRedundant`    Method I with (60a) and (60b): eleven rows of rank 10, none redundant
+    redundant   `TwoWheelAxleRedundant`    Method I with (60a) and (60b): eleven constraints of rank 10
 
 All have two degrees of freedom and Appell's equations (64):
 

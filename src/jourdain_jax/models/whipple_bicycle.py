@@ -213,7 +213,7 @@ class WhippleBicycle(Scene):
 
 
 def _vector(x, z) -> Vector3:
-    """Return components (x, 0, -z), in the engine's axes, of a vector in the plane of symmetry with z down."""
+    """Return the vector (x, z) of the plane of symmetry, z down, in the engine's axes: (x, 0, -z)."""
     x, z = jnp.asarray(x), jnp.asarray(z)
     return jnp.stack([x, jnp.zeros_like(x), -z])
 

@@ -1,9 +1,9 @@
 """Likely mistakes of a scene, in one table: computable, but hardly intended.
 
-smoothness        poses, constraints and coordinate rates that jump or have kinks on lines through states of the domain
+smoothness        jumps and kinks of poses, constraints and coordinate rates on lines through the domain
 grounds           behaviour of contact grounds against their description
 bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all conditions checked at the start of a motion
-scalar program    its rates and slopes against JAX's
+scalar program    rates and slopes of the program against JAX's
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from jourdain_jax.structure.structure import structure_whatever_its_faults
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes, none if plausible. `print` shows a table."""
+    """Findings of `check`: subject -> sentences on likely mistakes. `print` shows a table."""
 
     scene: str
     found: dict[str, tuple[str, ...]]

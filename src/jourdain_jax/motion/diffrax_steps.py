@@ -63,7 +63,14 @@ def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
         start = jj.start(disc, lean=0.3, spin_rate=-3.0)
         control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
         found = diffrax.diffeqsolve(
-            jj.diffrax_term(disc), diffrax.Tsit5(), 0.0, 2.0, None, (start.q, start.u), stepsize_controller=control, adjoint=diffrax.ForwardMode()
+            jj.diffrax_term(disc),
+            diffrax.Tsit5(),
+            0.0,
+            2.0,
+            None,
+            (start.q, start.u),
+            stepsize_controller=control,
+            adjoint=diffrax.ForwardMode(),
         )
         q, u = found.ys
     """
@@ -112,7 +119,7 @@ class Diffrax(eqx.Module, Integrator):
         control = diffrax.ClipStepSizeController(
             control, step_ts=ts, jump_ts=None if knots is None else knots
         )
-        # flip: values fall, which is not looked for; in lanes without an event it would be an error
+        # `flip` states that values fall; without it, samples without an event would raise an error
         search = optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0), flip=True)
         event = diffrax.Event(_lowest, search, direction=False)
         solution = diffrax.diffeqsolve(
@@ -194,8 +201,8 @@ def check(setup: Setup) -> None:
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
-    """Return which events have happened at the start, which diffrax does not check, by values there and after
-    two short steps (midpoint rule).
+    """Return which events have happened at the start, by values there and after two short steps (midpoint
+    rule). diffrax does not check the start.
     """
 
     def moved(h):

@@ -1,5 +1,5 @@
-"""Drift of a motion from its energy and from its constraints, which sets result codes, also inside `jit` and for
-each sample of a batch.
+"""Drift of energy and constraints along a motion. It sets result codes, also inside `jit` and for each sample
+of a batch.
 
 *Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about
 `atol + rtol |y|` per step in each number y of the state. If errors of this size in all numbers change the
@@ -10,7 +10,9 @@ the varying energy therefore means an error, such as an unnoticed singular posit
 *Constraints.* Redundant constraints that the start satisfies may contradict each other later, unless
 phi_0 = 0:
 
-    A u + phi_0 = 0,   rank A < number of rows:   an omitted constraint holds only if phi_0 is in the range of A
+    A u + phi_0 = 0,   rank A < number of rows
+
+An omitted constraint then holds only if phi_0 is in the range of A.
 """
 
 import jax

@@ -1,4 +1,4 @@
-"""Choice of the vector field that a model integrates: its state, scalar program or dense matrices, reduction."""
+"""Choice of the vector field of a model: its state, scalar program or dense matrices, and reduction."""
 
 from typing import Any
 

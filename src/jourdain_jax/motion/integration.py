@@ -73,9 +73,7 @@ def _prepared(setup: Setup) -> Setup:
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup so that, if machine code integrates it, other quantities use
-    machine code as well if possible.
-    """
+    """Return the setup, with machine code for quantities at saved times if machine code integrates it."""
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
         return setup

@@ -38,14 +38,14 @@ class Model(BuiltFor, Printed):
     """Scene with the choices for its integration, made by `build`. Prints as a table.
 
     It is a pytree whose leaves are the parameters of `scene`. `model.replace(radius=r)` changes parameters
-    and keeps the state and the backend; if JAX traces `r`, it keeps all choices that depend on numbers. A
-    model is pickled as its scene and built again when loaded.
+    and keeps the state and the backend. If JAX traces `r`, the new model keeps all choices that depend on
+    numbers. A model is pickled as its scene and built again when loaded.
     """
 
     scene: Scene
     formulation: Formulation  # with a decided state, if returned by `build`
     backend: str  # argument of `build`
-    decided: Reference | None  # scene that decided; None: this one, class defaults for traced parameters
+    decided: Reference | None  # scene whose numbers decided; None: this one, with class defaults if traced
     memory: int | None = None  # bytes for batches of motions and for the records of reverse mode, if given
     made: Any = None  # vector fields and constraint sizes by case, cached by `modelled`
 

@@ -1,10 +1,12 @@
 """Files of models: the findings of `build` as JSON, after a line with digests.
 
-    {"format", "version", "jax", "precision", "scene", "sha256"}      digests of the scene (class, methods, values) and of the next line
-    [how, {what: finding}]                                            what: the function that computes the finding, and its case
+    {"format", "version", "jax", "precision", "scene", "sha256"}
+    [how, {what: finding}]
 
-A dataclass in `KINDS` or a graph is {its name: its fields}, an array {"array": [type, entries]}, a tuple
-{"tuple": [...]}, a dictionary {"dict": pairs}.
+`scene`: digest of its class, methods and values; `sha256`: digest of the second line; `how`: arguments of
+`build`; `what`: the function that computes the finding, and its case. A dataclass in `KINDS` or a graph is
+{its name: its fields}, an array {"array": [type, entries]}, a tuple {"tuple": [...]}, a dictionary {"dict":
+pairs}.
 """
 
 import hashlib
@@ -56,7 +58,7 @@ def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
             if not isinstance(stated, dict) or stated.get(name) != value
         )
         raise ValueError(
-            f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in "
+            f"`{path}` is not a model of this `{type(scene).__name__}`: file and scene differ in "
             f"{other}; build and save it again"
         )
     how, found = _decoded(json.loads(content))

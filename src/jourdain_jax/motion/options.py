@@ -45,9 +45,9 @@ class Options:
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
       motion, but not those at which it continues. `work`: integrate the work of loads without a potential.
     - `max_transitions`: maximum number of events at which a motion continues (`jj.Event`).
-    - `retry`: repeat a motion whose independent speeds became invalid (with the full state), or that is stiff
-      (by an implicit solver, unless `solver` is given); `trajectory.fallback` and its summary report it.
-      Inside your own `jit` or `vmap`, or if False, the result code stays.
+    - `retry`: repeat a failed motion with the full state if its independent speeds became invalid, or by an
+      implicit solver if it is stiff and no `solver` is given. `trajectory.fallback` and the summary report a
+      repetition. Inside your own `jit` or `vmap`, or with False, the result code stays.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
@@ -55,7 +55,8 @@ class Options:
 
         careful = jj.Options(rtol=1e-11, atol=1e-11, max_step=0.1)
         motion = jj.simulate(jj.models.TiltingDisc(), t1=1.0, options=careful)
-        lanes = jj.rollout(jj.models.TiltingDisc(), {"lean": jnp.linspace(0.1, 0.3, 4)}, t1=1.0, options=careful, events=False)
+        leans = {"lean": jnp.linspace(0.1, 0.3, 4)}
+        lanes = jj.rollout(jj.models.TiltingDisc(), leans, t1=1.0, options=careful, events=False)
     """
 
     rtol: Number = TOLERANCE
@@ -159,9 +160,9 @@ def as_options(
 ) -> AllOptions:
     """Return the options of a call of `function`: the fields of the object, overridden by options by name.
 
-    `refused`: names that do not apply to this function, with reasons; `scene`: a model, which
-    supplies formulation, backend and memory. Raises TypeError for these and for unknown names,
-    ValueError for wrong values.
+    `refused`: names that do not apply to this function, with reasons; `scene`: a model, which supplies
+    formulation, backend and memory. Raises TypeError for refused and unknown names, ValueError for wrong
+    values.
     """
     of_model = (
         {name: getattr(scene, name) for name in ("formulation", "backend", "memory")}

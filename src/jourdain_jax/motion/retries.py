@@ -44,7 +44,7 @@ def retried(
     motion: Trajectory,
     options: AllOptions,
 ) -> Trajectory:
-    """Return the motion, repeated until a retry succeeds or none is left; unchanged if its result is traced."""
+    """Repeat a motion until a retry succeeds or none is left; unchanged if its result is traced."""
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -145,8 +145,8 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
 
 
 def _marked(motion: Trajectory, retries: int) -> Trajectory:
-    """Return one or several motions, marked as repeated by these retries. One that runs out of
-    steps again counts as stiff.
+    """Return one or several motions, marked as repeated by these retries. A motion that runs out of steps
+    again counts as stiff.
     """
     code = motion.result
     if retries & result_codes.IMPLICIT:

@@ -203,11 +203,11 @@ def rollout(
     **Examples**
 
         disc = jj.models.TiltingDisc()
-        spins = jnp.linspace(-6.0, -3.0, 16)                      # rad/s
-        lanes = jj.rollout(disc, {"lean": 0.3, "spin_rate": spins}, parameters={"mass": jnp.full(16, 2.0)}, t1=1.0)
-        print(lanes)                                              # how many arrived, and why others did not
-        lanes["lean"].shape, lanes.quantiles("lean").shape        # (16, 201) and (3, 201)
-        lanes.failed, lanes.lane(3).energies().balance            # numbers of failed lanes; one lane as a trajectory
+        starts = {"lean": 0.3, "spin_rate": jnp.linspace(-6.0, -3.0, 16)}
+        lanes = jj.rollout(disc, starts, parameters={"mass": jnp.full(16, 2.0)}, t1=1.0)
+        print(lanes)                                          # how many arrived, and why others did not
+        lanes["lean"].shape, lanes.quantiles("lean").shape    # (16, 201) and (3, 201)
+        lanes.failed, lanes.lane(3).energies().balance        # numbers of failed lanes; one as a trajectory
     """
     span = {name: by_name.pop(name, None) for name in SPAN}
     options = as_options(options, by_name, "rollout", scene=scene)

@@ -4,13 +4,15 @@ cross a jump of their loads.
 In reverse mode, a value L of a motion has cotangents g = dL/dy at the states it uses and g_0 = dL/dy_0 at the
 start. With the error s = atol + rtol |y| that step-size control allows at one state,
 
-    amplification = sum |g_0| s_0 / sum |g| s          relative error of a derivative <~ steps amplification rtol
+    amplification = sum |g_0| s_0 / sum |g| s
+    relative error of a derivative <~ steps amplification rtol
 
-because every step adds an error s, and the derivative is evaluated along a path that is off by their sum. In
-forward mode, with tangents d of the saved states and of the start, and s for the largest |y| of each,
+because every step adds an error s, and the derivative is evaluated along a path that is off by the sum of
+these errors. In forward mode, let d_0, d_m and d_1 be the tangents of the start, of the middle saved state
+and of the end, and s the error for the largest |y| of each number:
 
-    amplification = max |d_1|/s / max |d_0|/s                  if everything depends only on the start
-                    (max |d_1|/s / max |d_middle|/s)^2         otherwise; the smaller of both if also on the start
+    amplification = max |d_1|/s / max |d_0|/s              if only the start varies
+                    (max |d_1|/s / max |d_m|/s)^2          otherwise; the smaller of both if the start varies
 
 If the rates are f_1 before and f_2 after a jump at time s(p),
 

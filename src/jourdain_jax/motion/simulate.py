@@ -103,12 +103,13 @@ def simulate(
 
         disc = jj.models.TiltingDisc()
         motion = jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=2.0)
-        print(motion)                                             # result, steps, drift of the energy, contact forces
-        motion["lean"], motion.q_end, motion.ts                   # by name; as vectors
-        motion.point("disc"), motion.point("disc", (0, 0.5, 0))   # paths of the mass centre and of a point fixed in the body
+        print(motion)                             # result, steps, drift of the energy, contact forces
+        motion["lean"], motion.q_end, motion.ts   # by name; as vectors
+        motion.point("disc")                      # path of the mass centre
+        motion.point("disc", (0, 0.5, 0))         # path of a point fixed in the body
 
-        def lean_at_end(radius):                                  # a derivative with respect to a parameter
-            return jj.simulate(disc.replace(radius=radius), {"lean": 0.3, "spin_rate": -3.0}, ts=[1.0])["lean"][-1]
+        def lean_at_end(radius):                  # a derivative with respect to a parameter
+            return jj.simulate(disc.replace(radius=radius), {"lean": 0.3}, ts=[1.0])["lean"][-1]
 
         slope = jax.grad(lean_at_end)(0.5)
     """
@@ -259,10 +260,10 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
     if isinstance(given, State):
         return given
     if given is not None and not isinstance(given, Mapping):
+        advice = "; write `.state` after it" if isinstance(getattr(given, "state", None), State) else ""
         raise ValueError(
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a "
-            "dictionary of named values, or None for the scene's "
-            f"example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
+            f"dictionary of named values, or None for the scene's example{advice}"
         )
     model = modelled(model)
     return named_start(
@@ -295,7 +296,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     elif not known_numbers(times_fit(ts, t0, t1)).all():
         raise ValueError(
             f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
-            f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose it"
+            f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose `ts`"
         )
     return t0, ts, t1
 

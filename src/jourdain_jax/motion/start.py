@@ -69,8 +69,8 @@ def consistent(
     `inputs`: values of the scene's inputs (default: zero). `held`: names of
     coordinates and speeds that stay fixed.
 
-    Differentiable in any mode. The remaining violation is in `residual`. It is infinite for numbers that are
-    not finite; no error is raised, so that this works inside jit and vmap. The quaternion (0, 0, 0, 0) has no
+    Differentiable in any mode. `residual` is the remaining violation, infinite for numbers that are not
+    finite. No error is raised, so the function works inside jit and vmap. The quaternion (0, 0, 0, 0) has no
     direction and stays unchanged, with a residual of 1/2. Raises ValueError for wrong shapes.
     """
     model, scene = modelled(scene), as_scene(scene)
@@ -131,10 +131,11 @@ def start(
     Values that contradict each other by at most 1.5e-5, as rounded numbers may, move onto the constraints.
 
     Omitted coordinates start at zero (a quaternion at the identity) and follow from the constraints. If that
-    fails or leaves the scene's `domain`, they start at other states of the domain, nearest first, which the
-    `guess` of the state counts. `near`: initial guesses of coordinates by name. These may end outside the
-    domain, as may coordinates that the constraints determine uniquely. If a quaternion is partly given,
-    `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other components are zero.
+    fails or leaves the scene's `domain`, the search begins again at other states of the domain, nearest
+    first; `guess` of the result counts them. `near`: initial guesses of coordinates by name. Guessed
+    coordinates may end outside the domain, and so may coordinates that the constraints determine uniquely. If
+    a quaternion is partly given, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other components are
+    zero.
 
     Omitted privileged speeds stay zero, and the dependent speeds follow from the constraints. If dependent
     speeds are given, all others are determined by the smallest change that satisfies the constraints, in
@@ -244,7 +245,7 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
 
 
 def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> None:
-    """Raise a ValueError that says which constraint the state violates."""
+    """Raise a ValueError that names the violated constraint."""
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
     outside = np.flatnonzero(~np.asarray(start.inside(state.q)))

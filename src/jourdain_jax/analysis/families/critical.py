@@ -1,4 +1,4 @@
-"""Special points of steady motions as functions of the scene's parameters p, by the implicit function theorem.
+"""Special points of steady motions as functions of the parameters p, by the implicit function theorem.
 
     G(X, p) = 0,   dX = -G_X+ G_p dp,   X = (z, a, b, w)
     G = ( R,  C a,  C b,  F (a b) - (a b) S(w),  size and phase of a and b )
@@ -8,7 +8,8 @@
     zero eigenvalue              F a = 0,  F b = 0, with b along the steady motions that continue at the same
                                  parameters
 
-R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue. G and its derivatives are one scalar program. It has redundant,
+R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue; S(w): the 2
+x 2 matrix of the relations below G. G and its derivatives are one scalar program. It has redundant,
 consistent rows: G_X has full column rank, and its pseudo-inverse is computed by Q R.
 """
 
@@ -52,9 +53,8 @@ class CriticalPoint(Printed, eqx.Module):
     state: State
     parameters: dict[str, Float[Array, "*batch"]]  # the parameters that vary along the family
     eigenvalue: Complex[Array, "*batch"]  # 1/s, crossing the axis or double
-    condition: Float[
-        Array, "*batch"
-    ]  # least pivot of the equations over the largest; near zero, special points are close together
+    # least pivot of the equations over the largest; near zero, special points are close together
+    condition: Float[Array, "*batch"]
     code: Int[Array, "*batch"]
     kind: str = static()
 
@@ -238,7 +238,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     if type(scene) is not type(equations.scene):
         raise ValueError(
             f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
-            f"`{type(scene).__name__}`"
+            f"`{type(scene).__name__}`; pass a scene of the family's class"
         )
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))

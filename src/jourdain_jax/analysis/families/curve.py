@@ -168,8 +168,8 @@ def located(
     """Return the point between two neighbours at which a smooth `test` changes its sign; None if the curve is
     lost or undefined.
 
-    The interval is divided repeatedly, but not in its middle, and a short interval is interpolated linearly.
-    At a branch point the equations lose rank, and by symmetry branch points often lie in the middle.
+    The interval is divided repeatedly, and a short interval is interpolated linearly. It is not divided in
+    the middle, where by symmetry branch points often lie: there the equations lose rank.
     """
     share, short = 0.4, 1e-6  # a piece this short differs from its chord by the square of its length
     (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there

@@ -1,4 +1,4 @@
-"""Families of steady and of periodic motions: the whole curve through one of them, with its special points."""
+"""Families of steady and of periodic motions: the curve through one of them, with its special points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -234,20 +234,21 @@ def family(
     Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`, with one freedom left.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
-        print(turns)                                  # folds, branch points, changes of stability, why the curve ends
+        print(turns)    # folds, branch points, changes of stability, why the curve ends
         turns["lean"], turns.eigenvalues, turns.at(lean=0.4)
         straight = jj.family(bicycle, turns.branches[0])
-        jj.family(sleigh, jj.periodic(sleigh, guess, jnp.pi, inputs=torque), vary="drag")     # multipliers in place of eigenvalues
+        orbit = jj.periodic(sleigh, guess, jnp.pi, inputs=torque)
+        jj.family(sleigh, orbit, vary="drag")    # multipliers in place of eigenvalues
 
     **Arguments**
 
     - `guess`: as in `steady`; or a branch point of another family of steady motions, whose other curve is
       followed; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
       quantities of its search.
-    - `until`: name -> value at which the curve ends. The curve is followed towards it from the guess, whose
-      value of that name is kept at the start; without `until` it is followed in both directions. A closed
-      curve ends at its start, and a curve along a parameter ends before the parameter loses its declared
-      sign.
+    - `until`: name -> value at which the curve ends. The curve starts at the guess, keeps the guess's value
+      of that name there, and is followed towards the given value; without `until` it is followed in both
+      directions. A closed curve ends at its start, and a curve along a parameter ends before the parameter
+      loses its declared sign.
     - `vary`: a parameter of the scene (one number) that changes along the curve.
     - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as in `steady`.
     - `names`: of the modes at the start, by ascending real part, with the positive imaginary part of a pair

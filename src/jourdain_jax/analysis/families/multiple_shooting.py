@@ -1,4 +1,4 @@
-"""The equations of multiple shooting, R(z_1, .., z_n, T) of `periodic.py`, with their derivatives and multipliers."""
+"""Equations of multiple shooting (R in `periodic.py`) with their derivatives and multipliers."""
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ class Shooting(eqx.Module):
 
     @property
     def is_unknown(self) -> Bool[np.ndarray, "all_unknowns"]:
-        """Return which of the states at the starts of pieces, and whether the period, are solved for."""
+        """Return which numbers of the states at the starts of pieces, and whether the period, are unknown."""
         at_start = [k in self.free for k in range(len(self.sizes))]
         return np.array([*at_start, *[True] * len(self.sizes) * (self.pieces - 1), self.until is not None])
 

@@ -1,10 +1,11 @@
 """Periodic motions by multiple shooting over one period, and their Floquet multipliers.
 
     z_k -> f_k(z_k),  k = 1 .. n:  motions over equal parts of the period T,   z = (q, u)
-    R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  f_n(z_n) - z_1 of what matters,  c(z_1) )
+    R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  K (f_n(z_n) - z_1),  c(z_1) )
 
-c: the value of an event, if T is unknown. Ignorable coordinates may shift by the same amount in every period.
-With small motions dz_k = B_k x_k that satisfy the constraints, and L_k B_k = 1,
+g, phi: constraints; K: omits coordinates without effect on accelerations; c: value of an event, if T is
+unknown. Ignorable coordinates may shift by the same amount in every period. With small motions dz_k = B_k x_k
+that satisfy the constraints, and L_k B_k = 1,
 
     x_{k+1} = M_k x_k,  M_k = L_{k+1} (df_k/dz_k) B_k:       the multipliers are the eigenvalues of M_n .. M_1
 
@@ -124,7 +125,8 @@ def periodic(
 ) -> PeriodicMotion:
     """Return the periodic motion near a guess, with its Floquet multipliers.
 
-        orbit = jj.periodic(sleigh, {"forward": 0.4}, jnp.pi, inputs={"torque": lambda t: 0.6 * jnp.sin(2 * t)})
+        torque = {"torque": lambda t: 0.6 * jnp.sin(2 * t)}
+        orbit = jj.periodic(sleigh, {"forward": 0.4}, jnp.pi, inputs=torque)
         orbit.multipliers, orbit.stable, orbit.shift["heading"]
         jax.jacfwd(lambda drag: jj.periodic(sleigh.replace(drag=drag), guess, jnp.pi).multipliers)(0.15)
 

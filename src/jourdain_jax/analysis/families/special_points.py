@@ -4,7 +4,7 @@
     branch point                det (U'J; t) = 0              U: the independent rows of J, continued
     zero eigenvalue             s = 0, real
     pair on the imaginary axis  Re s = 0, complex
-    double root                 (s_a - s_b)^2 = 0             a pair of real ones becomes complex, or the reverse
+    double root                 (s_a - s_b)^2 = 0             two real ones become complex, or the reverse
 
 If a test function keeps its sign but nearly vanishes by the parabola through three neighbours, it is
 evaluated there: it may change its sign twice within a step.

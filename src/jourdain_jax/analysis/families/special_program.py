@@ -1,4 +1,4 @@
-"""The equations of special points as one scalar program with derivatives. Eigenvalue derivatives use it as well."""
+"""Equations of special points as one scalar program with derivatives; eigenvalue derivatives use it, too."""
 
 from functools import cached_property
 

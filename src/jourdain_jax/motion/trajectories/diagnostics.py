@@ -21,8 +21,8 @@ OverTimes = Float[Array, "*lanes times"]
 
 
 class Energies(eqx.Module):
-    """Energies along a motion, in J. `balance`, which is T + V minus the work done (if integrated), is
-    constant for a correct motion.
+    """Energies along a motion, in J. `balance`, T + V less the integrated work, is constant for a correct
+    motion.
     """
 
     kinetic: OverTimes

@@ -137,7 +137,7 @@ class Trajectory(Record, Printed):
         return map_over_times(values_in_time.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
-        """Return the quantities that the scene declares conserved, by name at all times; without the energy."""
+        """Return quantities that the scene declares conserved, without the energy, by name at all times."""
         return map_over_times(values_in_time.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
@@ -228,10 +228,11 @@ class Trajectory(Record, Printed):
         """Return the trajectory, with NaN states if it reached neither its end nor an event. Works under
         `jit`, `vmap` and `grad`, and for each sample of a batch.
 
-            loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
+            motion = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0)
+            loss = lambda radius: motion(radius).nan_if_failed().q_end[0]
 
-        Their derivatives are NaN, too. Samples excluded from a loss by `jnp.where(motion.succeeded, ...,
-        0.0)` do not disturb its derivatives with respect to shared values.
+        Derivatives of NaN states are NaN, too. Samples excluded from a loss by `jnp.where(motion.succeeded,
+        ..., 0.0)` do not disturb its derivatives with respect to shared values.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]
         failed = lambda x: jnp.broadcast_to(
