@@ -200,8 +200,8 @@ def _gyroscopic_torque_forgotten(inertia_resultants):
 
 
 def _torques_in_space_axes(impressed):
-    def wrong(scene, motion):
-        right, given = impressed(scene, motion), virtual_power.resultants(scene, motion)
+    def wrong(scene, motion, loads=None):
+        right, given = impressed(scene, motion, loads), virtual_power.resultants(scene, motion, loads=loads)
         return virtual_power.Resultants(right.force, given.torque, right.direct)
 
     return wrong
@@ -223,7 +223,7 @@ def _torques_in_space_axes(impressed):
         (instant, "rates_along_motion", _b_t_forgotten, 13, "dE/dt is the power of all that works"),
         (
             virtual_power,
-            "_inertia_resultants",
+            "inertia_resultants",
             _gyroscopic_torque_forgotten,
             3,
             "h is the gradient of the Gibbs function",
