@@ -162,7 +162,7 @@ SENSORS: dict[str, str] = {
     "jj.identification.Sensor(3)": "`quantity` of `Sensor` is an int, expected a coordinate, a speed",
     "jj.identification.Sensor(lag=-0.1)": "`lag` of `Sensor` is -0.1 s, expected zero or more",
     "jj.identification.Sensor(delay=-0.1)": (
-        "`delay` of `Sensor` is -0.1 s, expected zero or more; where the clock of a channel is ahead, shift"
+        "`delay` of `Sensor` is -0.1 s, expected zero or more; if the clock of a channel is ahead, shift"
         " its times"
     ),
     "jj.identification.Sensor(gain=np.nan)": "`gain` of `Sensor` is nan, expected a finite number",

@@ -64,7 +64,7 @@ STUDIES: dict[str, str | tuple[str, str]] = {
     "by_radius.task(keep_every=0)": "`keep_every` is 0, expected a whole number of at least 1",
     "by_radius.task(every=2)": (
         "TypeError",
-        "Study.run() takes no `every`: trajectories of every N-th lane are kept by `keep_every=N`",
+        "Study.run() takes no `every`: `keep_every=N` stores the trajectory of every N-th sample",
     ),
     "by_radius.task(t1=-np.inf)": "t1",
     "by_radius.task(outputs={'x': jj.studies.End('leen')})": "did you mean `lean`",

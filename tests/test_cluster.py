@@ -104,7 +104,7 @@ def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path):
             options["client"] = stack.enter_context(distributed.Client(cluster))
         else:
             options["processes"] = 2
-        with pytest.warns(UserWarning, match="processes died 3 times on lanes 6144 to 8191 of"):
+        with pytest.warns(UserWarning, match="processes died 3 times on samples 6144 to 8191 of"):
             found = study.run(tmp_path / "discs.zarr", **options)
     first, last = found.store.span(3)
     assert not found.complete

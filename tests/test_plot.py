@@ -89,11 +89,11 @@ def test_of_a_rollout_bands_hold_the_parts_that_are_asked_for(lanes):
         expected = np.rad2deg(np.quantile(lanes["heading"][:, -1], [(1 - part) / 2, (1 + part) / 2]))
         assert_allclose([at_end.min(), at_end.max()], expected, atol=1e-9)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "90 % of lanes",
-        "50 % of lanes",
+        "90 % of samples",
+        "50 % of samples",
         "median",
     ]
-    assert axes[0].get_title(loc="left") == "21 lanes; 0 stopped at an event, 0 failed"
+    assert axes[0].get_title(loc="left") == "21 samples; 0 stopped at an event, 0 failed"
     assert not overlap(figure, figure.legends[0], axes[0].title, *axes)
 
 

@@ -118,7 +118,7 @@ def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     assert whole.statistics.lanes[0, 0] == COUNT - 1
     values = [np.delete(arrays[name].values, BAD) for name in ("final lean", "distance")]
     assert whole.statistics.covariance[0, 4] == pytest.approx(np.cov(*values)[0, 1], rel=1e-9)
-    assert f"failed: lanes {BAD}" in str(whole)
+    assert f"failed: samples {BAD}" in str(whole)
     with pytest.raises(ValueError, match="radius"):
         whole.lane(BAD).simulate()
 
@@ -178,13 +178,13 @@ def test_a_study_is_opened_without_its_scene(whole):
     assert str(found) == str(whole)
     with pytest.raises(ValueError, match=r"study\.run"):
         found.lane(0)
-    with pytest.raises(IndexError, match="lane 150 does not exist"):
+    with pytest.raises(IndexError, match="sample 150 does not exist"):
         whole.lane(COUNT)
 
 
 def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(whole, drawn):
     shown = whole._repr_html_()
-    assert shown.startswith(f"<pre>Study in {whole.store.path}: {COUNT} of {COUNT} lanes")
+    assert shown.startswith(f"<pre>Study in {whole.store.path}: {COUNT} of {COUNT} samples")
     axes = {axes.get_xlabel(): axes for axes in drawn[0].axes}
     assert len(axes) == len(OUTPUTS)
     assert axes["final lean (rad)"].lines[0].get_xdata() == [whole.mean("final lean")] * 2

@@ -148,7 +148,9 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, path, computed
         receipt = path / "run" / "chunks" / "1"
         receipt.write_bytes(receipt.read_bytes()[:-1])
     if harm == "one bit":
-        with pytest.raises(ValueError, match=r"`lean at the end` is damaged in lanes .*run the study again"):
+        with pytest.raises(
+            ValueError, match=r"`lean at the end` is damaged in samples .*run the study again"
+        ):
             jj.load_study(path).to_xarray()
     with pytest.warns(UserWarning, match="1 chunks of .* are damaged and are computed again: 1"):
         found = run(path)
@@ -375,7 +377,7 @@ def test_chunks_of_another_grid_do_not_count(whole, path, computed):
     would give another mean.
     """
     _changed(path, "grid.json", centre=whole.store.read_grid()["high"])
-    with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are omitted"):
+    with pytest.warns(UserWarning, match=r"samples 0 to 31, 32 to 63, 64 to 89 of .* are omitted"):
         found = jj.load_study(path)
     assert (found.complete, found.counts) == (False, {})
     with (
@@ -572,7 +574,7 @@ def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes
     lanes = ", ".join({1: "32 to 63", 2: "64 to 89"}[number] for number in deadly)
     with pytest.warns(
         UserWarning,
-        match=rf"processes died 3 times on lanes {lanes} of .*omitted; all others are stored.*memory=",
+        match=rf"processes died 3 times on samples {lanes} of .*omitted; all others are stored.*memory=",
     ) as said:
         assert _with_deaths(path, deadly) == dict.fromkeys(deadly, 3)
     assert len(said) == 1
@@ -585,7 +587,7 @@ def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes
 def test_a_first_block_on_which_processes_die_ends_the_study(tmp_path):
     """Every process begins with it: all others would die, too."""
     with pytest.raises(
-        RuntimeError, match=r"processes died 3 times on lanes 0 to 31 of .*with which every process begins"
+        RuntimeError, match=r"processes died 3 times on samples 0 to 31 of .*with which every process begins"
     ):
         _with_deaths(tmp_path / "discs.zarr", (), first_block=True)
 

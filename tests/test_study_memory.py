@@ -73,7 +73,7 @@ def test_a_study_goes_on_with_the_blocks_with_which_it_began(tmp_path, monkeypat
     assert begun.complete
     assert begun.store.study["block"] == 16
     assert_array_equal(begun.statistics.mean, whole.statistics.mean)
-    with pytest.raises(ValueError, match="blocks of 16 lanes and chunks of 16 take up to"):
+    with pytest.raises(ValueError, match="blocks of 16 samples and chunks of 16 take up to"):
         run(path, memory=bounded(monkeypatch, 1000), **TIMES)
 
 

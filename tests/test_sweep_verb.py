@@ -37,7 +37,7 @@ def test_a_study_runs_from_a_file_goes_on_and_is_exported(tmp_path, capsys, monk
     monkeypatch.chdir(tmp_path)
     (tmp_path / "discs.toml").write_text(FILE)
     assert main(["sweep", "discs.toml", "--shard", "1/2", "--quiet"]) == 0
-    assert "64 of 100 lanes; run it again to continue" in capsys.readouterr().out
+    assert "64 of 100 samples; run it again to continue" in capsys.readouterr().out
     assert main(["sweep", "status", "discs.zarr", "--json"]) == 1  # not complete
     assert json.loads(capsys.readouterr().out)["complete"] is False
     assert main(["sweep", "resume", "discs.zarr", "--quiet"]) == 0

@@ -18,14 +18,14 @@ if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
 
 # A batched LAPACK call of jaxlib 0.10 waits, in a thread of the pool, for work that is queued on the same
-# pool: as many such calls at once as there are threads wait for ever (seen with two cores and batches of some
+# pool. If every thread makes such a call, all wait for ever (seen with two cores and batches of some
 # thousand). jaxlib 0.11 no longer splits batches.
 if not {"PJRT_NPROC", "NPROC"} & _os.environ.keys():
     _os.environ["PJRT_NPROC"] = str(max(16, _os.cpu_count() or 1))
 
-# By default XLA compiles a loop into one function if its body touches less than 1 kB; beyond, it starts every
-# operation of the body on its own, which takes ten times as long as the arithmetic of a step (a disc alone:
-# 2.9 ms, with this 0.22 ms).
+# By default XLA compiles a loop into one function if its body touches less than 1 kB. Otherwise it starts
+# every operation of the body separately, which takes ten times as long as the arithmetic of a step (a motion
+# of one disc: 2.9 ms, with this option 0.22 ms).
 if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
@@ -46,7 +46,7 @@ _MOVED = ("identification", "studies", "equations", "analysis")
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name; raise an AttributeError that says where a former one is now."""
+    """Import a public name; raise an AttributeError with the new place of a former name."""
     if name in __all__:
         return _public(name)
     places = [

@@ -44,8 +44,8 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
 
     Derivatives of the parameters with respect to the readings are exact; covariances are of first order in
     the sigmas of the readings (see the module docstring). A mass centre is the point with the least sum of
-    squared distances from the plumb lines through it. The published values are means over all pairs of lines
-    instead, in which nearly parallel lines have the same weight as others.
+    squared distances from the plumb lines through it. The published values are means over all pairs of lines,
+    with the same weight for nearly parallel lines.
 
     **Arguments:** `path`, of a file of readings (`readings.py` lists its content), or the name of a shipped
     one (`shipped_measurements`). **Returns:** a `MeasuredBicycle`, with a warning for plumb lines that miss
@@ -92,10 +92,8 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
         here = [i for i, name in enumerate(names) if name.startswith(f"miss {part}")]
         distance = [abs(float(found[names[i]])) for i in here]
         sigma = np.sqrt(np.sum(misses[here] ** 2, axis=1))
-        # where sigmas are zero, so is the scale
-        ratio = np.divide(
-            distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0
-        )
+        exact = np.where(np.array(distance) > 1e-12, np.inf, 0.0)  # ratios for zero sigmas
+        ratio = np.divide(distance, sigma, out=exact, where=sigma > 0)
         worst = int(np.argmax(ratio))
         if ratio[worst] > 3:  # standard deviations by which lines may miss a mass centre without a warning
             warnings.append(
@@ -113,9 +111,8 @@ def _with_slopes(
     """Return parameters, distances of plumb lines, and the derivatives of both with respect to each reading,
     in the order of the means.
     """
-    found, slope = jax.linearize(
-        lambda y: _parameters(y, dict(hangings), by_table), means
-    )  # compiles in half the time of `jacfwd`
+    # compiles in half the time of `jacfwd`
+    found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)
     return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 

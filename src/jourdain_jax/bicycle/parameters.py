@@ -24,8 +24,8 @@ PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
-    """Return the conditions that make a bicycle impossible, each as a sentence, with marks of the violating
-    values. NaN counts as a violation.
+    """Return the conditions that possible bicycles satisfy, as sentences, and whether each value violates
+    them. NaN counts as a violation.
 
     **Arguments:** `values`: number, or array of samples of one common shape, for every name of
     `PARAMETER_NAMES`. **Returns:** sentence -> True for values that violate it.
@@ -42,10 +42,10 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
 
 
 def doubts(values: Mapping[str, float]) -> Sentences:
-    """Return one sentence for each oddity of a bicycle's values that does not prevent a simulation, from the
-    conditions of a rigid body's inertia.
+    """Return one sentence for each doubtful value of a bicycle that does not prevent a simulation.
 
-    The inertia matrix is positive definite, and each principal moment is at most the sum of the other two.
+    The inertia matrix of a body should be positive definite, and each principal moment of inertia at most the
+    sum of the other two.
     **Arguments:** `values`: number for every name of `PARAMETER_NAMES`.
     """
     found = []
@@ -57,10 +57,8 @@ def doubts(values: Mapping[str, float]) -> Sentences:
     for body in "BH":
         xx, yy, zz, xz = (values[f"I{body}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
         middle, half_spread = (xx + zz) / 2, math.hypot((xx - zz) / 2, xz)
-        smallest, largest = (
-            middle - half_spread,
-            middle + half_spread,
-        )  # principal moments in the plane of symmetry
+        # principal moments in the plane of symmetry
+        smallest, largest = middle - half_spread, middle + half_spread
         if smallest <= 0 or yy <= 0:
             found.append(f"the inertia matrix of body {body} is not positive definite")
         if yy > smallest + largest or largest > smallest + yy:

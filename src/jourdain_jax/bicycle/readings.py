@@ -19,6 +19,7 @@ of quantity, part and number: `TtB2` is the twisting period of the rear frame B,
 | `mP lP dP TtP1` | a steel bar of known inertia, which calibrates the rod | kg, m, s |
 | `h6 h7 d5 d6 l` | suspension point of handlebar G relative to the front axle; only with G and S | m |
 | `g` | gravity | m/s^2 |
+
 The offset of the rod is from the middle of the wheel. A part has three hangings or more.
 """
 
@@ -37,27 +38,7 @@ _FORM = (
 )
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
 _WHOLE_FORK, _SPLIT_FORK = ("mH", "TcH1"), ("mG", "mS", "h6", "h7", "d5", "d6", "l", "TcG1", "TcS1")
-_ALWAYS = (
-    "g",
-    "dR",
-    "nR",
-    "dF",
-    "nF",
-    "mR",
-    "mF",
-    "mB",
-    "lR",
-    "lF",
-    "TcR1",
-    "TcF1",
-    "TtR1",
-    "TtF1",
-    "mP",
-    "lP",
-    "dP",
-    "TtP1",
-    "TcB1",
-)
+_ALWAYS = "g dR nR dF nF mR mF mB lR lF TcR1 TcF1 TtR1 TtF1 mP lP dP TtP1 TcB1"
 
 
 @dataclass(frozen=True)
@@ -100,15 +81,19 @@ def read_readings(path: str | Path) -> Readings:
             [with_sigma(one, name, where, "reading") for one in right.split(",")]
         )
     split = "mS" in means or "mG" in means
-    needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
+    needed = [
+        *_ALWAYS.split(),
+        *(_SPLIT_FORK if split else _WHOLE_FORK),
+        *(_FRAME if "w" in means else _TABLE),
+    ]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
     missing = [name for name in needed if name not in means]
     for part, found in hangings.items():  # three, for three numbers in the plane of symmetry
         missing += [f"{what}{part}{k + 1}" for k in range(len(found), 3) for what in ("alpha", "a", "Tt")]
     if missing:
         raise ValueError(
-            f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and "
-            f"add a line {_FORM} for each."
+            f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure each one, "
+            f"and add a line {_FORM}."
         )
     used = {
         *needed,
@@ -140,7 +125,7 @@ def _hangings(means: dict[str, float], part: str) -> Indices:
 
 
 def _mean(readings: list[tuple[float, float | None]]) -> tuple[float, float | None]:
-    """Return the mean of the readings in a line, and its standard deviation (None if no reading has one)."""
+    """Return the mean of the readings in a line, and its standard deviation; None if no reading has one."""
     squares = [sigma**2 for _, sigma in readings if sigma is not None]
     return math.fsum(value for value, _ in readings) / len(readings), (
         math.sqrt(math.fsum(squares)) / len(readings) if squares else None

@@ -3,8 +3,8 @@
     M q'' + v C1 q' + (g K0 + v^2 K2) q = 0,   q = (lean, steer)
     p(s; v) = det(s^2 M + s v C1 + g K0 + v^2 K2) = a4 s^4 + a3 s^3 + a2 s^2 + a1 s + a0
 
-With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x), and polynomials in
-x determine, with omega^2 = b1/b3,
+With x = v^2, the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x). Stability changes
+at roots of polynomials in x (omega^2 = b1/b3):
 
     where an eigenvalue is zero             b0 = 0
     where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if b1/b3 > 0)
@@ -18,7 +18,7 @@ b3 > 0, and a real eigenvalue crosses zero upwards where b0' b1 < 0. Two that co
 dp/dv and d2p/ds2 have equal signs. Coefficients are ordered from the highest power.
 
 M, C1, K0 and K2 come from the nonlinear model, linearised about upright straight running at rest and at one
-speed. That C is proportional to v and K affine in v^2 is checked in the tests.
+speed. The tests check that C is proportional to v, and that K is affine in v^2.
 
 Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant
 (Orlando) and discriminant are textbook.

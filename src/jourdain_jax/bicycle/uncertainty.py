@@ -49,13 +49,13 @@ def sample_parameters(
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())
 
-    **Arguments:** `bicycle`; `key`, a JAX random key; `count`, number of samples. **Returns:** all samples,
-    including impossible ones, which are marked and counted by violation. **Raises** ValueError if `count` is
-    not positive.
+    **Arguments:** `bicycle`; `key`, a JAX random key; `count`, number of samples. **Returns:** all samples.
+    Impossible bicycles are marked (`physical`) and counted by violation (`refused`). **Raises** ValueError
+    unless `count` is positive.
     """
     if count < 1:
         raise ValueError(
-            f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about 0.1 sigma."
+            f"`count` is {count}, expected at least 1 sample; 2000 samples give limits to about 0.1 sigma."
         )
     value = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     standard = jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)

@@ -74,14 +74,10 @@ def _job(options) -> bool:
 def prefixes(names: list[str]) -> list[str]:
     """Return prefixes of figure files, numbered if bicycle names repeat; empty for one bicycle."""
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
-    return (
-        [
-            f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-"
-            for k, name in enumerate(plain)
-        ]
-        if len(names) > 1
-        else [""] * len(names)
-    )
+    if len(names) < 2:
+        return [""] * len(names)
+    numbers = [plain[: k + 1].count(name) for k, name in enumerate(plain)]
+    return [f"{name}-{k}-" if k > 1 else f"{name}-" for name, k in zip(plain, numbers, strict=True)]
 
 
 def _figures(study: Study, out: Path, prefix: str) -> list[Path]:

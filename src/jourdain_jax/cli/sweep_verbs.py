@@ -165,14 +165,13 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
         raise ValueError("the file has no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))
     vary = {name: _varying(name, how) for name, how in asked.get("vary", {}).items()}
-    start = (
-        {
+    if "start" in asked:
+        start = {
             name: _varying(name, how) if isinstance(how, Mapping) else how
             for name, how in asked["start"].items()
         }
-        if "start" in asked
-        else None
-    )
+    else:
+        start = None
     correlation = {tuple(pair.split()): value for pair, value in asked.get("correlation", {}).items()}
     known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
     outputs = (

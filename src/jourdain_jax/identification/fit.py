@@ -53,14 +53,14 @@ class FitFields(OptionFields, total=False):
 
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
-    """Return the minimum from each `theta`. If there is none, or if residuals are far beyond their sigmas,
-    fit over growing spans as well, and return the lower minimum.
+    """Return the minimum from each `theta`. Where there is none, or where residuals are far beyond their
+    sigmas, also fit over growing spans, and return the lower minimum.
 
-    Over a short span a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
-    starts at the result over the shorter span; unknowns that a short span does not determine stay near the
-    first guess. If a fit makes no progress far from its minimum, growing spans are tried, and the fit
-    continues only if these do not lead to small residuals either. If every theta is a first guess of the same
-    problem, spans grow only if none led to a minimum with small residuals.
+    Over a short span, a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
+    starts at the result over the shorter span. Unknowns that a short span does not determine stay near the
+    first guess. A fit without progress far from a minimum stops, and continues only if growing spans do not
+    lead to small residuals either. For several first guesses of one problem, spans grow only if no guess led
+    to small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times the expectation for noise alone, one half per sample
@@ -121,7 +121,7 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
 
 
 def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
-    """Return the minimum after moving unknowns off their bounds where that lowers it, and the statistics of
+    """Return the minimum after moving unknowns off their bounds where this lowers F, and the statistics of
     the unknowns that stay at a bound.
     """
     for _ in range(20):
@@ -178,19 +178,17 @@ def fit(
     - `loss`: `huber()` or `student_t()` for data with outliers (default: least squares).
     - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white
       noise. "runs": the differences between at least five runs (the cluster sandwich), valid for any noise
-      within a run, even if the scene is not quite right; unknowns of single runs still assume white noise
-      within the run.
+      within a run, even if the scene is slightly wrong. Unknowns of single runs still assume white noise.
     - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`.
 
-    Stop events do not cut a run: all given samples count, and `Fit.warnings` names events that the fitted
-    motion meets before a sample. Give samples up to the event of the real motion; otherwise estimates whose
-    motion ends early would have fewer residuals.
+    Stop events do not cut a run: all given samples count, since otherwise a motion that ends early would have
+    fewer residuals. `Fit.warnings` names events that the fitted motion meets before a sample. Give samples up
+    to the event of the real motion.
 
-    If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans
-    (unless `shooting` is given): the first 1/32 of each run, then more of it, as far as the fitted motion
-    follows the data, with the first guess as a weak prior whose sigma is its own size. This also fits
-    unstable motions that no first guess would follow to their end. The lower minimum counts; `Fit.grown` is
-    True if it came from growing spans.
+    If a fit finds no minimum, or residuals far beyond their sigmas, it is repeated over growing spans, unless
+    `shooting` is given. The first span is 1/32 of each run; the next ones are longer, as far as the fitted
+    motion follows the data. The first guess is then a weak prior, with its own size as sigma. This also fits
+    unstable motions. The lower minimum counts; `Fit.grown` is True if it came from growing spans.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals, residuals, the fitted scene, and
     sentences on undetermined combinations. Given sigmas count as known; if they are None, or under a robust
@@ -251,16 +249,8 @@ def _asked(
     if errors not in ("sigmas", "runs"):
         raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
     named = free if isinstance(free, Mapping) else tuple(as_names(free))
-    return Asked(
-        as_scene(scene),
-        named,
-        settled,
-        loss or LEAST_SQUARES,
-        Control(tolerance, most_steps, cutoff),
-        errors,
-        1,
-        None,
-    )
+    control = Control(tolerance, most_steps, cutoff)
+    return Asked(as_scene(scene), named, settled, loss or LEAST_SQUARES, control, errors, 1, None)
 
 
 def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
@@ -283,16 +273,14 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
             raise ValueError(f"the channels hold {sorted(counts)} repeats; {said}")
         members = counts.pop()
     enough = _check_enough(runs, unknowns, repeats)
-    theta = (
-        unknowns.first_guesses(asked.guesses)
-        if members is None
-        else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-    )
-    problem = (
-        Problem(asked, runs, unknowns, members)
-        if asked.shooting is None
-        else Piecewise(asked, runs, unknowns)
-    )
+    if members is None:
+        theta = unknowns.first_guesses(asked.guesses)
+    else:
+        theta = np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
+    if asked.shooting is None:
+        problem = Problem(asked, runs, unknowns, members)
+    else:
+        problem = Piecewise(asked, runs, unknowns)
     found = shot(problem, theta) if isinstance(problem, Piecewise) else minimum(problem, theta)
     # without a step it is unknown whether starts can move with the unknowns
     if problem.failed or not found.steps.all():
@@ -331,10 +319,8 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
             'errors="runs" takes standard errors from the differences between runs, but there '
             f'are {len(runs)}; give 5 or more, or errors="sigmas"'
         )
-    robust, unknown = (
-        asked.loss != LEAST_SQUARES,
-        in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma),
-    )
+    robust = asked.loss != LEAST_SQUARES
+    unknown = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and robust:
         raise ValueError(
             f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of "
@@ -357,10 +343,8 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
         for name, values in run.values.items()
     ]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
-    each, sigmas = (
-        sum(counts) + np.count_nonzero(unknowns.prior_weight),
-        len({name for run in runs for name in run.unknown_sigma}),
-    )
+    each = sum(counts) + np.count_nonzero(unknowns.prior_weight)
+    sigmas = len({name for run in runs for name in run.unknown_sigma})
     samples = int(np.max(each))
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
@@ -387,6 +371,6 @@ def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.
         unknowns=problem.unknowns,
         work_out=partial(statistics, problem, found, at_bounds),
     )
-    if problem.with_memory:  # it needs motions, in the present context
+    if problem.with_memory:  # statistics need motions: compute them in the present context
         told.statistics  # noqa: B018
     return told

@@ -1,11 +1,11 @@
-"""Extremes and integrals of a quantity along a motion, from its values at saved times and at the end, also
-between them.
+"""Extremes and integrals of a quantity along a motion, from its values at saved times and at the end.
 
-Between saved times the quantity is a polynomial through nearby values. For the largest value it has degree
-four, through the five values around the largest; a fine grid and one step of Newton's method for p'(s) = 0
-locate its maximum. For the integral it has degree three, through the four values around each interval;
-Simpson's rule integrates it exactly. With time h between values, the maximum of a smooth quantity is accurate
-to the fifth order of h and its integral to the fourth; saved values alone would give the second.
+Between saved times the quantity is a polynomial through nearby values. For the largest value, a polynomial p
+of degree four goes through the five values around the largest; a fine grid and one step of Newton's method
+for p'(s) = 0 locate its maximum. For the integral, a polynomial of degree three goes through the four values
+around each interval; Simpson's rule integrates it exactly. With time h between values, the maximum of a
+smooth quantity is accurate to the fifth order of h, and its integral to the fourth. Saved values alone would
+give the second order.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # number of values that determine a polynomi
 def sampled(
     motion: Trajectory, quantity: str | Callable
 ) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
-    """Return times and values of a quantity (a name, or a function of a trajectory that returns its values at
-    all times), and the number of valid ones.
+    """Return times and values of a quantity, and the number of valid values. `quantity`: a name, or a
+    function of a trajectory that returns its values at all times.
 
-    Times are the saved ones that were reached, followed by the end. The end replaces the last saved time if
+    Times are the saved times that were reached, followed by the end. The end replaces the last saved time if
     the two are very close. Remaining entries repeat the end.
     """
     reached, ts = jnp.sum(motion.valid), jnp.asarray(motion.ts)
@@ -63,10 +63,8 @@ def largest(times: Values, values: Values, count: Count) -> Scalar:
     if times.shape[0] < FOR_EXTREMES:
         return values[k]
     first, s, y = _window(times, values, count, k - FOR_EXTREMES // 2, k, FOR_EXTREMES)
-    low, high = (
-        s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)],
-        s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)],
-    )
+    low = s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)]
+    high = s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)]
     # a fine grid for the polynomial
     places = jnp.linspace(low, high, 33)
     near = places[jnp.argmax(jax.vmap(lambda place: _polynomial(s, y, place))(places))]

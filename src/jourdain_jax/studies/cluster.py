@@ -61,8 +61,8 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
-    """Compute and store a chunk in this worker; `asking`: the process that requests it; `places`: result of
-    `_places`.
+    """Compute and store a chunk in this worker. `asking`: the process that requests the chunk; `places`:
+    result of `_places`.
     """
     # a separate worker process uses only its share of the cores
     if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:

@@ -111,11 +111,10 @@ class Design(Printed):
             )
         group = len(self.variables) + 2
         if self.sampler == "saltelli" and (samples % group or self.correlation):
-            wrong = (
-                "variables are correlated, for which Sobol' indices are not defined"
-                if self.correlation
-                else f"`samples` is {samples}"
-            )
+            if self.correlation:
+                wrong = "variables are correlated, for which Sobol' indices are not defined"
+            else:
+                wrong = f"`samples` is {samples}"
             raise ValueError(
                 f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of "
                 f"{group} samples (variables + 2)"
@@ -245,11 +244,10 @@ class Design(Printed):
             + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")
         ]
         for name, what in self.variables.items():
-            shown = (
-                f"{len(what)} values from {what.min():g} to {what.max():g}"
-                if isinstance(what, np.ndarray)
-                else repr(what)
-            )
+            if isinstance(what, np.ndarray):
+                shown = f"{len(what)} values from {what.min():g} to {what.max():g}"
+            else:
+                shown = repr(what)
             lines.append(f"  {name}: {shown}")
         lines += [
             f"  correlation of {' and '.join(pair)}: {value:g}"

@@ -19,8 +19,8 @@ class InUseError(RuntimeError):
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock file `path`. Raises `InUseError`, naming the holder, if it is in use. The system releases
-    the lock when its holder ends, however it ends.
+    """Hold the lock file `path`. Raises `InUseError`, naming the holder, if another process holds it. The
+    system releases the lock when its holder ends for any reason.
     """
     with open(path, "a+b") as file:
         if fcntl is not None:

@@ -6,9 +6,9 @@ and the output f as a function of them,
     d mean / d theta = (1 / n) sum_k  df/dx (x_k)  dx_k / d theta
 
 where df/dx is the exact derivative of the sample's motion, in forward mode. This is the derivative of the
-mean if f is continuous. If f jumps when a sample changes from one end to another (from an event to none), the
-contribution of these samples is missing, and a warning says so. Outputs that say which event happened have no
-pathwise derivative.
+mean if f is continuous. f may jump where the end of a motion changes, for example from an event to none. The
+contribution of these samples is missing then, with a warning. Outputs that depend only on the event that
+happened have no pathwise derivative.
 """
 
 from collections.abc import Mapping, Sequence
@@ -67,7 +67,7 @@ class MeanGradients(Printed):
 
     def _text(self) -> str:
         lines = [
-            f"Gradients of means over {int(self.lanes.max(initial=0))} lanes"
+            f"Gradients of means over {int(self.lanes.max(initial=0))} samples"
             + (f"; {self.failed} failed and are omitted" if self.failed else "")
         ]
         for i, output in enumerate(self.outputs):
@@ -184,14 +184,14 @@ def _gathered(
         if of_event.any():
             none = ", ".join(name for name, is_one in zip(task.outputs, of_event, strict=True) if is_one)
             warned.append(
-                f"whether a sample ends at an event depends on what varies: the means of {none} have no "
-                "pathwise derivative; take differences"
+                f"the event at which a sample ends depends on the varying quantities: the means of {none} "
+                "have no pathwise derivative; take differences"
             )
         if not of_event.all():
             warned.append(
-                f"{int(np.sum(ends >= 0))} of {len(values)} samples end at an event, others at another one "
-                "or none: if an output jumps between ends, the gradient lacks the change of these shares; "
-                "compare with differences of the mean"
+                f"{int(np.sum(ends >= 0))} of {len(values)} samples end at an event, others at another event "
+                "or at none: if an output jumps between these ends, the gradient lacks the change of their "
+                "shares; compare with differences of the mean"
             )
     for text in warned:
         warn(text, SensitivityWarning)

@@ -1,7 +1,7 @@
 """Bounds on a study: the disk of its folder, and the memory of its processes (resident memory, sizes of blocks
 and chunks).
 
-The need of a process is estimated before it compiles anything, and checked after every block:
+The memory that a process needs is estimated before it compiles anything, and checked after every block:
 
     resident now + COMPILED + BLOCKS (bytes of a block's saved states) + CHUNKS (bytes of a chunk's arrays)
 

@@ -22,8 +22,8 @@ from jourdain_jax.studies.along_motion import integral, largest, sampled
 
 
 class Output:
-    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times`: whether it uses saved
-    times, or only the end.
+    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times`: whether the number
+    depends on saved times, or only on the end.
     """
 
     unit: str = ""
@@ -70,8 +70,10 @@ class End(Output):
 class _Along(Output):
     """A number that summarises a `quantity` along the motion: the name of a coordinate or speed, or a
     function of a trajectory that returns its values at all times, such as `lambda motion:
-    jnp.hypot(motion["x"], motion["y"])`. Between saved times it is a polynomial: for a smooth quantity saved
-    every h seconds, extremes are accurate to the fifth order of h, integrals to the fourth.
+    jnp.hypot(motion["x"], motion["y"])`.
+
+    Between saved times the quantity is a polynomial. For a smooth quantity saved every h seconds, extremes
+    are accurate to the fifth order of h, integrals to the fourth.
     """
 
     quantity: str | Callable
@@ -142,7 +144,7 @@ class OfEvent(Output):
         valid = names_of_events(scene)
         if not valid:
             raise ValueError(
-                f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no stop events; "
+                f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no stop events; "
                 "give it a method `events`"
             )
         if self.event is not None and self.event not in valid:
@@ -153,11 +155,9 @@ class OfEvent(Output):
 
     def _happened(self, motion: Trajectory):
         stopped = motion.result == EVENT
-        return (
-            stopped
-            if self.event is None
-            else stopped & (motion.event == motion.event_names.index(self.event))
-        )
+        if self.event is None:
+            return stopped
+        return stopped & (motion.event == motion.event_names.index(self.event))
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class Quantity(Output):
         if shape != () or jnp.iscomplexobj(found):
             raise ValueError(
                 f"an output is {described(found)}, expected one real number for a motion; take "
-                "an entry or reduce it, or give one output for each"
+                "one entry, reduce the array, or give one output for each entry"
             )
         return jnp.asarray(found, motion.q_end.dtype)
 

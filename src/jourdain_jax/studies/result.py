@@ -47,7 +47,7 @@ class Lane(Printed):
         given = {
             name: f"{np.asarray(value).tolist()}" for name, value in (self.parameters | self.starts).items()
         }
-        lines = [f"Lane {self.number}: " + ", ".join(f"{name} = {value}" for name, value in given.items())]
+        lines = [f"Sample {self.number}: " + ", ".join(f"{name} = {value}" for name, value in given.items())]
         if self.kept:
             lines.append(f"  {result_codes.MESSAGES.get(int(self.kept['result']), 'not computed yet')}")
             lines += [f"  {name} = {value:.6g}" for name, value in self.kept.items() if name != "result"]
@@ -103,12 +103,12 @@ class StudyResult(Printed):
         """
         if not 0 <= number < len(self):
             raise IndexError(
-                f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}"
+                f"sample {number} does not exist; this study has {len(self)} samples, 0 to {len(self) - 1}"
             )
         if self.task is None:
             raise ValueError(
                 "the scene of this study is unknown here; call `study.run` with the same arguments, which "
-                "recomputes nothing"
+                "computes nothing again"
             )
         kept = {}
         if self.store.columns:
@@ -187,7 +187,7 @@ class StudyResult(Printed):
             )
         if self.store.study["save"] == "statistics" or not self.complete:
             raise ValueError(
-                "Sobol' indices need all lanes of a study with save='outputs'"
+                "Sobol' indices need all samples of a study with save='outputs'"
                 + ("" if self.complete else "; run it to its end")
             )
         return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
@@ -261,7 +261,7 @@ class StudyResult(Printed):
             unit = column.attributes.get("units") if column else ""
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
             axis.spines[["top", "right"]].set_visible(False)
-        whole.axes[0].set_ylabel("lanes")
+        whole.axes[0].set_ylabel("samples")
 
     def _repr_html_(self) -> str:
         drawn = [name for name in self.outputs if self._done and self._bars(name, 40)[0].sum() > 0]
@@ -281,7 +281,7 @@ class StudyResult(Printed):
         tally = self._tally
         done = int(tally.codes.sum())
         lines = [
-            f"Study in {self.store.path}: {done} of {len(self)} lanes"
+            f"Study in {self.store.path}: {done} of {len(self)} samples"
             + ("" if self.complete else "; run it again to continue")
         ]
         lines += [
@@ -290,7 +290,7 @@ class StudyResult(Printed):
         ]
         if self.failed.size:
             lines.append(
-                "  failed: lanes "
+                "  failed: samples "
                 + ", ".join(map(str, self.failed[:10]))
                 + (" ..." if self.failed.size > 10 else "")
             )
@@ -299,11 +299,11 @@ class StudyResult(Printed):
         if done:
             lines.append(
                 f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} "
-                "rejected a lane"
+                "rejected per sample"
             )
             width = max(map(len, self.outputs))
             lines.append(
-                f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} "
+                f"  {'':<{width}} {'samples':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} "
                 f"{'median':>12} {'97.5 %':>12}"
             )
             for i, name in enumerate(self.outputs):

@@ -1,8 +1,7 @@
 """Running a study: computes and stores the missing chunks in sequence, with a progress bar, and handles
 interruptions.
 
-After the first Ctrl-C the current chunk is finished; a second one stops at once. The same call continues from
-either.
+The first Ctrl-C finishes the current chunk, the second stops at once. The same call continues after both.
 """
 
 import json
@@ -68,14 +67,14 @@ class Runner:
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
             warn(
-                f"the first {task.block} lanes of `{store.path}` have other bits here than where the study "
+                f"the first {task.block} samples of `{store.path}` have other bits here than where the study "
                 "began (another machine, or other versions); results are right, but not bit-equal to those "
                 "of one machine"
             )
         self.grid = Grid.from_dict(kept, len(task.outputs))
 
     def run(self, number: int) -> tuple[int, int]:
-        """Compute and store a chunk. Return the number of its samples and of the failed ones."""
+        """Compute and store a chunk. Return the numbers of its samples and of its failed samples."""
         first, last = self.store.span(number)
         kept, tallies = [], []
         for number_of_block in range(first // self.task.block, -(-last // self.task.block)):
@@ -161,7 +160,7 @@ def bounded(
         need := memory.BLOCKS * task.block * task.bytes_of_lane
         + memory.CHUNKS * lanes * task.bytes_of_kept_lane
     ) > room:
-        text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB"
+        text = f"blocks of {task.block} samples and chunks of {lanes} take up to {need / 1e6:.0f} MB"
         text += f", but `memory` leaves only {room / 1e6:.0f} MB for each process"
         raise ValueError(
             f"{text}; give more memory, fewer processes, a smaller `chunk`, fewer times `ts`, "
@@ -189,7 +188,7 @@ def _constants(task: Task) -> dict[str, tuple]:
         found["saved_lane"] = (
             "saved_lane",
             np.arange(0, len(task.design), task.stride),
-            {"long_name": "lane whose trajectory is kept"},
+            {"long_name": "sample whose trajectory is kept"},
         )
     return found
 
@@ -203,8 +202,8 @@ def _chunk(task: Task, chunk: int | None) -> int:
         return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
         raise ValueError(
-            f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are "
-            "computed together in this study"
+            f"`chunk` is {chunk!r}, expected a multiple of {unit} samples, such as {4 * unit}: this study "
+            "computes so many together"
         )
     return int(chunk)
 
@@ -259,11 +258,9 @@ def _as_text(x) -> object:
     """Return an option as text; numbers stay numbers. Memory addresses of functions, different in every
     process, are omitted.
     """
-    return (
-        np.asarray(x).tolist()
-        if isinstance(x, int | float | np.ndarray | jax.Array)
-        else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
-    )
+    if isinstance(x, int | float | np.ndarray | jax.Array):
+        return np.asarray(x).tolist()
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(x))
 
 
 def _check_same(store: Store, task: Task, chunk: int | None) -> None:
@@ -278,7 +275,7 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         )
     if chunk is not None and chunk != store.chunk:
         raise ValueError(
-            f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is "
+            f"`{store.path}` was begun with chunks of {store.chunk} samples, and `chunk` is "
             f"{chunk}; omit `chunk`"
         )
     now = versions()
@@ -343,7 +340,7 @@ def run(
     """Compute the missing part of a task in the folder `path`.
 
     `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
-    numbers of samples and of failed ones, chunk by chunk.
+    numbers of samples and of failed samples, chunk by chunk.
     """
     if not Store.is_taken(path):
         memory.check_disk(path, len(task.design) / shard[1] * task.bytes_of_kept_lane)
@@ -358,7 +355,7 @@ def run(
         bar = tqdm(
             total=known + _lanes(store, missing),
             initial=known,
-            unit="lane",
+            unit="sample",
             unit_scale=True,
             disable=not progress,
             smoothing=0.1,

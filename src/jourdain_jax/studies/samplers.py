@@ -1,5 +1,4 @@
-"""Numbers u in (0, 1) for the samples of a study. Those of sample k depend only on the seed and k, not on the
-order of computation.
+"""Numbers u in (0, 1) for the samples of a study. The numbers of sample k depend only on the seed and k.
 
     random           words of the counter-based generator Philox 4x64 (Salmon et al. 2011), with counter k
     latin-hypercube  one sample in each of N strata of each variable (McKay, Beckman and Conover 1979):
@@ -11,8 +10,8 @@ order of computation.
                      samples j (d + 2) + i are A_j, then A_j with the entry of one variable from B_j, for
                      each variable, then B_j (Saltelli et al. 2010)
 
-Each is a function of an ordered array of integers k, of NumPy or of JAX on a device, with identical bits,
-since it computes with words.
+Each sampler is a function of an ordered array of integers k, in NumPy or in JAX on a device. Both give
+identical bits, since they compute with words.
 """
 
 from functools import lru_cache
@@ -100,9 +99,8 @@ def latin_hypercube(seed: int, index, variables: int, samples: int):
         [permuted(seed, number, index, samples) for number in range(variables)], axis=1
     )
     share = random(seed, index, variables, samples)
-    return (strata + share) / apart(
-        float(samples), share
-    )  # keeps a compiler from replacing the division by a constant
+    # `apart` keeps a compiler from replacing the division by a constant
+    return (strata + share) / apart(float(samples), share)
 
 
 @lru_cache(maxsize=16)

@@ -72,7 +72,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     group = len(names) + 2
     if values.ndim != 1 or values.size % group or not values.size:
         raise ValueError(
-            f"there are {values.size} values, expected a multiple of {group}: of a design of "
+            f"there are {values.size} values, expected a multiple of {group}; give the values of a design of "
             f"{len(names)} variables with sampler='saltelli'"
         )
     if not 0 < confidence < 1:
@@ -80,7 +80,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     groups = values.reshape(-1, group)
     sound = np.isfinite(groups).all(axis=1)
     groups = groups[sound]
-    if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # whose variance is the divisor
+    if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # the variance of these columns is the divisor
         raise ValueError(
             "fewer than two groups of samples have values, or all values are equal; Sobol' "
             "indices need a quantity that varies"

@@ -85,8 +85,8 @@ class Tally:
     steps: np.ndarray  # (2,): accepted and rejected
     failed: np.ndarray  # indices of samples
     sums: np.ndarray  # (blocks, 3, outputs, outputs): N, A and S of each block
-    # (2, cells): nonempty cells among (outputs, CELLS + 2), and their counts; the first and last of each row
-    # are below and above
+    # (2, cells): nonempty cells among (outputs, CELLS + 2), and their counts; the first and last cell of each
+    # output are those below and above the grid
     cells: np.ndarray
     extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite if there is none
 

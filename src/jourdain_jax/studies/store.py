@@ -1,5 +1,5 @@
-"""A study on disk: a Zarr group (format 3) with one array per quantity along `lane`, and files for continuing
-after an interruption.
+"""A study on disk: a Zarr group (format 3) with one array per quantity along the axis `lane` of samples, and
+files for continuing after an interruption.
 
     NAME/zarr.json, NAME/c/0, ...   arrays, cut into chunks; each ends in its CRC-32C (Zarr's codec `crc32c`)
     run/study.json      identity of the study: format, digests, settings, versions; written once
@@ -8,11 +8,10 @@ after an interruption.
     run/chunks/K        receipt of chunk K with checksums, counts and sums; written after its arrays
     run/lock            held by the process that runs the study
 
-A chunk counts as finished if its receipt is intact and belongs to this study and grid, and its arrays match
-the checksums of the receipt; otherwise it is computed again. Files that are not in the manifest count as
-missing; the grid is written before the manifest that lists it. Processes that compute the grid at the same
-time write the same one. On machines whose numbers differ, chunks of a replaced grid do not count. Chunks need
-no manifest.
+A chunk is finished if its receipt is intact, belongs to this study and grid, and matches the checksums of its
+arrays. Otherwise it is computed again. Files that are not in the manifest count as missing. The grid is
+written before the manifest that lists it. Processes that compute the grid at the same time write the same
+numbers. Where the numbers of two machines differ, chunks of a replaced grid do not count.
 """
 
 import contextlib
@@ -150,11 +149,10 @@ class Store:
         if not os.path.exists(self.path / "run" / "study.json"):
             if os.path.isfile(self.path):
                 raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
-            what = (
-                "is not a study: it holds no `run/study.json`"
-                if os.path.exists(self.path)
-                else "does not exist"
-            )
+            if os.path.exists(self.path):
+                what = "is not a study: it holds no `run/study.json`"
+            else:
+                what = "does not exist"
             raise ValueError(
                 f"`{shortened(self.path, 300)}` {what}; give the folder of a study, or a new name"
             )
@@ -193,7 +191,7 @@ class Store:
         # a file that is written once
         return read_bytes(self.path / name, 100_000_000, "the folder of a study with all its files")
 
-    def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
+    def _damaged(self, name: str, what: str = "its content has changed") -> ValueError:
         return ValueError(
             f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move "
             "the folder away and run it anew"
@@ -207,7 +205,7 @@ class Store:
     def lanes_of(self, numbers: Sequence[int]) -> str:
         """Return a text that names the samples of chunks."""
         spans = (f"{first} to {last - 1}" for first, last in map(self.span, numbers[:5]))
-        return f"lanes {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
+        return f"samples {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
 
     @staticmethod
     def is_taken(path: FilePath) -> bool:
@@ -289,12 +287,13 @@ class Store:
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
             own = [self.identity, self._digests.get(GRID, found.of[-1])]
-            return (
-                found
-                if ((found.first, found.last), list(found.of), {*found.checksums})
-                == (self.span(number), own, {*self.columns})
-                else None
-            )
+            if ((found.first, found.last), list(found.of), {*found.checksums}) == (
+                self.span(number),
+                own,
+                {*self.columns},
+            ):
+                return found
+            return None
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             return None
 
@@ -344,7 +343,7 @@ class Store:
             if self.columns and (wrong := self._wrong(number)):
                 text = (
                     f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the"
-                    " chunk, is not what was written"
+                    " chunk, has changed"
                 )
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 

@@ -27,9 +27,9 @@ from jourdain_jax.studies.run import bounded, in_this_process, run
 from jourdain_jax.studies.task import AT_START, SAVES, Task
 from jourdain_jax.studies.workers import in_processes
 
-_STATED = "times to save at are `ts`, and what is stored is chosen by `outputs` and `save`"
+_STATED = "give saved times as `ts`; `outputs` and `save` choose the stored results"
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
-REFUSED["every"] = "trajectories of every N-th lane are kept by `keep_every=N`"
+REFUSED["every"] = "`keep_every=N` stores the trajectory of every N-th sample"
 
 
 class TaskFields(MotionFields, total=False):
@@ -113,7 +113,7 @@ class Study(Printed):
             check_name(name, known, f"scene `{type(self.scene).__name__}` has no parameter `{name}`")
             if known[name]:
                 raise ValueError(
-                    f"parameter `{name}` is an array; what varies must be one number: vary a "
+                    f"parameter `{name}` is an array, but only single numbers can vary: vary a "
                     "parameter from which the scene makes that array"
                 )
             if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
@@ -136,7 +136,7 @@ class Study(Printed):
                 constants[name] = how
             elif name in groups:
                 raise ValueError(
-                    f"start `{name}` is a vector; what varies must be one number: vary its entries"
+                    f"start `{name}` is a vector, but only single numbers can vary: vary its entries"
                 )
             else:
                 varying[name + AT_START] = how
@@ -215,15 +215,15 @@ class Study(Printed):
           speeds. They are NaN for failed motions.
         - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
           "statistics" stores only counts, sums and histograms.
-        - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample (with save="statistics"
-          its other results, too); 1: of all samples; None: of none.
+        - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample; with save="statistics"
+          also its other results. 1: of all samples; None: of none.
         - `chunk`: number of samples stored together (default: about a thousandth of all); after a crash at
           most one chunk is computed again.
-        - `processes`: the number of computing processes, each with its share of the cores. More than one need
-          a script whose top level is guarded by `if __name__ == "__main__":`, and outputs that are not
-          defined inside functions.
-        - `client`: a `dask.distributed.Client` whose workers compute, one chunk at a time each; all of them
-          must reach the folder.
+        - `processes`: the number of computing processes, each with its share of the cores. If there are
+          several, guard the top level of your script by `if __name__ == "__main__":`, and define outputs
+          outside of functions.
+        - `client`: a `dask.distributed.Client`. Each of its workers computes one chunk at a time, and must
+          reach the folder.
         - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
           machines; `jj.studies.merge_studies` combines them.
         - `progress`: show a bar; `command`: text stored with the study.

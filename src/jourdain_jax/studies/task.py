@@ -27,7 +27,7 @@ from jourdain_jax.studies.design import Design
 from jourdain_jax.studies.outputs import Output
 from jourdain_jax.studies.store import Column
 
-LARGEST_BLOCK = 2048  # samples: enough to hide the slowest, few enough for a chunk of a fraction of a second
+LARGEST_BLOCK = 2048  # samples: one slow sample hardly counts, and a chunk takes a fraction of a second
 AT_START = "_at_start"  # suffix of columns of start values, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files next to the arrays
 SAVES = ("statistics", "outputs")
@@ -119,11 +119,10 @@ class Task:
             found.append((name, Column("float64", math.nan, attributes, every=every)))
 
         for name in self.design.names:
-            about = (
-                f"start value of {name.removesuffix(AT_START)}"
-                if name.endswith(AT_START)
-                else f"parameter {name}"
-            )
+            if name.endswith(AT_START):
+                about = f"start value of {name.removesuffix(AT_START)}"
+            else:
+                about = f"parameter {name}"
             number(name, about, units.get(name, ""), role="varied")
         for name, (_, dtype, fill, attributes) in OF_LANES.items():
             events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}

@@ -1,8 +1,8 @@
-"""Several processes that compute the chunks of one study; each is started afresh (never forked from one in
-which JAX runs) and has its share of the cores.
+"""Several processes that compute the chunks of one study. Each is a new process, not a fork of one in which
+JAX runs, and has its share of the cores.
 
-The unfinished chunks of a worker that died are given to a new worker, one at a time. A chunk on which workers
-died three times is omitted, with a warning that names its samples.
+If a worker dies, a new worker computes its unfinished chunks, one at a time. A chunk on which workers died
+three times is omitted, with a warning that names its samples.
 """
 
 import contextlib
@@ -83,9 +83,9 @@ def whatever_dies(
     """Yield the counts of the chunks `numbers`, computed even if processes die. Chunks on which they die
     repeatedly are omitted with a warning.
 
-    - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed ones of each
-      chunk, and returns the indices of unfinished ones if a process died.
-    - `attempts`: how often each of these chunks is tried alone, to exclude other chunks as the cause.
+    - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed samples of each
+      chunk. It returns the indices of unfinished chunks if a process died.
+    - `attempts`: how often each unfinished chunk is tried alone, to exclude other chunks as the cause.
 
     A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
     RuntimeError if this happens in the first block, which every process computes.
@@ -111,7 +111,7 @@ def whatever_dies(
 
 _ADVICE = (
     "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or "
-    "simulate these lanes one by one, each in its own process, to see why"
+    "simulate these samples one by one, each in its own process, to see why"
 )
 
 
@@ -134,8 +134,8 @@ def sent_to_others(task: Task) -> bytes:
 def computed(
     submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int
 ) -> Generator[tuple[int, int], None, list[int]]:
-    """Yield the numbers of samples and of failed ones of chunks as they finish, at most `most` of them at
-    once. Return the indices of chunks on which a process died.
+    """Yield the numbers of samples and of failed samples of each chunk when it finishes. At most `most`
+    chunks run at once. Return the indices of chunks on which a process died.
 
     `submit(number)`: a future of `concurrent.futures`; `deadly`: the error that reports a dead process.
     """
@@ -168,7 +168,7 @@ def computed(
 
 def _begin(sent: bytes, places, begun) -> None:
     """Start a worker: bind it to its cores, ignore Ctrl-C (which the parent handles), and end it with its
-    parent; `begun`: an event that is set when it can compute.
+    parent. `begun`: an event that is set when the worker can compute.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if parent := parent_process():
@@ -182,11 +182,10 @@ def keep_to_share(place: int, count: int) -> None:
     """Bind this thread, and all threads that it starts, to the cores of process `place` of `count`. Call it
     before JAX starts its threads, one per core.
     """
-    cores = (
-        sorted(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else list(range(os.cpu_count() or 1))
-    )
+    if hasattr(os, "sched_getaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+    else:
+        cores = list(range(os.cpu_count() or 1))
     own = cores[place::count] or cores
     os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
     with contextlib.suppress(AttributeError, OSError):  # not every system supports this
@@ -194,6 +193,6 @@ def keep_to_share(place: int, count: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent (a handle of the operating system) has ended, or if it already has."""
+    """End this process when its parent, a handle of the operating system, ends or has ended."""
     connection.wait([parent])
     os._exit(1)

@@ -62,10 +62,8 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
 
 def _moves(contact: Contact) -> bool:
     """Return whether the contact plane moves."""
-    normals, offsets = (
-        np.asarray(contact.plane.normal),
-        np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1),
-    )
+    normals = np.asarray(contact.plane.normal)
+    offsets = np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1)
     return isinstance(contact.ground, Plane | None) and bool(
         np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max())
     )

@@ -1,5 +1,5 @@
-"""Drawing of a motion: shapes of the bodies and their contacts at all saved times reached. Bodies without
-visuals take a shape from their constructor, outline, contacts or inertia.
+"""Drawing of a motion: shapes of the bodies and their contacts at all saved times that were reached. A body
+without visuals has the shape of its constructor, outline, contacts or inertia.
 """
 
 from dataclasses import dataclass
@@ -22,18 +22,8 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import contacts_of, visuals_of
 from jourdain_jax.scene.visuals import Visual
 
-PALETTE = (
-    "#1f77b4",
-    "#ff7f0e",
-    "#2ca02c",
-    "#d62728",
-    "#9467bd",
-    "#8c564b",
-    "#e377c2",
-    "#7f7f7f",
-    "#bcbd22",
-    "#17becf",
-)
+_COLOURS = "#1f77b4 #ff7f0e #2ca02c #d62728 #9467bd #8c564b #e377c2 #7f7f7f #bcbd22 #17becf"
+PALETTE = _COLOURS.split()
 PLAIN = "#8a8a86"  # colour of visuals that belong to no body
 
 

@@ -216,7 +216,7 @@ def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
-    """Return (name, point, scaled force) of every contact of each motion, and a note on the force of the
+    """Return (name, point, scaled force) of every contact of each motion, and a note with the force of the
     longest arrow.
 
     If a few forces are far larger than the others (a fall, a nearly singular configuration), their arrows are
@@ -227,10 +227,8 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
         own = []
         for name, force in (motion.contact_forces() if one.contacts else {}).items():
             contact = one.contacts[name]
-            normal, tangential = (
-                np.asarray(force.normal)[one.reached],
-                np.asarray(force.tangential)[one.reached],
-            )
+            normal = np.asarray(force.normal)[one.reached]
+            tangential = np.asarray(force.tangential)[one.reached]
             vectors = normal[:, None] * np.asarray(contact.plane.normal) + np.einsum(
                 "tk,tkj->tj", tangential, np.asarray(contact.plane.tangents)
             )
@@ -242,12 +240,12 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
     strongest = float(sizes.max())
     usual = 2.0 * float(np.quantile(sizes[1:], 0.9)) if strongest else 0.0
     longest = usual if 0.0 < 2.0 * usual <= strongest else strongest
-    told = (
-        f"longest arrow: {longest:.3g} N"
-        + (f" and more, up to {strongest:.3g} N" if longest < strongest else "")
-        if strongest
-        else ""
-    )
+    if strongest:
+        told = f"longest arrow: {longest:.3g} N" + (
+            f" and more, up to {strongest:.3g} N" if longest < strongest else ""
+        )
+    else:
+        told = ""
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         return (

@@ -123,7 +123,7 @@ def _plot_motions(
     axes[-1].set_xlabel(f"t in {sizes['t'][0]}")
     if title is None and len(motions) == 1 and isinstance(motions[0], Rollout):
         stopped = int(np.sum(motions[0].result == result_codes.EVENT))
-        title = f"{len(motions[0])} lanes; {stopped} stopped at an event, {motions[0].failed.size} failed"
+        title = f"{len(motions[0])} samples; {stopped} stopped at an event, {motions[0].failed.size} failed"
     if title:
         axes[0].set_title(title, fontsize="medium", loc="left")
     handles, texts = axes[0].get_legend_handles_labels()
@@ -259,7 +259,7 @@ def _draw(
     if many:
         named = f"{label}, " if label else ""
         for k, part in reversed(list(enumerate(bands))):
-            band = f"{named}{100 * part:.3g} % of lanes"
+            band = f"{named}{100 * part:.3g} % of samples"
             axis.fill_between(
                 ts, y[2 * k], y[2 * k + 1], color=colour, alpha=0.2 if k else 0.4, lw=0, label=band
             )

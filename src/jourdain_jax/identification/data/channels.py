@@ -7,14 +7,16 @@ Instruments for accelerations and forces: accelerometers on bodies, load cells u
 
     f = R' (a_P - g),     a_P = d/dt (v + omega x (P - r)) along (1, qdot, udot)
 
-Source: D. H. Titterton and J. L. Weston, Strapdown Inertial Navigation Technology, 2nd ed. (2004), section 3.
+f: reading of an accelerometer at the point P; R, r, v, omega: orientation, mass centre, velocity and angular
+velocity of the body; g: gravity. Source: D. H. Titterton and J. L. Weston, Strapdown Inertial Navigation
+Technology, 2nd ed. (2004), section 3.
 
-A measured time of the stop event that ended a run:
+A measured time (`value`) of the stop event that ended a run:
 
-    r = (t_event - value) / sigma        t_event: time at which the motion stops there; as in `simulate`
+    r = (t_event - value) / sigma        t_event: time at which the simulated motion stops at the event
 
-A motion stops at its first event, so a run has one. It is stored as a channel with one value, at the last
-sample of the run: the first sample that is not before the event.
+A motion stops at its first event, so a run has at most one. The measured time is a channel with one value, at
+the last sample of the run, which is the first sample at or after the event.
 """
 
 from abc import abstractmethod
@@ -57,7 +59,7 @@ OverTimes = Float[Array, "times 3"]
 
 
 class Channel(eqx.Module):
-    """A function of a motion, as it was when traced."""
+    """A traced function of a motion."""
 
     operations: Call = static()  # functions of captured values and of the numbers of a motion
     held: tuple[Array, ...]  # captured values

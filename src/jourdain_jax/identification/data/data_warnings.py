@@ -15,8 +15,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentences:
-    """Return one sentence for each oddity of `checked` runs. Traced numbers are not examined. `repeats`:
-    values have a leading axis, of which only the first entry is examined.
+    """Return one sentence for each probable mistake in `checked` runs. Traced numbers are not examined.
+    `repeats`: values have a leading axis; only its first entry is examined.
     """
     found: list[str] = []
     for index, run in enumerate(runs):
@@ -30,15 +30,12 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentenc
                     f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1])
                 )
         for name, values in run.values.items():
-            quantity, shown = (
-                run.sensors[name].quantity if name in run.sensors else name,
-                values[0] if repeats else values,
-            )
-            is_angle = (
-                quantity in scene.coordinate_names.entries
-                if isinstance(quantity, str)
-                else callable(quantity)
-            )
+            quantity = run.sensors[name].quantity if name in run.sensors else name
+            shown = values[0] if repeats else values
+            if isinstance(quantity, str):
+                is_angle = quantity in scene.coordinate_names.entries
+            else:
+                is_angle = callable(quantity)
             if is_angle and shown.ndim == 1 and not is_traced((shown, run.ts)):
                 found += _of_angle(f"channel `{name}` of run {index}", shown, run.ts)
     return tuple(found)

@@ -9,13 +9,12 @@ exactly at its bound.
 
 Priors with correlated errors, of numbers that were measured together:
 
-    r = M S^-1 (theta - mean),     M C M' = 1,     |r|^2 = d' (S C S)^-1 d       r: additional residuals
-    S: standard deviations,   C: correlations
+    r = M S^-1 d,   d = theta - mean,   M C M' = 1,   |r|^2 = d' (S C S)^-1 d
 
-C = V diag(e) V' gives M = diag(e)^-1/2 V'. If only some of the numbers are free, S C S is their block of the
-covariance (the marginal).
+r: additional residuals; S: standard deviations; C: correlations. C = V diag(e) V' gives M = diag(e)^-1/2 V'.
+If only some of the numbers are free, S C S is their block of the covariance (the marginal).
 
-Unknowns within bounds as vectors x of any real numbers, with the factor by which densities change:
+Unknowns theta within bounds as functions of any real number x, with the slope by which densities change:
 
     unbounded  theta = x
     positive   theta = exp x

@@ -118,19 +118,17 @@ class Experiment(eqx.Module):
         self.sigma = _reals(
             "sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()}
         )
-        memory = (
-            correlation_time
-            if isinstance(correlation_time, Mapping)
-            else dict.fromkeys(self.values, correlation_time)
-        )
+        if isinstance(correlation_time, Mapping):
+            memory = correlation_time
+        else:
+            memory = dict.fromkeys(self.values, correlation_time)
         self.unknown_correlation = tuple(sorted(name for name, value in memory.items() if value is None))
         self.correlation_time = _correlation_times(memory)
         self.start = _reals("start value", start)
-        self.unknown_start = (
-            dict(unknown_start)
-            if isinstance(unknown_start, Mapping)
-            else dict.fromkeys(as_names(unknown_start))
-        )
+        if isinstance(unknown_start, Mapping):
+            self.unknown_start = dict(unknown_start)
+        else:
+            self.unknown_start = dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
         self.sensors = {
             name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()

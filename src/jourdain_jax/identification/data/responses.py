@@ -56,17 +56,15 @@ class Reading(Response):
         """
         if self.operation is None:
             return motion[self.name]
-        return (
-            self.operation.over_times(motion)
-            if isinstance(self.operation, Instrument)
-            else jax.vmap(self.operation)(states)
-        )
+        if isinstance(self.operation, Instrument):
+            return self.operation.over_times(motion)
+        return jax.vmap(self.operation)(states)
 
     def shown(
         self, x, grid, ts, begin=None
     ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
-        """Return the reading at `ts` of a quantity with values `x` at these times or on a grid, and y on the
-        grid. `begin`: initial output of the filter (None: its steady value).
+        """Return the reading at `ts` of a quantity with values `x` at these times or on a grid, and the
+        output of the filter on the grid. `begin`: its initial output (None: its steady value).
         """
         y = None
         if grid is not None:
@@ -105,8 +103,8 @@ class Drive(Response):
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
-    """Return the numbers of a sensor (first guesses for estimated ones), the names of the estimated ones, and
-    the names of all numbers that have an effect.
+    """Return the numbers of a sensor (first guesses of estimated numbers), the names of estimated numbers,
+    and the names of all numbers that have an effect.
     """
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))

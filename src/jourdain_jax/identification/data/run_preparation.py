@@ -135,8 +135,8 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
         ):
             raise ValueError(
                 f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, "
-                f"before the last sample at {float(run.ts[-1]):g} s, and its lag ends there; repeat the last "
-                "value at a later time"
+                f"before the last sample at {float(run.ts[-1]):g} s, but its lag needs all of the run; "
+                "repeat the last value at a later time"
             )
         inputs = drive.put_into(inputs)
         if drive.unknown:
@@ -168,11 +168,10 @@ def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> Shap
         return ()
     groups = {group: length for names in both for group, _, length in names.groups}
     if name not in groups:
-        unknown = (
-            f"unknown channel `{name}`"
-            if name == channel_name
-            else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-        )
+        if name == channel_name:
+            unknown = f"unknown channel `{name}`"
+        else:
+            unknown = f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
         raise ValueError(
             f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities "
             "give a function of the motion in `sensors`."

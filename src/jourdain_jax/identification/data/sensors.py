@@ -59,8 +59,8 @@ class Sensor(eqx.Module):
     Near a jump J of the slope (a speed under a force that steps) the error is up to 0.26 J h; near a jump J
     of the second derivative, up to 0.08 J h^2.
 
-    Under `jit`, where times are unknown, each interval between samples is halved: give a first sample at or
-    near `t0`.
+    Under `jit`, where times are unknown, the number of intervals is twice that of the samples: give a first
+    sample at or near `t0`.
 
     **Raises** ValueError for numbers that are not finite, and for negative delays or lags.
     """
@@ -161,7 +161,7 @@ def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array,
         raise ValueError(f"{where} is {number}, expected a finite number")
     if name in OF_TIME and not holds(lambda x: x >= 0, number):
         raise ValueError(
-            f"{where} is {float(number):g} s, expected zero or more; where the clock of a "
+            f"{where} is {float(number):g} s, expected zero or more; if the clock of a "
             "channel is ahead, shift its times"
         )
     return number

@@ -11,11 +11,11 @@ time tau minimises, at the estimates of all other unknowns,
 
     sum w^2 / 2 + sum log sqrt(1 - rho_k^2) + log det(J_w' J_w) / 2
 
-(restricted likelihood): without its last term, which accounts for the unknowns, tau would be too short. tau
-and the unknowns are estimated alternately. Intervals include the spread of estimates and variances over all
-tau, weighted by that likelihood, uniformly in arcsin rho (see `Problem.doubt`). Source: H. D. Patterson and
-R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation (1993), chapter
-3.
+This is the restricted likelihood. Its last term accounts for the unknowns; without it, tau would be too
+short. tau and the unknowns are estimated alternately. Intervals include the spread of estimates and variances
+over all tau, weighted by that likelihood, uniformly in arcsin rho (see `Problem.doubt`). Source: H. D.
+Patterson and R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation
+(1993), chapter 3.
 """
 
 from collections.abc import Callable, Mapping, Sequence

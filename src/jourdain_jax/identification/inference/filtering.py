@@ -68,8 +68,8 @@ def filtered_log_likelihood(
       `Estimate(prior=Normal(mean, sigma))` in `unknown_start`, its distribution at the start. Sensors have no
       delay and no lag, and all their numbers are known.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the
-      speed)^2 / s: alone, it makes the variance of the speed grow by q t. Speeds without an entry are not
-      disturbed. The independent speeds are `scene.privileged`, or the engine's choice.
+      speed)^2 / s. In the time t, the disturbance adds q t to the variance of the speed. Speeds without an
+      entry are not disturbed. The independent speeds are `scene.privileged`, or the engine's choice.
     - `options`, `by_name`: as in `simulate`.
 
     The motion between samples and its derivatives with respect to the state come from `simulate`. The
@@ -77,8 +77,8 @@ def filtered_log_likelihood(
     order. Without process noise and with a known start it equals `log_likelihood`.
 
     Differentiable with respect to parameters, start values, sigmas and intensities in forward mode
-    (`jax.jacfwd`: second derivatives of the motion), under `jit` and `vmap`. -inf if the motion fails. Make
-    sensors outside of `jit`: inside, their delay is traced.
+    (`jax.jacfwd`), under `jit` and `vmap`. The result is -inf if the motion fails. Make sensors outside of
+    `jit`: inside, their delay is traced.
 
     **Raises** ValueError for a name that is no independent speed, intensities below zero, quaternions,
     sensors with a delay or lag, accelerometers, noise with a correlation time, and unknown numbers.
@@ -215,11 +215,10 @@ class _Filter:
         for name in sorted(self.run.weights):
             sensor = self.run.sensors.get(name, ideal(name))
             operation = sensor.operation
-            x = (
-                operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t)))
-                if isinstance(operation, Channel)
-                else state[sensor.name]
-            )
+            if isinstance(operation, Channel):
+                x = operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t)))
+            else:
+                x = state[sensor.name]
             found.append(jnp.ravel(sensor.shown(x[None], None, None)[0]))
         return jnp.concatenate(found)
 

@@ -29,18 +29,15 @@ def as_fit_options(
 
 def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experiment, ...]:
     """Return one run or several as a tuple, checked against the scene. Raises ValueError as in `checked`, and
-    if there is no run.
-
-    Oddities of a run (`oddities`) cause warnings.
+    if there is no run. Probable mistakes (`oddities`) cause warnings.
     """
     as_scene(scene)
     check_kind(data, Experiment | Iterable, "`data`", "an `Experiment` or a sequence of at least one")
     runs = (data,) if isinstance(data, Experiment) else tuple(data)
-    wrong = (
-        [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)]
-        if runs
-        else ["`data` is empty"]
-    )
+    if runs:
+        wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)]
+    else:
+        wrong = ["`data` is empty"]
     if wrong:
         raise ValueError(f"{wrong[0]}, expected an `Experiment` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))

@@ -52,7 +52,7 @@ class Information:
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
     hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # undetermined directions of each member, orthonormal
-    # of theta / size along such a direction, above which an unknown has a part in it
+    # change of theta / size along such a direction above which an unknown has a part in it
     least_part: Float[np.ndarray, "*members unknowns"]
     rank: Int[np.ndarray, "*members"]  # number of determined directions
     identifiable: Bool[np.ndarray, "*members unknowns"]
@@ -375,9 +375,8 @@ def weak_combinations(
 
 
 def _by(name: str, change: float, is_relative: bool) -> str:
-    how = (
-        f"{100 * change:.2g} %"
-        if is_relative and abs(change) < 0.995
-        else f"{change:.2g}{' times its value' if is_relative else ''}"
-    )
+    if is_relative and abs(change) < 0.995:
+        how = f"{100 * change:.2g} %"
+    else:
+        how = f"{change:.2g}{' times its value' if is_relative else ''}"
     return f"a change of `{name}` by {how}"

@@ -89,10 +89,8 @@ class LogDensity(eqx.Module):
             - 0.5 * known @ known
         )
         shared, local = self._split(theta)
-        scene, sigma = (
-            self.layout.scene(self.scene, shared),
-            dict(zip(self.sigmas, theta[count:end], strict=True)),
-        )
+        scene = self.layout.scene(self.scene, shared)
+        sigma = dict(zip(self.sigmas, theta[count:end], strict=True))
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
 
         def one(run: Run, local: Float[Array, "local"]) -> Scalar:

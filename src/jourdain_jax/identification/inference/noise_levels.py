@@ -111,12 +111,10 @@ def _told_by_kind(
     """Return p_c (members, kinds) and (C A_c C)_ii (members, kinds, places), from triangles in units of
     sigma.
     """
-    m, S, G, own = (
-        known.follow.shape[-2],
-        known.shared[:, None, None],
-        known.follow[:, :, None],
-        known.own[:, :, None],
-    )
+    m = known.follow.shape[-2]
+    S = known.shared[:, None, None]
+    G = known.follow[:, :, None]
+    own = known.own[:, :, None]
     T_o, T_s = T[..., :m], T[..., m:-1]
     X = T_s - T_o @ G  # unknowns of a run follow the shared ones, x = - G s
     p = np.einsum("brkij,brkij->bk", X @ S, X) + np.einsum("brkij,brkij->bk", T_o @ own, T_o)

@@ -128,8 +128,8 @@ def planned_information(
       sensors are unknowns, too, and priors count.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with
-    respect to parameters, start values and samples of inputs in forward mode (`jax.jacfwd`; second
-    derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
+    respect to parameters, start values and samples of inputs, in forward mode (`jax.jacfwd`) and under `jit`:
+    starts and inputs can be optimised. Derivatives with respect to samples use XLA.
 
     **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and
     correlated noise.

@@ -39,11 +39,8 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         rise, where = float(at.at.cost[0] - found.at.cost[b]), f"near {origin + way * delta:.6g}"
         if np.isfinite(rise):
             points.append((origin + way * delta, rise))
-            note = (
-                note
-                if at.converged[0]
-                else (f"no minimum over the others was found {where}, so the interval may be too narrow")
-            )
+            if not at.converged[0]:
+                note = f"no minimum over the others was found {where}, so the interval may be too narrow"
         if rise < -2 * close * end:
             return Side(bound, False, at, points, f"a lower minimum lies {where}; fit again from there")
         if abs(rise / end - 1) < close:

@@ -51,12 +51,10 @@ class Spread:
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
     """Return the uncertainties of estimates; unknowns at a `bound` are held there."""
-    unknowns, theta, scores, cutoff = (
-        problem.unknowns,
-        found.theta,
-        found.at.arrow.scores,
-        problem.asked.control.cutoff,
-    )
+    unknowns = problem.unknowns
+    theta = found.theta
+    scores = found.at.arrow.scores
+    cutoff = problem.asked.control.cutoff
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=cutoff)
 
@@ -72,11 +70,10 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
     more, of_memory = problem.doubt(theta, elsewhere)
     quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more + levels.more)
     if problem.asked.errors == "runs":
-        of_runs = (
-            levels
-            if problem.estimated
-            else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
-        )
+        if problem.estimated:
+            of_runs = levels
+        else:
+            of_runs = noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
         known = replace(of_runs.known, own=known.own).between_runs(
             levels.at.arrow.scores if problem.estimated else scores
         )

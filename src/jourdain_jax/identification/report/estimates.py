@@ -47,11 +47,10 @@ class Estimated(Printed, eqx.Module):
             )
         if np.isnan(self.low + self.high):
             return f"{self.value:.6g}{unit}, not determined by the measurements"
-        error = (
-            f"standard error {self.standard_error:.2g}"
-            if np.isfinite(self.standard_error)
-            else "at its bound"
-        )
+        if np.isfinite(self.standard_error):
+            error = f"standard error {self.standard_error:.2g}"
+        else:
+            error = "at its bound"
         return f"{self.value:.6g}{unit}, {error}, 95 % interval [{self.low:.6g}, {self.high:.6g}]"
 
 
@@ -233,10 +232,8 @@ class Estimates(Printed):
             runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
             products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
             squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
-            pairs, size = (
-                np.isfinite(products).sum(),
-                np.nanmean(squares) if np.isfinite(squares).any() else 0.0,
-            )
+            pairs = np.isfinite(products).sum()
+            size = np.nanmean(squares) if np.isfinite(squares).any() else 0.0
             if pairs and size > 0:
                 found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
         return found
@@ -255,10 +252,10 @@ class Estimates(Printed):
 
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
-        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first
-        order (the delta method). A combination may have an interval even if its parts are not identifiable
-        separately. The result is NaN if it depends on an undetermined direction, or on an unknown at its
-        bound.
+        With y = f(scene), var(y) = g' C g to first order (the delta method), where g = d y / d theta and C is
+        the covariance of the estimates. A combination may have an interval even if its parts are not
+        identifiable separately. The result is NaN if it depends on an undetermined direction, or on an
+        unknown at its bound.
 
         - `function`: plain JAX, of a scene; returns an array of any shape. `unit`: of the result, for
           `print`.

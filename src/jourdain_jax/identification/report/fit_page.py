@@ -143,8 +143,8 @@ def fit_page(
     if profiles:
         about = (
             "The rise of the sum of squares when one unknown is fixed and all others are fitted again. The "
-            "interval ends where it passes 3.84 (red, dashed). Grey: the parabola of the standard error; if "
-            "both differ, trust the profile."
+            "interval ends where the rise passes 3.84 (red, dashed). Grey: the parabola of the standard "
+            "error; where the two differ, trust the profile."
         )
         figures = [profile(one, float(fit[one.name].standard_error)) for one in profiles.values()]
         sections.append(Section("Profile likelihood", about, list(map(str, profiles.values())), figures))
@@ -170,9 +170,7 @@ def _informed(shares: Informed) -> Section:
         "Shares of samples in the information on each unknown. They account for the estimation of all other "
         "unknowns."
     )
-    shown = np.sort(
-        np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8]
-    )  # of which it is drawn where they inform
+    shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # runs
     columns = (
         {f"run {run}": shares.of_runs[:, run] for run in shown}
         | shares.of_channels
@@ -245,11 +243,10 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
         narrow = "-" if white or rho < 0 else f"about {np.sqrt((1 + rho) / (1 - min(rho, 0.999))):.2g}"
         rows.append((name, f"{rho:.3f}", f"{limit:.3f}", "yes" if white else "NO", time, narrow))
     if any(row[3] == "NO" for row in rows):
-        allowed = (
-            ""
-            if fit.errors == "sigmas"
-            else (" Those given here are based on differences between runs, and allow for it.")
-        )
+        if fit.errors == "sigmas":
+            allowed = ""
+        else:
+            allowed = " Those given here are based on differences between runs, and allow for it."
         about = (
             "Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in"
             f" the last column.{allowed} {about}"
@@ -258,11 +255,10 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
 
 
 def _way(fit: Estimates) -> Section:
-    told = (
-        fit.agreement
-        if fit.guesses > 1
-        else ("one first guess was tried; `guesses=30` would show how many lead here")
-    )
+    if fit.guesses > 1:
+        told = fit.agreement
+    else:
+        told = "one first guess was tried; `guesses=30` would show how many lead here"
     rows = [("objective", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
     return Section("The way to the minimum", told, table(rows))

@@ -74,11 +74,9 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
     low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
     limit = here(at_bounds.limit)
     about = spread(problem, found, bound)
-    levels, known, reach = (
-        about.levels,
-        about.known.only() if single else about.known,
-        one(about.quantiles * about.known.standard_errors),
-    )
+    levels = about.levels
+    known = about.known.only() if single else about.known
+    reach = one(about.quantiles * about.known.standard_errors)
     residuals, white = (
         tuple(
             {name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()}

@@ -36,9 +36,7 @@ def warnings_of(fit: Estimates) -> Sentences:
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
-    """Yield warnings if the minimum is not a true one, or if bounds or missing degrees of freedom determine
-    it.
-    """
+    """Yield warnings if there is no true minimum, or if bounds or missing degrees of freedom determine it."""
     if fit.stuck:
         yield (
             "no step improves the fit, but this is no minimum: nearby the motion fails, or is rougher than "
@@ -53,11 +51,10 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
     elif not fit.converged:
         yield "no minimum was found; raise `max_iterations`, or use a closer first guess"
     if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
-        verb = (
-            "lies at a bound, which decides its value"
-            if len(names) == 1
-            else "lie at bounds, which decide their values"
-        )
+        if len(names) == 1:
+            verb = "lies at a bound, which decides its value"
+        else:
+            verb = "lie at bounds, which decide their values"
         yield f"{', '.join(names)} {verb}; standard errors are meaningless: widen the bounds"
     for name in fit.untold:
         yield (
@@ -134,8 +131,8 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
         )
     elif named and own:
         yield (
-            f"{start} of unknowns of single runs (`{own[0]}`) too narrow: differences between runs do not"
-            " show them"
+            f'{start} of unknowns of single runs (`{own[0]}`) too narrow: errors="runs" widens only'
+            " intervals of shared unknowns"
         )
 
 
@@ -151,15 +148,15 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return the mean square that lies this many standard deviations from 1, computed by its cube root, which
-    is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
+    """Return the mean square that lies this many standard deviations from 1. Its cube root is nearly normal
+    (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Return the size of the residuals of all channels with known sigmas, and of each of these channels.
-    Under a robust loss they are based on medians.
+    """Return the sizes of the residuals: of all channels with known sigmas together, and of each such
+    channel. Under a robust loss, sizes are based on medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [

@@ -128,7 +128,7 @@ class Prediction(Printed):
         told = f"rms of {self.rms:.3g}; R^2 {self.r_squared:.6g}"
         return (
             f"{np.isfinite(self.error).sum()} samples from {self.ts[0]:.6g} to {self.ts[-1]:.6g} s, predicted"
-            f" to an {told}"
+            f" with an {told}"
         )
 
 
@@ -143,11 +143,9 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     """
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
-    unknowns, theta, shared = (
-        problem.unknowns,
-        problem.unknowns.guess[None].copy(),
-        problem.unknowns.layout.sizes[0],
-    )
+    unknowns = problem.unknowns
+    theta = problem.unknowns.guess[None].copy()
+    shared = problem.unknowns.layout.sizes[0]
     for place, label in enumerate(unknowns.labels[:shared]):
         check_name(label, fit.labels, f"the runs held out share `{label}`, which was not estimated")
         theta[0, place] = fit[label].value
@@ -158,7 +156,7 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     if not np.isfinite(at.cost[0]):
         raise ValueError("a motion of the held-out runs fails at the estimates; examine it with `simulate`")
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
-    # residuals are in units of sigmas, of which the unknown ones were estimated from these runs
+    # residuals are in units of sigmas; unknown sigmas were estimated from these runs
     ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
     residuals = [
         {name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()}
@@ -273,9 +271,7 @@ class Profile(Printed):
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        ends = (
-            "no data set an end to it" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
-        )
+        ends = "the data give no end" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
         return "; ".join(
             (f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes)
         )
@@ -297,11 +293,10 @@ def profiles(
         k = unknowns.labels.index(name)
         place, error = int(unknowns.estimated[k]), errors[name]
         estimate = float(fitted.theta[0, place])
-        first = (
-            0.6 * error
-            if np.isfinite(error) and error > 0
-            else 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
-        )
+        if np.isfinite(error) and error > 0:
+            first = 0.6 * error
+        else:
+            first = 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
         low, high = (
             side(problem, fitted, 0, place, way, first, RISE_95 / 2 * inflation[name]) for way in (-1.0, 1.0)
         )

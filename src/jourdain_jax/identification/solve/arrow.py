@@ -1,13 +1,15 @@
 """Least squares with unknowns shared by all runs and unknowns of single runs or pieces: an arrow-shaped
 matrix, which may contain a chain.
 
-    minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2 + l |D d|^2
-        piece i: own unknowns x_i, shared unknowns s; its join with the piece before, if there is one
+    minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2
+             + lambda |D d|^2
+    [J_i S_i r_i] = Q_i [ T_i ; 0 ]
+    [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; remainder of the next piece ] = Q_i' [ U_i ; remainder ]
 
-    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per piece, of which only T_i is kept
-    from the last pieces of the runs to their first, x_i is eliminated by a QR factorisation of
-    [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; remainder of the next piece ], a Schur complement
-    s by the singular values of the remainders of all runs; directions below a cut-off do not move
+Piece i has residuals r_i, own unknowns x_i, the shared unknowns s, and a join with the piece before it, whose
+residuals are c_i; d = (ds, dx_0, ...). Only T_i is kept of the first QR factorisation. The second eliminates
+x_i, from the last piece of a run to the first. The singular values of the remainders of all runs give ds;
+directions below a cut-off do not move.
 
 A run that is not cut is one piece without a join. Time and memory grow linearly with the number of pieces. A
 leading axis `members` holds problems of equal shape. All on NumPy. Source: G. H. Golub and V. Pereyra,
@@ -131,8 +133,8 @@ class Arrow(ByMember):
         return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
 
     def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
-        """Return for each column the sum over all rows of the function `of`: (..., rows, columns and
-        residual) -> (..., columns).
+        """Return the sum over all rows of `of`, for each column. `of` maps (..., rows, columns and residual)
+        to (..., columns).
         """
         shared, *others = map(of, self._blocks)
         pieces, m, _ = self.counts
@@ -213,8 +215,8 @@ def with_prior(
 def eliminated(
     local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that express a piece's unknowns by shared ones and the previous piece's; and the
-    remaining rows, without the piece's unknowns.
+    """Return the rows that express the unknowns of each piece by shared unknowns and those of the previous
+    piece, and the remaining rows, without unknowns of pieces.
 
     `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """

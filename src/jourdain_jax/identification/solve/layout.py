@@ -98,10 +98,8 @@ class Layout:
                 found[leaf] = own.at[(..., *entry.index)].set(value)
         for tie in self.ties:
             # parameters of members have leading axes, shared ones have none
-            function, axes = (
-                tie.value,
-                [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)],
-            )
+            function = tie.value
+            axes = [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
             for _ in shared.shape[:-1]:
                 function = jax.vmap(function, in_axes=(axes,))
             found[getattr(names, tie.name)] = function(found)

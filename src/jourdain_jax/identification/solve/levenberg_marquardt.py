@@ -4,14 +4,15 @@ trial step.
     minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
     step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J
                steps end at bounds, and the other unknowns are solved again
-    patience   if F is large, and has not decreased much within so many steps, the member ends
-    converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown
+    patience   a member ends if F is large and has not decreased much within so many steps
+    converged  the undamped step has |J d| <= `tolerance`, in standard errors, and moves no unknown
                by more than that fraction of its size
 
-Steps end at bounds, since a transformation onto the interior never reaches them: of ten fits with zero
-damping, seven with its logarithm had not converged in 256 steps, and all ten converge in 4 here. The method
-of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be differentiated
-with respect to the starts of all others. It has no bounds. It evaluates residuals and derivatives separately.
+Steps end at bounds, since a transformation onto the interior never reaches them. In ten fits of a damping
+that is zero, all converge in 4 steps here; with its logarithm as unknown, seven had not converged in 256. The
+method of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be
+differentiated with respect to the starts of all others. It has no bounds. It evaluates residuals and
+derivatives separately.
 
 Several problems of one shape (`members`) run as a batch; finished ones cost nothing. Source: D. W. Marquardt,
 SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum
@@ -171,8 +172,7 @@ def minimise(
         # determined directions
         by = np.where(gained > 0.9 * promised, 1 / fall[here], np.where(gained < 0.6 * promised, 3.0, 1.0))
         damping[here] = np.maximum(damping[here] * np.where(better, by, growth[here]), LEAST)
-        # decrease slowly after a failed step: in a curved valley every other step would fail; growth doubles
-        # with each failure
+        # after a failed step, damping decreases slowly: in a curved valley every other step would fail
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], 10.0), 2.0)
         growth[here] = np.where(better, 4.0, 2 * growth[here])
         way.go(here, x + d, trial, better)

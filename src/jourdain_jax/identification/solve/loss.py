@@ -45,11 +45,9 @@ class Loss:
     def weight(self, r: Samples) -> Samples:
         """Return w(r)."""
         k = self.parameter
-        return (
-            (k + 1) / (k + r**2)
-            if self.kind == "student-t"
-            else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
-        )
+        if self.kind == "student-t":
+            return (k + 1) / (k + r**2)
+        return np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Samples):
         """Return `rows`, each multiplied by the root of its weight."""
@@ -73,11 +71,9 @@ class Loss:
     def _slope(self, r: Residuals) -> Residuals:
         """Return psi'."""
         k = self.parameter
-        return (
-            (k + 1) * (k - r**2) / (k + r**2) ** 2
-            if self.kind == "student-t"
-            else (np.abs(r) <= k).astype(float)
-        )
+        if self.kind == "student-t":
+            return (k + 1) * (k - r**2) / (k + r**2) ** 2
+        return (np.abs(r) <= k).astype(float)
 
 
 LEAST_SQUARES = Loss("least squares", np.inf)

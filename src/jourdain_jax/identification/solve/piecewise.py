@@ -61,8 +61,8 @@ class _Standing(ByMember):
 
 
 class Piecewise(Problem):
-    """The problem of whole runs, computed in pieces. `pieces`: the same problem with the states at the joints
-    as additional unknowns.
+    """The problem of whole runs, computed in pieces. `pieces`: the same problem, with the states at the
+    joints as additional unknowns.
     """
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
@@ -191,10 +191,8 @@ class Piecewise(Problem):
         """Set the unknowns of the pieces of all members; return the unknowns of the whole runs."""
         shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
-        slopes, jumps = (
-            np.zeros((*local.shape, self.own + self.shared)),
-            np.full((*local.shape[:2], self.states), np.inf),
-        )
+        slopes = np.zeros((*local.shape, self.own + self.shared))
+        jumps = np.full((*local.shape[:2], self.states), np.inf)
         self.at = _Standing(
             local.copy(),
             whole,
@@ -243,8 +241,8 @@ class Piecewise(Problem):
             yield b, j, closed(rows, self.own + self.shared)
 
     def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
-        """Return [J g r], as `evaluated` does, with a share of the gaps closed. g is the further change of r
-        when all gaps are closed.
+        """Return [J g r] of whole runs, with a share of the gaps closed. g is the change of r when all gaps
+        are closed.
         """
         return self._of_runs(members, ~self._move(theta, members, share))
 

@@ -60,13 +60,11 @@ class Problem:
     def __init__(
         self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None
     ):
-        self.asked, self.runs, self.unknowns, self.single, self.count = (
-            asked,
-            runs,
-            unknowns,
-            repeats is None,
-            repeats or 1,
-        )
+        self.asked = asked
+        self.runs = runs
+        self.unknowns = unknowns
+        self.single = repeats is None
+        self.count = repeats or 1
         self.scene, self.loss = asked.scene, asked.loss
         self.groups = [
             Group(asked.scene, runs, indices, unknowns.layout, asked.options, repeats)
@@ -209,10 +207,8 @@ class Problem:
         unknowns, mean, weight = self.unknowns, self.unknowns.prior_mean, self.unknowns.prior_weight
         if span is not None:
             none = (weight == 0) & ~unknowns.fixed
-            mean, weight = (
-                np.where(none, span.begun, mean),
-                np.where(none, 1 / unknowns.sizes(span.begun), weight),
-            )
+            mean = np.where(none, span.begun, mean)
+            weight = np.where(none, 1 / unknowns.sizes(span.begun), weight)
         elif not weight.any():
             return whole, 0.0
         r, M = (theta - mean) * weight, unknowns.whitening
@@ -223,8 +219,8 @@ class Problem:
     def is_followed(
         self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float
     ) -> Bool[np.ndarray, "members shares"]:
-        """Return for which shares of the span the mean squared residual is at most `most` times the value for
-        noise.
+        """Return whether the mean squared residual over each share of the span is at most `most` times its
+        value for noise.
         """
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
@@ -241,10 +237,8 @@ class Problem:
         """Maximise the restricted likelihood over unknown correlation times. Return the largest change of
         rho, the correlation over one shortest interval.
         """
-        evaluated, ends = (
-            list(self.evaluated(theta, members)),
-            np.array([correlation_limits(self.runs, name) for name in self.with_memory]),
-        )
+        evaluated = list(self.evaluated(theta, members))
+        ends = np.array([correlation_limits(self.runs, name) for name in self.with_memory])
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
         for k, (low, high) in enumerate(ends):
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
@@ -320,8 +314,8 @@ class Problem:
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
-        """Return the residuals of a run by channel in units of sigma, (members, *samples); NaN for missing
-        samples, and for members with another failed run. `white`: return whitened residuals.
+        """Return the residuals of a run by channel in units of sigma, (members, *samples). They are NaN for
+        missing samples, and for members with another failed run. `white`: return whitened residuals.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]

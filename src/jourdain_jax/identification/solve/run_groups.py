@@ -147,11 +147,9 @@ class Group:
         runs = [run_of(data[i], repeats=members is not None) for i in indices]
         if members is None:
             runs = [_of_members(run, lambda x: x[None]) for run in runs]
-        self.runs, self._count, self._lengths = (
-            np.array(indices),
-            members or 1,
-            [run.ts.shape[0] for run in runs],
-        )
+        self.runs = np.array(indices)
+        self._count = members or 1
+        self._lengths = [run.ts.shape[0] for run in runs]
         times, knots = max(self._lengths), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
         filled = [filled_up(run, times, knots) for run in equal]

@@ -55,11 +55,10 @@ class Run(NamedTuple):
         """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
-        states = (
-            motion.motions()
-            if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values())
-            else None
-        )
+        if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()):
+            states = motion.motions()
+        else:
+            states = None
         found, filters, place = {}, [], len(state_names(scene))
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None

@@ -130,10 +130,8 @@ def shot(problem: Piecewise, theta: Places) -> Minimum:
     """Return the minimum from each `theta`."""
     check_starts(problem.scene, problem.runs, problem.unknowns)
     begin, control = _begun(problem, theta), problem.asked.control
-    roughly, every = (
-        replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)),
-        np.arange(len(theta)),
-    )
+    roughly = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps))
+    every = np.arange(len(theta))
 
     def with_gaps(begin: np.ndarray, width: float) -> Minimum:
         what = f"pieces with gaps of {width:g}"  # in sizes of the states
@@ -155,10 +153,8 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
     count, coordinates = len(theta), len(problem.scene.coordinate_names)
     places = np.arange(problem.states)
     of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
-    nodes, starts = (
-        np.zeros((count, len(problem.follows), problem.states)),
-        np.zeros((len(problem.follows), problem.states)),
-    )
+    nodes = np.zeros((count, len(problem.follows), problem.states))
+    starts = np.zeros((len(problem.follows), problem.states))
     for run, data in enumerate(problem.runs):
         q, u = _start(problem, data, theta[0], run)
         starts[problem.run_of == run, : q.size + u.size] = np.concatenate([q, u])
@@ -275,7 +271,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """Return the fraction of the largest singular value below which singular values count as zero. It is
-    smaller if the largest has grown along the motion and the others have not.
+    """Return the fraction of the largest singular value below which singular values count as zero. The
+    fraction is smaller if the largest value grows along the motion and the others do not.
     """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

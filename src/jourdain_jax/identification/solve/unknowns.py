@@ -6,8 +6,7 @@ sensors and actuators.
 Every run has a place for each initial value that is unknown in any run; a known value is held. If there is
 only one run, all its unknowns count as shared.
 
-`check_starts` checks that the runs start on the constraints, at the first guess and after changes of the
-unknowns.
+`check_starts` checks that runs start on the constraints, also after changes of the unknowns.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -117,11 +116,9 @@ class _Entry:
     @property
     def labels(self) -> list[str]:
         """Return the name of each number."""
-        return (
-            [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)]
-            if self.guess.ndim
-            else [self.label]
-        )
+        if self.guess.ndim:
+            return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)]
+        return [self.label]
 
 
 def unknowns_of(
@@ -288,11 +285,9 @@ def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
     """Return an unknown of one run, held if the run knows it or does not have it."""
     if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
-        return (
-            _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True)
-            if estimate is None
-            else _of_sensor(label, place.name, estimate)
-        )
+        if estimate is None:
+            return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True)
+        return _of_sensor(label, place.name, estimate)
     guess = np.asarray(run.start.get(place.name, np.zeros(place.shape)))
     if place.name not in run.unknown_start:
         return _Entry(label, "", guess, unbounded(), fixed=True)
