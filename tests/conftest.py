@@ -50,10 +50,11 @@ LAYERS = (
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others
 # have nothing to do.
 LONGEST = """
-friction modes sides held_rows crossings linearize identify malformed_inputs native_mutants inertia gpu mutants
-periodic study_faults result_codes load_jumps native events feasible_starts types stiff sensors log_density simulate
-build storage_faults report diffrax code_map lowering fit_report studies whipple_bicycle rank_of_vanishing_rows
-quality native_functions native_derivatives call_costs rows_lost_at_rest extremes readme inputs float32
+friction modes sides held_rows crossings linearize identify malformed_inputs native_mutants inertia gpu
+mutants periodic study_faults result_codes load_jumps native events feasible_starts types stiff sensors
+log_density simulate build storage_faults report diffrax code_map lowering fit_report studies whipple_bicycle
+rank_of_vanishing_rows quality native_functions native_derivatives call_costs rows_lost_at_rest extremes
+readme inputs float32
 """
 
 

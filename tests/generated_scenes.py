@@ -59,7 +59,7 @@ class Recipe:
 
     @property
     def reversible(self):
-        """Whether motions may be run backwards: nothing depends on time, and no force is odd in the speeds."""
+        """Whether motions can run backwards: nothing depends on time, and no force is odd in speeds."""
         return self.scleronomic and self.kinds().isdisjoint(ODD)
 
 

@@ -12,7 +12,12 @@ from small_scenes import Bead, Cart, DrivenPendulum, Oscillator, OnPlane
 
 model, Sleigh = jj.models.model, jj.models.ChaplyginSleigh
 TS, START = np.array([0.5, 1.0]), {"x_rate": 0.6, "heading_rate": 0.9}
-sleigh, disc, skate, oscillator = Sleigh(mass=1.0), jj.models.TiltingDisc(), jj.models.Skate(), ContactOscillator()
+sleigh, disc, skate, oscillator = (
+    Sleigh(mass=1.0),
+    jj.models.TiltingDisc(),
+    jj.models.Skate(),
+    ContactOscillator(),
+)
 data = jj.Experiment(TS, {"x": np.array([0.3, 0.5])}, 0.01, start=START)
 moved = jj.simulate(sleigh, START, ts=TS)
 study = jj.Study(sleigh, vary={"offset": [0.2, 0.3]})
@@ -23,8 +28,12 @@ calls = {
     "fit_batch": lambda **options: jj.fit_batch(sleigh, data, ("offset",), **options),
     "log_likelihood": lambda **options: jj.identification.log_likelihood(sleigh, data, **options),
     "log_density": lambda **options: jj.identification.log_density(sleigh, data, ("offset",), **options),
-    "planned_information": lambda **options: jj.identification.planned_information(sleigh, data, ("offset",), **options),
-    "filtered_log_likelihood": lambda **options: jj.identification.filtered_log_likelihood(sleigh, data, process_noise={}, **options),
+    "planned_information": lambda **options: jj.identification.planned_information(
+        sleigh, data, ("offset",), **options
+    ),
+    "filtered_log_likelihood": lambda **options: jj.identification.filtered_log_likelihood(
+        sleigh, data, process_noise={}, **options
+    ),
     "Study.run": lambda **options: study.run("nowhere", **options),
 }
 
@@ -39,7 +48,9 @@ class Stopped(Oscillator):
 def stopped(events={"buffer": (0.9, 0.003)}, values=None, **more):
     """A run of which no more than its event is known, unless values are given."""
     ts = np.array([0.5]) if values is None else 0.1 * np.arange(1.0, len(values) + 1.0)
-    return jj.Experiment(ts, {} if values is None else {"x": values}, 0.005, start={"x": 0.3}, t0=0.0, events=events, **more)
+    return jj.Experiment(
+        ts, {} if values is None else {"x": values}, 0.005, start={"x": 0.3}, t0=0.0, events=events, **more
+    )
 
 
 def event(*given, **options):
@@ -52,7 +63,12 @@ def tied(function):
 
 def pieces(count, **shooting):
     ts = np.linspace(0.0, 0.5, count)
-    return jj.fit(Cart(), jj.Experiment(ts, {"x": ts}, 0.1, start={"x": 0.0}), "mass", shooting=jj.identification.MultipleShooting(**shooting))
+    return jj.fit(
+        Cart(),
+        jj.Experiment(ts, {"x": ts}, 0.1, start={"x": 0.0}),
+        "mass",
+        shooting=jj.identification.MultipleShooting(**shooting),
+    )
 
 
 def planned(**changes):
@@ -62,12 +78,16 @@ def planned(**changes):
 
 def cell(scene, name):
     """What a load cell under this contact tells."""
-    shown = jj.Experiment(TS, {"plate": np.ones((2, 3))}, 1.0, start={}, sensors={"plate": jj.identification.LoadCell(name)})
+    shown = jj.Experiment(
+        TS, {"plate": np.ones((2, 3))}, 1.0, start={}, sensors={"plate": jj.identification.LoadCell(name)}
+    )
     return jj.fit(scene, shown, ("mass",))
 
 
 def gradients(parameters, **more):
-    return jj.Study(sleigh, **more).mean_gradients(parameters=parameters, t1=0.1, outputs={"x": jj.studies.End("x")})
+    return jj.Study(sleigh, **more).mean_gradients(
+        parameters=parameters, t1=0.1, outputs={"x": jj.studies.End("x")}
+    )
 
 
 def described(**members):
@@ -111,7 +131,9 @@ possible = jj.identification.possible_inertia()
 
 
 def described_file(**changes):
-    return described_study({"model": "tilting-disc", "samples": 8, "vary": {"radius": {"normal": [0.5, 0.01]}}} | changes)
+    return described_study(
+        {"model": "tilting-disc", "samples": 8, "vary": {"radius": {"normal": [0.5, 0.01]}}} | changes
+    )
 
 
 def file(save, load):
@@ -182,9 +204,10 @@ SOLVERS = {
     "jj.DiscreteLagrangeDAlembert('midpiont', step=0.1)": (
         "unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`"
     ),
-    "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), formulation=jj.Formulation('minimal'))": (
-        "leave the `state` of its `Formulation`"
-    ),
+    (
+        "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), "
+        "formulation=jj.Formulation('minimal'))"
+    ): ("leave the `state` of its `Formulation`"),
     "jj.simulate(model('free-rigid-body'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": (
         "does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities ... ; use"
         " solver=jj.ImplicitMidpoint(step="
@@ -226,12 +249,14 @@ FITS = {
     "event(events={'buffer': (0.9, 0.0)})": "sigma of channel `buffer` must be above zero",
     "event(events={'x': (0.9, 0.003)}, values=np.ones(8))": "`x` is both a channel and an event",
     "event(sensors={'buffer': 'x'})": "`buffer` is an event, whose time has no sensor",
-    "jj.fit(Stopped(), stopped(values=np.ones(8)), ('mass',), shooting=jj.identification.MultipleShooting(pieces=2))": (
-        "run 0 has a measured time of its event `buffer`, which `shooting` does not use"
-    ),
-    "jj.identification.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), process_noise={'x_rate': 0.1})": (
-        "run 0 gives the time of its event `buffer`, which the filter does not use"
-    ),
+    (
+        "jj.fit(Stopped(), stopped(values=np.ones(8)), ('mass',), "
+        "shooting=jj.identification.MultipleShooting(pieces=2))"
+    ): ("run 0 has a measured time of its event `buffer`, which `shooting` does not use"),
+    (
+        "jj.identification.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), "
+        "process_noise={'x_rate': 0.1})"
+    ): ("run 0 gives the time of its event `buffer`, which the filter does not use"),
     "jj.identification.MultipleShooting()": "expects either `pieces`",
     "jj.identification.MultipleShooting(pieces=4, duration=1.0)": "expects either `pieces`",
     "jj.identification.MultipleShooting(pieces=1)": "two or more",
@@ -274,9 +299,10 @@ INERTIAS = {
     "jj.fit(Turning(), jj.Experiment(TS, {'yaw': TS}, 0.1, start={}), {'bodi': possible})": (
         "`bodi`, which is not a body of `Turning`; did you mean `body`"
     ),
-    "jj.fit(model('double-pendulum-rods'), jj.Experiment(TS, {'x1': TS}, 0.1, start={}), {'first': possible})": (
-        "is a particle; name a rigid body"
-    ),
+    (
+        "jj.fit(model('double-pendulum-rods'), jj.Experiment(TS, {'x1': TS}, 0.1, start={}), "
+        "{'first': possible})"
+    ): ("is a particle; name a rigid body"),
     "jj.fit(disc, jj.Experiment(TS, {'lean': TS}, 0.1, start={}), {'disc': possible})": (
         "entry 11 of its inertia is made of `mass`, `radius`"
     ),
@@ -325,9 +351,10 @@ IMPOSSIBLE = {
     "jj.structure_of(OnSledge(lambda pose, back: jj.HeightMap(lambda x, y: 0.05 + 0.01 * (x - back[0]))))": (
         "moves with another body, but its `velocity` and"
     ),
-    "jj.structure_of(OnSledge(lambda pose, back: jj.Cylinder(3.0, (0.0, 1.0, 0.0), side='outside', origin=back - jnp.array([0.0, 0.0, 3.0]))))": (
-        "moves with another body, but its `velocity` and"
-    ),
+    (
+        "jj.structure_of(OnSledge(lambda pose, back: jj.Cylinder(3.0, (0.0, 1.0, 0.0), side='outside', "
+        "origin=back - jnp.array([0.0, 0.0, 3.0]))))"
+    ): ("moves with another body, but its `velocity` and"),
     "jj.structure_of(OnLift(lambda q, up: jj.Plane(up)))": (
         "the plane of contact `back` of `OnLift` moves along its normal ... if coordinates move it, omit the"
         " contact"
@@ -386,7 +413,10 @@ PLOTTED = {
         "KeyError",
         "no body `slegh` in this scene; did you mean `sleigh`? Valid names: `sleigh`.",
     ),
-    "jj.simulate(described(invariants=lambda self, m: {'momentum': m['bead'].velocity}), {}, t1=0.1).invariants()": (
+    (
+        "jj.simulate(described(invariants=lambda self, m: {'momentum': m['bead'].velocity}), {}, "
+        "t1=0.1).invariants()"
+    ): (
         "invariant `momentum` of `Described` has shape (3,), expected one number; give every component its"
         " own name"
     ),
@@ -451,9 +481,11 @@ CLASSES = {
     "described(exemple=property(lambda self: {}))": "has a method `exemple`, ... did you mean `example`?",
     "jj.simulate(Bare(), {}, t1=1.0)": ("NotImplementedError", "define `bodies(self, t, q)`"),
     "jj.simulate(Random(), {'x': 1.0}, t1=1.0)": "draws random numbers",
-    "jj.accelerations(described(geometric_constraints=lambda self, pose: {'row': pose.q.x - pose.q.y}, velocity_constraints=lambda self, motion: {'row': motion.u.x_rate}), 0.0, jnp.zeros(2), jnp.zeros(2))": (
-        "constraint name `row` of `Described` is used twice"
-    ),
+    (
+        "jj.accelerations(described(geometric_constraints=lambda self, "
+        "pose: {'row': pose.q.x - pose.q.y}, velocity_constraints=lambda self, "
+        "motion: {'row': motion.u.x_rate}), 0.0, jnp.zeros(2), jnp.zeros(2))"
+    ): ("constraint name `row` of `Described` is used twice"),
 }
 
 TABLE = OPTIONS | SOLVERS | FITS | INERTIAS | IMPOSSIBLE | PLOTTED | SWEEPS | CLASSES

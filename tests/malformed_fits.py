@@ -11,7 +11,13 @@ SWUNG = {"x": 0.3 * np.cos(TS), "x_rate": -0.3 * np.sin(TS)}
 
 def run(**changes):
     """A cart that is pushed, seen at 21 times."""
-    given = {"ts": TS, "values": SWUNG, "sigma": {"x": 0.01, "x_rate": 0.02}, "start": {"x": 0.3, "x_rate": 0.0}, "inputs": {"push": 1.0}} | changes
+    given = {
+        "ts": TS,
+        "values": SWUNG,
+        "sigma": {"x": 0.01, "x_rate": 0.02},
+        "start": {"x": 0.3, "x_rate": 0.0},
+        "inputs": {"push": 1.0},
+    } | changes
     return jj.Experiment(given.pop("ts"), given.pop("values"), given.pop("sigma"), **given)
 
 
@@ -31,7 +37,9 @@ def with_input(push):
 
 cart, gain, command = Cart(), jj.Estimate(1.0), jj.Sampled([0.0, 4.0], [1.0, 1.0])
 together = jj.identification.joint_normal({"mass": 2.0, "stiffness": 5.0}, [[0.01, 0.0], [0.0, 0.01]])
-density = jj.identification.log_density(cart, [run(unknown_start=("x",))] * 2, {"damping": jj.bounds(0.0, 2.0), "stiffness": None})
+density = jj.identification.log_density(
+    cart, [run(unknown_start=("x",))] * 2, {"damping": jj.bounds(0.0, 2.0), "stiffness": None}
+)
 '''
 
 FITS: dict[str, str] = {
@@ -59,9 +67,10 @@ FITS: dict[str, str] = {
         "sigma of channel `x` ... shape (5,)"
     ),
     "jj.fit_batch(cart, run(), 'mass')": "expected (repeats, 21)",
-    "jj.fit_batch(cart, run(values={'x': np.ones((3, 21)), 'x_rate': np.ones((2, 21))}, sigma=1.0), 'mass')": (
-        "hold [2, 3] repeats"
-    ),
+    (
+        "jj.fit_batch(cart, run(values={'x': np.ones((3, 21)), 'x_rate': np.ones((2, 21))}, sigma=1.0), "
+        "'mass')"
+    ): ("hold [2, 3] repeats"),
     "jj.fit(cart, run(values={'x': [0.1, 0.2]}, sigma=1.0, ts=TS[:2]), ('mass', 'damping', 'stiffness'))": (
         "2 measured values cannot determine 3 unknowns"
     ),
@@ -101,12 +110,14 @@ FITS: dict[str, str] = {
     "jj.fit(cart, run(values={'x': np.where(TS[4] == TS, 0.1, np.nan)}, sigma=None), 'mass')": (
         "1 measured values ... 1 unknowns and 1 sigmas"
     ),
-    "jj.fit(cart, run(values={'a': TS}, sigma=1.0, sensors={'a': lambda motion: np.sin(motion.q.x)}), 'mass')": (
-        "write it with `jax.numpy`"
-    ),
-    "jj.fit(cart, run(values={'a': TS}, sigma=1.0, sensors={'a': lambda m: abs(m.q.x) if m.q.x > 0 else 0.0}), 'mass')": (
-        "without `if`"
-    ),
+    (
+        "jj.fit(cart, run(values={'a': TS}, sigma=1.0, "
+        "sensors={'a': lambda motion: np.sin(motion.q.x)}), 'mass')"
+    ): ("write it with `jax.numpy`"),
+    (
+        "jj.fit(cart, run(values={'a': TS}, sigma=1.0, "
+        "sensors={'a': lambda m: abs(m.q.x) if m.q.x > 0 else 0.0}), 'mass')"
+    ): ("without `if`"),
     "run(ts=np.where(TS[4] == TS, np.nan, TS))": "`ts` must be finite and strictly increasing",
     "jj.Experiment(TS[:0], {'x': TS}, 1.0, start={})": "expected a vector of at least one time",
     "run(t0=1.0)": "the start at t0 = 1.0 s comes after the first sample",
@@ -199,7 +210,10 @@ SENSORS: dict[str, str] = {
     "jj.Experiment(TS, {'x': TS}, 1.0, start={}, sensors={'y': 'x'})": (
         "sensor `y` has no measured values; valid names: `x`"
     ),
-    "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), 'mass')": (
+    (
+        "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), "
+        "'mass')"
+    ): (
         "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean"
         " `x_rate`"
     ),
@@ -234,9 +248,10 @@ SENSORS: dict[str, str] = {
     "jj.fit(cart, shown(), {'mass': jj.Estimate((1.0, 2.0))})": (
         "first guess of `mass` has shape (2,), expected ()"
     ),
-    "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.identification.Sensor('x', gain=gain)}, inputs={'push': jj.identification.Actuator(command, gain=gain)}))": (
-        "has a channel and an input `push`, both with an estimated gain; give the channel another name"
-    ),
+    (
+        "jj.fit(cart, run(values={'push': TS}, sigma=1.0, sensors={'push': jj.identification.Sensor('x', "
+        "gain=gain)}, inputs={'push': jj.identification.Actuator(command, gain=gain)}))"
+    ): ("has a channel and an input `push`, both with an estimated gain; give the channel another name"),
 }
 
 NOISE: dict[str, str] = {
@@ -266,9 +281,10 @@ PRIORS: dict[str, str] = {
     "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 2.0], [2.0, 1.0]])": (
         "its correlations have the eigenvalue -1"
     ),
-    "jj.fit(cart, jj.Experiment(TS, {'x': TS}, 0.01, start={'x': 0.3}, unknown_start={'x': together['mass']}, t0=0.0))": (
-        "belongs to one run"
-    ),
+    (
+        "jj.fit(cart, jj.Experiment(TS, {'x': TS}, 0.01, start={'x': 0.3}, "
+        "unknown_start={'x': together['mass']}, t0=0.0))"
+    ): ("belongs to one run"),
 }
 
 DENSITIES: dict[str, str] = {
@@ -296,9 +312,10 @@ INERTIAS: dict[str, str] = {
     "jj.identification.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]))": (
         "not symmetric; give Ixy = Iyx"
     ),
-    "jj.identification.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True)": (
-        "Ixy = 0.1 and Iyz = 0"
-    ),
+    (
+        "jj.identification.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), "
+        "symmetric=True)"
+    ): ("Ixy = 0.1 and Iyz = 0"),
     "jj.identification.inertia_from_log_cholesky([1.0, 2.0, 3.0])": "has shape (3,), expected (6,), or (4,)",
 }
 

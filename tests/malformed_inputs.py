@@ -13,7 +13,13 @@ import diffrax, equinox as eqx, jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.bicycle.parameter_files import read_bicycle
 from jourdain_jax.cli import main
-from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, FreeRigidBody, PendulumChain, TrailerChain
+from jourdain_jax.models import (
+    ChaplyginSleigh,
+    DoublePendulumRods,
+    FreeRigidBody,
+    PendulumChain,
+    TrailerChain,
+)
 from jourdain_jax.models.registry import model
 
 nan, inf = float("nan"), float("inf")
@@ -55,7 +61,9 @@ def answered(**members):
 
 def unchecked(field, value):
     """A load with a field that its own checks would not let pass."""
-    return eqx.tree_at(lambda load: getattr(load, field), jj.Load(), value, is_leaf=lambda x: x is None or x == {})
+    return eqx.tree_at(
+        lambda load: getattr(load, field), jj.Load(), value, is_leaf=lambda x: x is None or x == {}
+    )
 
 
 def held(**rows):
@@ -96,8 +104,12 @@ def verified(scene, **state):
 def rewritten(name, **changes):
     """A trajectory file with some arrays, or entries of its header, changed or (None) left out."""
     header = HEADER | {key: value for key, value in changes.items() if key in HEADER}
-    arrays = ARRAYS | {"header": np.array(json.dumps({key: value for key, value in header.items() if value is not None}))}
-    arrays |= {key.replace("parameter_", "parameter:"): value for key, value in changes.items() if key not in HEADER}
+    arrays = ARRAYS | {
+        "header": np.array(json.dumps({key: value for key, value in header.items() if value is not None}))
+    }
+    arrays |= {
+        key.replace("parameter_", "parameter:"): value for key, value in changes.items() if key not in HEADER
+    }
     np.savez(name, **{key: value for key, value in arrays.items() if value is not None})
     return name
 
@@ -106,7 +118,10 @@ def bicycle(line="", **changes):
     """A measured bicycle's file with a line more, or with values changed."""
     text = RIGID + line
     for name, value in changes.items():
-        text = "".join(f"{name} = {value}\\n" if row.startswith(f"{name} =") else row for row in text.splitlines(keepends=True))
+        text = "".join(
+            f"{name} = {value}\\n" if row.startswith(f"{name} =") else row
+            for row in text.splitlines(keepends=True)
+        )
     with open("mine.txt", "w") as file:
         file.write(text)
     return "mine.txt"
@@ -128,6 +143,7 @@ open("half.npz", "wb").write(WHOLE[: len(WHOLE) // 2])
 open("empty.npz", "wb").close()
 open("text.npz", "w").write("no trajectory")
 from jourdain_jax.bicycle.parameter_files import shipped_bicycles
+
 RIGID = shipped_bicycles()["Rigid"].read_text()
 '''
 
@@ -595,7 +611,10 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(None))": (
         "unknown state form `None`; valid names: `auto`, `minimal`, `full`."
     ),
-    "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, formulation=jj.Formulation('minimal'))": (
+    (
+        "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, "
+        "formulation=jj.Formulation('minimal'))"
+    ): (
         "constraints of `Described` are nonlinear in the speeds, so there is no minimal state; use"
         " jj.Formulation('full')"
     ),

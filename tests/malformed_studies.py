@@ -55,9 +55,10 @@ STUDIES: dict[str, str | tuple[str, str]] = {
     "jj.Study(disc, start={'lean': 0.2}, samples=8)": "nothing varies",
     "by_radius.task(save='everything')": "`save` is 'everything'",
     "by_radius.task(save='trajectories')": "trajectories are kept by `keep_every=1`",
-    "jj.Study(disc, start={'lean': jj.studies.Uniform(0.1, 0.2), 'spin_rate': datetime.date(2020, 1, 1)}, samples=8)": (
-        "start `spin_rate` is a date"
-    ),
+    (
+        "jj.Study(disc, start={'lean': jj.studies.Uniform(0.1, 0.2), 'spin_rate': datetime.date(2020, 1, "
+        "1)}, samples=8)"
+    ): ("start `spin_rate` is a date"),
     "by_radius.task(keep_every=10**30)": (
         "`keep_every` is 1000000000000000000000000000000, expected a whole number"
     ),

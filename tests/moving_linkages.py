@@ -10,7 +10,7 @@ import jourdain_jax as jj
 
 
 def rod_body(x, z, angle, length, mass) -> jj.RigidBody:
-    """A uniform thin rod in the plane y = 0, centred at (x, z) m and turned by `angle` (rad) from the x axis."""
+    """A uniform thin rod in the plane y = 0, centred at (x, z) m, at `angle` (rad) to the x axis."""
     return jj.RigidBody(mass, mass * length**2 / 12 * jnp.ones(3), jnp.stack([x, 0 * x, z]), jj.rot_y(-angle))
 
 

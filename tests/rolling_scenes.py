@@ -162,7 +162,7 @@ class BallInBowl(jj.Scene):
 
 
 class BallInDrum(jj.Scene):
-    """A ball within a cylinder about an upright axis: angle around it, place along it; the gap is built in."""
+    """A ball within an upright cylinder: angle around the axis, place along it; the gap is built in."""
 
     mass: object = jj.parameter(0.7)
     radius: object = jj.parameter(0.05)

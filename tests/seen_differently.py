@@ -1,9 +1,9 @@
 """A scene seen differently: the same motion in other units, from another frame, in other coordinates and
 speeds, its bodies and rows in another order.
 
-    r' = (R r + r_0 + v_0 t)/L        t' = t/T        m' = m/M                                   frame and units
-    q'_k = q_k/d_k + a_k sin(q_{k-1})                 in reversed order                          coordinates
-    u_k = d_k/T (u'_k + b_k cos(q_0 + k) u'_{k-1})                                               speeds
+    r' = (R r + r_0 + v_0 t)/L        t' = t/T        m' = m/M          frame and units
+    q'_k = q_k/d_k + a_k sin(q_{k-1})                 in reversed order coordinates
+    u_k = d_k/T (u'_k + b_k cos(q_0 + k) u'_{k-1})                      speeds
 
 `Seen` hands the engine a scene in the primed quantities and its author the unprimed ones: what the engine
 works out must be the same motion. All of it is data, so that one program serves every way of looking, and the

@@ -38,7 +38,7 @@ START = {name: RUN[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rat
 
 @jax.jit
 def _free_body(yaw, lean, spin, yaw_rate, lean_rate, spin_rate, radius):
-    """The values by name of the free disc, with the contact at the origin, from those of the disc in angles."""
+    """The free disc's values by name, from those of the disc in angles; the contact is at the origin."""
     frame = jj.rot_z(yaw) @ jj.rot_x(lean)
     turned = frame @ jj.rot_y(spin)
     omega = frame @ jnp.array([lean_rate, spin_rate, 0.0]) + jnp.array([0.0, 0.0, yaw_rate])
@@ -150,7 +150,7 @@ def test_the_free_disc_wobbles_along_the_same_path():
 
 
 def test_the_free_disc_nearly_falls_flat_and_rises_again():
-    # 0.02 degrees from flat at t = 0.154 the contact races half round the rim; coordinates in angles would fail there
+    # 0.02 degrees from flat, at t = 0.154, the contact races half round the rim, where angles would fail
     run, theta, turn = rolling_disc.NEAR_FALL, rolling_disc.NEAR_FALL["theta0"], 1e-3
     yaw_rate = turn / np.sin(theta)
     start = _free_body(0.0, theta - np.pi / 2, 0.0, yaw_rate, 0.0, yaw_rate * np.cos(theta), run["radius"])

@@ -1,4 +1,4 @@
-"""The documentation names what is there: public names, pages, files; and reads docstrings as they are meant."""
+"""The documentation names existing things (public names, pages, files), and shows docstrings as meant."""
 
 import importlib.util
 import json

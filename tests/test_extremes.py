@@ -75,7 +75,7 @@ def test_the_derivative_is_that_of_the_largest_value():
 
 
 def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
-    """A particle thrown upwards turns at v^2 / (2 g), between two saved times, and lands between two others."""
+    """A particle thrown upwards turns at v^2 / (2 g) and lands, both between saved times."""
     motion = jj.simulate(Thrown(), {"z": 1.0, "z_rate": 2.0}, t1=0.9, ts=np.linspace(0.0, 0.9, 10), **TIGHT)
     top, landed = 1.0 + 4.0 / 18.0, (2.0 + np.sqrt(22.0)) / 9.0
     assert jnp.nanmax(motion["z"]) < top - 1e-3

@@ -44,7 +44,13 @@ names, ts, slow = json.loads(input())
 
 
 def types(tree):
-    return sorted({str(x.dtype) for x in jax.tree.leaves(tree) if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)})
+    return sorted(
+        {
+            str(x.dtype)
+            for x in jax.tree.leaves(tree)
+            if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)
+        }
+    )
 
 
 def motion_of(scene, start, **options):
@@ -61,7 +67,9 @@ for name in names:
     by_xla = motion_of(scene, state, backend="xla")
     t, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, 4))
     ways = jj.reductions(scene) if slow else ["svd"]
-    solve = jax.jit(jax.vmap(lambda t, q, u: {way: jj.accelerations(scene, t, q, u, reduction=way) for way in ways}))
+    solve = jax.jit(
+        jax.vmap(lambda t, q, u: {way: jj.accelerations(scene, t, q, u, reduction=way) for way in ways})
+    )
     by_reduction = solve(t, q, u)
     middle = by_reduction["svd"].udot
     found[name] = {
@@ -70,12 +78,26 @@ for name in names:
         "result": [int(way.result) for way in (motion, by_xla)] == [result_codes.SUCCESS] * 2,
         "reduction": motion.reduction,
         "operations": jj.lower(scene).operations,
-        "types": types((scene, state, motion, by_xla, motion.energies(), motion.accelerations(), motion.contact_forces(), by_reduction)),
+        "types": types(
+            (
+                scene,
+                state,
+                motion,
+                by_xla,
+                motion.energies(),
+                motion.accelerations(),
+                motion.contact_forces(),
+                by_reduction,
+            )
+        ),
         "warnings": [str(w.message) for w in caught],
         "drift": float(jj.diagnose(motion).energy_drift / motion.energies().kinetic[0]),
         "states": [t.tolist(), q.tolist(), u.tolist()],
         "udot": middle.tolist(),
-        "spread": {way: float(jnp.max(jnp.abs(a.udot - middle)) / (1 + jnp.max(jnp.abs(middle)))) for way, a in by_reduction.items()},
+        "spread": {
+            way: float(jnp.max(jnp.abs(a.udot - middle)) / (1 + jnp.max(jnp.abs(middle))))
+            for way, a in by_reduction.items()
+        },
         "applicable": bool(jnp.all(jnp.stack([a.applicable for a in by_reduction.values()]))),
     }
 
@@ -83,31 +105,45 @@ sleigh = MODELS["chaplygin-sleigh"]()
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     tight = jj.simulate(sleigh, sleigh.example, t1=0.1, rtol=1e-8, atol=1e-8)
-found["tight"] = {"warnings": [str(w.message) for w in caught], "files": [w.filename for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
+found["tight"] = {
+    "warnings": [str(w.message) for w in caught],
+    "files": [w.filename for w in caught],
+    "finite": bool(jnp.all(jnp.isfinite(tight.q))),
+}
 found["few steps"] = motion_of(sleigh, sleigh.example, max_steps=3).message
 try:
-    found["contradiction"] = str(motion_of(MODELS["skate"](), {"heading": 0.0, "x_rate": 1.0, "y_rate": 0.1, "heading_rate": 0.0}).u[0])
+    found["contradiction"] = str(
+        motion_of(MODELS["skate"](), {"heading": 0.0, "x_rate": 1.0, "y_rate": 0.1, "heading_rate": 0.0}).u[0]
+    )
 except ValueError as error:
     found["contradiction"] = str(error)
 
 
 class Beside(jj.Scene):
     "An oscillator, and a particle that goes past far away."
+
     coordinates = jj.coordinates("x far")
 
     def bodies(self, t, q):
-        return {name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x])) for name, x in (("a", q.x), ("b", q.far))}
+        return {
+            name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x])) for name, x in (("a", q.x), ("b", q.far))
+        }
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-1e4 * motion.q.x),)
 
 
-found["far away"] = [motion_of(Beside(), {"x": 1.0, "far": 1e6, "far_rate": 1.0}, backend=way)["far"].tolist() for way in ("auto", "xla")]
+found["far away"] = [
+    motion_of(Beside(), {"x": 1.0, "far": 1e6, "far_rate": 1.0}, backend=way)["far"].tolist()
+    for way in ("auto", "xla")
+]
 
 
 if slow:
+
     class Pushed(jj.Scene):
         "A particle on a wire that is pushed by a record, until it is at 1 m."
+
         mass: float = jj.parameter(2.0, unit="kg")
         coordinates, inputs = jj.coordinates("x"), jj.inputs("push")
 
@@ -120,11 +156,11 @@ if slow:
         def events(self, motion):
             return {"arrived": 1.0 - motion.q.x}
 
-
     def arrival(push, mass=2.0):
         record = jj.Sampled([0.0, 1.0, 3.0], jnp.stack([0 * push, push, push]))
-        return jj.simulate(Pushed(mass), {"x": 0.0}, t1=3.0, rtol=1e-6, atol=1e-6, inputs={"push": record}, work=False)
-
+        return jj.simulate(
+            Pushed(mass), {"x": 0.0}, t1=3.0, rtol=1e-6, atol=1e-6, inputs={"push": record}, work=False
+        )
 
     pushes = jnp.asarray([2.0, 4.0, 8.0])
     of_one = arrival(pushes[0])
@@ -132,11 +168,14 @@ if slow:
         "ways": of_one.reduction,
         "alone": float(of_one.t_end),
         "batch": jax.vmap(lambda push: arrival(push).t_end)(pushes).tolist(),
-        "slopes": jax.vmap(jax.grad(lambda mass, push: arrival(push, mass).t_end), (None, 0))(2.0, pushes).tolist(),
+        "slopes": jax.vmap(jax.grad(lambda mass, push: arrival(push, mass).t_end), (None, 0))(
+            2.0, pushes
+        ).tolist(),
     }
 
     class Twice(jj.Scene):
-        "A particle on a circle, said by two rows that depend on each other on the circle alone, not where rounded coordinates are."
+        "A particle on a circle, by two rows that depend on each other exactly on the circle."
+
         coordinates = jj.coordinates("x y")
 
         def bodies(self, t, q):
@@ -147,15 +186,25 @@ if slow:
             circle = (q.x**2 + q.y**2 - 1.0) / 2
             return {"circle": circle, "once more": (2.0 + q.x + 3.0 * q.y) * circle}
 
-
     round_the_circle = motion_of(Twice(), jj.start(Twice(), x=0.6, x_rate=-0.4))
-    found["circle"] = [jnp.stack([round_the_circle["x"], round_the_circle["y"]]).tolist(), round_the_circle.message]
+    found["circle"] = [
+        jnp.stack([round_the_circle["x"], round_the_circle["y"]]).tolist(),
+        round_the_circle.message,
+    ]
     board = MODELS["snakeboard"]()
-    nowhere = {"steer": jnp.pi / 2, "steer_rate": 0.5, "y_rate": 0.5, "heading_rate": 0.3}  # at parallel rows with a sideways velocity
+    nowhere = {
+        "steer": jnp.pi / 2,
+        "steer_rate": 0.5,
+        "y_rate": 0.5,
+        "heading_rate": 0.3,
+    }  # at parallel rows with a sideways velocity
     ended = jj.simulate(board, nowhere, ts=[0.0, 1.0], rtol=1e-5, atol=1e-5, retry=True)
     found["no motion continues"] = [int(ended.result), int(ended.accepted + ended.rejected)]
     options = {"rtol": 1e-5, "atol": 1e-5}
-    found["far in time"] = [jj.simulate(Beside(), {"x": 1.0}, t0=t0, ts=[t0 + 0.5, t0 + 1.0], **options)["x"].tolist() for t0 in (0.0, 1e4)]
+    found["far in time"] = [
+        jj.simulate(Beside(), {"x": 1.0}, t0=t0, ts=[t0 + 0.5, t0 + 1.0], **options)["x"].tolist()
+        for t0 in (0.0, 1e4)
+    ]
     found["verified"] = str(jj.verify(sleigh, jj.start(sleigh, **sleigh.example)))
 print(json.dumps(found))
 """

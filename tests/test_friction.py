@@ -531,7 +531,7 @@ def test_carts_fall_as_they_may():
 
 
 def test_a_cart_brakes_on_two_runners():
-    """Loads (b + mu h)/w and (w - b - mu h)/w of the weight, b = 0.4, h = 0.5, w = 1 m; it stops as a whole."""
+    """Loads (b + mu h)/w and (w - b - mu h)/w of the weight, b = 0.4, h = 0.5, w = 1 m; all of it stops."""
     motion = jj.simulate(Cart(), {"z": 0.5, "x_rate": 0.6}, ts=[0.1, 0.3], **FINE)
     forces = motion.contact_forces()
     weight = 10 * G

@@ -30,9 +30,11 @@ EVERYTHING = """
         <geom type="capsule" fromto="0 0 0 0.1 0.2 0.4" size="0.03"/>
         <body name="fore-arm" pos="0.1 0.2 0.4" xyaxes="1 0.2 0 0 1 0.1">
           <joint name="elbow" axis="0 1 0.3" stiffness="4" springref="{b}" ref="{a}" range="-{c} {c}"/>
-          <joint name="reach" type="slide" axis="1 0 0" pos="0.3 0 0" stiffness="9" springref="0.1" damping="0.2" ref="0.05"/>
+          <joint name="reach" type="slide" axis="1 0 0" pos="0.3 0 0" stiffness="9" springref="0.1"
+            damping="0.2" ref="0.05"/>
           <geom class="main" type="cylinder" size="0.02 0.15" zaxis="1 1 1"/>
-          <body name="tip" pos="0.2 0 0"><inertial pos="0.01 0.02 0" mass="0.3" diaginertia="0.01 0.012 0.014" quat="1 1 0 0.5"/></body>
+          <body name="tip" pos="0.2 0 0"><inertial pos="0.01 0.02 0" mass="0.3"
+            diaginertia="0.01 0.012 0.014" quat="1 1 0 0.5"/></body>
           <body pos="0 0 0.1"><geom size="0.04"/></body>
           <body pos="0 0.1 0" euler="0 {a} 0">
             <joint axis="0 0 -1" pos="0.1 0 0"/><joint axis="1 0 0"/>
@@ -42,7 +44,8 @@ EVERYTHING = """
       </body>
     </body>
     <body name="apart" pos="2 0 0" zaxis="0 -1 0">
-      <joint name="al-one" type="hinge" axis="0 0 1" ref="{b}"/><geom type="capsule" size="0.1 0.2" pos="0.3 0 0"/>
+      <joint name="al-one" type="hinge" axis="0 0 1" ref="{b}"/>
+        <geom type="capsule" size="0.1 0.2" pos="0.3 0 0"/>
     </body>
   </worldbody>
   <actuator><motor name="pull" joint="reach" gear="3"/><motor joint="elbow"/></actuator>
@@ -173,9 +176,12 @@ def test_several_geoms_are_one_body():
 # a parallelogram: two cranks of 0.3 m on the ground, 0.5 m apart, and a coupler that hangs on the first one
 LINKAGE = """
 <mujoco model="linkage"><compiler angle="radian"/>{option}<worldbody>
-  <body name="first"><joint name="a" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/>
-    <body name="coupler" pos="0 0 -0.3"><joint name="b" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.4"/></body></body>
-  <body name="second" pos="0.5 0 0"><joint name="c" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/></body>
+  <body name="first"><joint name="a" axis="0 1 0"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/>
+    <body name="coupler" pos="0 0 -0.3"><joint name="b" axis="0 1 0"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.4"/></body></body>
+  <body name="second" pos="0.5 0 0"><joint name="c" axis="0 1 0"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/></body>
   <body name="wall" pos="3 0 0"><geom type="mesh" mesh="m"/></body>
 </worldbody><equality>{equality}</equality></mujoco>
 """

@@ -25,22 +25,30 @@ ARM = """
   <link name="first">
     <inertial><origin xyz="0.1 0.2 0.3" rpy="0.3 -0.4 0.5"/><mass value="2"/>
       <inertia ixx="0.1" ixy="0.01" ixz="-0.02" iyy="0.12" iyz="0.005" izz="0.09"/></inertial>
-    <visual><origin xyz="0 0 0.2"/><geometry><box size="0.1 0.2 0.3"/></geometry><material name="m"><color rgba="1 0.5 0 0.5"/></material></visual>
+    <visual><origin xyz="0 0 0.2"/><geometry><box size="0.1 0.2 0.3"/></geometry><material name="m">
+      <color rgba="1 0.5 0 0.5"/></material></visual>
   </link>
-  <link name="frame"><visual><origin xyz="0.01 0 0"/><geometry><sphere radius="0.02"/></geometry></visual></link>
+  <link name="frame"><visual><origin xyz="0.01 0 0"/><geometry><sphere radius="0.02"/></geometry></visual>
+    </link>
   <link name="second">
-    <inertial><origin xyz="0 0.1 0"/><mass value="1.5"/><inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial>
+    <inertial><origin xyz="0 0.1 0"/><mass value="1.5"/>
+      <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial>
     <visual><geometry><cylinder radius="0.05" length="0.4"/></geometry></visual>
   </link>
-  <link name="third"><inertial><mass value="0.5"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <link name="third"><inertial><mass value="0.5"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
   <joint name="turn" type="revolute">
-    <parent link="ground"/><child link="first"/><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><axis xyz="0 1 1"/>
+    <parent link="ground"/><child link="first"/><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/>
+      <axis xyz="0 1 1"/>
     <limit lower="-1" upper="2" effort="5" velocity="3"/><dynamics damping="0.7"/>
   </joint>
-  <joint name="hold" type="fixed"><parent link="first"/><child link="frame"/><origin xyz="0 0 0.4" rpy="0 0 1"/></joint>
-  <joint name="slide" type="prismatic"><parent link="frame"/><child link="second"/><axis xyz="0 0 2"/><limit lower="0" upper="0.5"/></joint>
+  <joint name="hold" type="fixed"><parent link="first"/><child link="frame"/>
+    <origin xyz="0 0 0.4" rpy="0 0 1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="frame"/><child link="second"/><axis xyz="0 0 2"/>
+    <limit lower="0" upper="0.5"/></joint>
   <joint name="follow" type="continuous">
-    <parent link="second"/><child link="third"/><origin xyz="0.3 0 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>
+    <parent link="second"/><child link="third"/><origin xyz="0.3 0 0"/>
+      <mimic joint="slide" multiplier="2" offset="0.1"/>
   </joint>
 </robot>
 """
@@ -162,9 +170,9 @@ def test_a_link_without_mass_may_be_fixed_and_a_joint_be_called_as_a_coordinate_
 
 
 def test_a_robot_on_two_wheels_follows_its_closed_form():
-    # with v, omega of the middle of the axle, mass centre of the platform at -d, half track b, wheels of J,
-    # A:
-    #   (m + 2 mw + 2 J/r^2) vdot + m d omega^2 = (tr + tl)/r,   (I + 2 J b^2/r^2) omegadot - m d v omega = b (tr - tl)/r
+    # v, omega: of the middle of the axle; mass centre of the platform at -d; half track b; wheels of J, A
+    #   (m + 2 mw + 2 J/r^2) vdot + m d omega^2 = (tr + tl)/r
+    #   (I + 2 J b^2/r^2) omegadot - m d v omega = b (tr - tl)/r
     r, b, c, J, A, mw = 0.033, 0.08, 0.0002, 0.000018, 0.00001, 0.03
     platform, lidar, x_platform, x_lidar = 1.2, 0.15, -0.03, -0.05
     m, moment = platform + lidar, platform * x_platform + lidar * x_lidar

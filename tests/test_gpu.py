@@ -41,9 +41,7 @@ def _numbers(name: str, kinds, **options) -> dict[str, np.ndarray]:
 
 
 FEW = (
-    2**19
-    # bytes of a device, of which an eighth is for the steps of all its motions: some slots for each thread, or
-    # one
+    2**19  # bytes of a device, an eighth of which is for the steps of all its motions
 )
 
 
@@ -227,6 +225,7 @@ def test_many_lanes_run_at_once_on_a_gpu():
 
 OF_TWO_DEVICES = """
 import gpu_twin, jax, numpy as np, jourdain_jax as jj
+
 scene, lanes = jj.models.ChaplyginSleigh(), jax.sharding.PartitionSpec("lanes")
 end = lambda speed: jj.simulate(scene, {"x_rate": speed}, ts=[0.1]).q_end[0]
 one, speeds = jax.vmap(jax.value_and_grad(end)), np.linspace(0.4, 0.6, 6)
@@ -236,7 +235,9 @@ with gpu_twin.in_place_of_a_gpu() as launched:
     shared = jax.jit(jax.shard_map(one, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))
     found = jax.block_until_ready(shared(speeds))
     second = jax.block_until_ready(jax.jit(one)(jax.device_put(speeds, jax.devices()[1])))
-    assert len(found[0].devices()) == 2 and second[0].devices() == {jax.devices()[1]} and 3 in launched.values()
+    assert (
+        len(found[0].devices()) == 2 and second[0].devices() == {jax.devices()[1]} and 3 in launched.values()
+    )
 np.testing.assert_array_equal(found, expected)
 np.testing.assert_array_equal(second, expected)
 """

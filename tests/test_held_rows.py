@@ -106,7 +106,7 @@ class Sled(jj.Scene):
 
 
 def closed_sled(holds, t):
-    """Place at t of a sled that turns at 2 rad/s and begins at 1.5 m/s: it slips until yaw is pi, then holds."""
+    """Place at t of a sled that turns at 2 rad/s, begins at 1.5 m/s, slips until yaw is pi, then holds."""
     r = holds / 1.5 / 2.0  # F/(m w)
     slid = jnp.pi / 2
     place = jnp.stack([(1.5 - r) * slid, r])

@@ -16,6 +16,7 @@ import gc
 import sys
 import jourdain_jax as jj
 import jax
+
 assert gc.isenabled() and not gc.get_freeze_count()
 jax.config.update("jax_num_cpu_devices", 3)  # an error where JAX has computed anything
 assert jax.device_count() == 3
@@ -23,7 +24,16 @@ assert jax.device_count() == 3
 disc = jj.models.TiltingDisc()
 assert jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), t1=0.1).result == 0
 jj.clear_caches()  # of what is imported
-left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.studies", "jourdain_jax.views", "jourdain_jax.models.blades"}
+left = {
+    "diffrax",
+    "optimistix",
+    "lineax",
+    "tqdm",
+    "jourdain_jax.analysis",
+    "jourdain_jax.studies",
+    "jourdain_jax.views",
+    "jourdain_jax.models.blades",
+}
 imported = left & sys.modules.keys()
 assert not imported, imported
 from jourdain_jax import fit

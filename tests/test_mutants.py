@@ -47,7 +47,7 @@ from jourdain_jax.structure.trace import named_values
 
 
 def rewritten(function: Callable, right: str, wrong: str) -> Callable:
-    """The function with one piece of its text replaced, without its decorators; that piece must occur once."""
+    """The function with one piece of its text, which must occur once, replaced, without its decorators."""
     text = textwrap.dedent(inspect.getsource(inspect.unwrap(function)))
     assert text.count(right) == 1, (
         f"`{right}` occurs {text.count(right)} times in `{function.__name__}`: this mutant must follow the"

@@ -49,7 +49,7 @@ def _ends(x, backend="native", events=False, **options):
 
 
 def _exact(x, events=False):
-    """x = c + A cos(w t - phase) about c = push/stiffness; the wall is met where the cosine is -(wall + c)/A."""
+    """x = c + A cos(w t - phase) about c = push/stiffness; at the wall the cosine is -(wall + c)/A."""
     w, centre = jnp.sqrt(x[1] / x[0]), x[5] / x[1]
     a, b = x[3] - centre, x[4] / w
 

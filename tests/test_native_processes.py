@@ -23,13 +23,21 @@ pytestmark = machine_code.needed
 OPTIONS = {"ts": [0.2], "rtol": 1e-6, "atol": 1e-6, "backend": "native"}
 FORKED = """
 import os, sys
-import jax; jax.config.update("jax_enable_x64", True)
+import jax
+
+jax.config.update("jax_enable_x64", True)
 import numpy as np
 import jourdain_jax as jj
 
+
 def ends():
     starts = {"lean": np.linspace(0.1, 0.3, 500)}
-    return np.asarray(jj.rollout(jj.models.TiltingDisc(), starts, ts=[0.2], rtol=1e-6, backend="native", progress=False).lanes.q_end)
+    return np.asarray(
+        jj.rollout(
+            jj.models.TiltingDisc(), starts, ts=[0.2], rtol=1e-6, backend="native", progress=False
+        ).lanes.q_end
+    )
+
 
 children = []
 for _ in range(2):  # before JAX begins: no program that uses it may be forked later

@@ -83,7 +83,7 @@ def test_a_limit_cycle_has_its_period_and_multiplier_with_their_derivatives_in_a
 
 
 def test_multipliers_far_apart_keep_their_digits():
-    """`x = -sin(t)/17` from an unstable rest; multipliers exp(+-8 pi). It passes a stop event of the scene."""
+    """`x = -sin(t)/17` from an unstable rest; multipliers exp(+-8 pi). It passes a stop event."""
     orbit = jj.periodic(INVERTED, {"x_rate": 0.0}, 2 * np.pi, pieces=8)
     assert orbit.residual < 1e-12
     assert str(orbit).startswith("no periodic motion found near the guess")
@@ -161,7 +161,7 @@ def test_what_is_asked_wrongly_is_named(said):
 
 
 def test_a_motion_that_is_none_says_so():
-    """A particle that is pushed along never comes back; with a parameter that is no number nothing is found."""
+    """A particle that is pushed along never comes back; a parameter that is NaN gives no result."""
     pushed = on_a_line(lambda size, x, v, t: size * (1 + v**2))
     found = jax.jit(
         jax.vmap(

@@ -1,4 +1,4 @@
-"""Figures of quantities against time: what is drawn is what the motion holds, in the unit that was asked for."""
+"""Figures of quantities against time show the values of the motion, in the requested unit."""
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -37,7 +37,10 @@ def test_the_list_of_slow_tests_names_tests_that_exist():
 
 
 MODULES = r"(?:asynchat|asyncore|distutils|imp|smtpd|pkg_resources)\b"
-OF_JAX = r"(?:abstract_arrays|interpreters\.xla|lib\.xla_bridge|linear_util|tree_(?:flatten|leaves|map|unflatten)|util|xla_computation)\b"
+OF_JAX = (
+    r"(?:abstract_arrays|interpreters\.xla|lib\.xla_bridge|linear_util"
+    r"|tree_(?:flatten|leaves|map|unflatten)|util|xla_computation)\b"
+)
 OF_NUMPY = r"\b(?:jnp\.round_|j?np\.(?:in1d|row_stack|trapz))\b"
 EXPERIMENTAL = r"\bjax\.experimental(?:\.| import )(?:host_callback|maps)\b"
 OF_CORE = r"\bjax\.core(?:\.| import )(?!Tracer\b)"  # it keeps little else that is public

@@ -18,17 +18,21 @@ import jourdain_jax as jj
 URDF = """
 <robot name="arm" version="1.0">
   <material name="dark"><color rgba="0.2 0.2 0.2 1"/><texture filename="a.png"/></material>
-  <link name="ground"><visual name="v"><origin xyz="0 0 1" rpy="0 0 1"/><geometry><box size="1 1 0.1"/></geometry><material name="dark"/></visual></link>
+  <link name="ground"><visual name="v"><origin xyz="0 0 1" rpy="0 0 1"/><geometry><box size="1 1 0.1"/>
+    </geometry><material name="dark"/></visual></link>
   <link name="first">
     <inertial><origin xyz="0.1 0.2 0.3" rpy="0.3 -0.4 0.5"/><mass value="2"/>
       <inertia ixx="0.1" ixy="0.01" ixz="-0.02" iyy="0.12" iyz="0.005" izz="0.09"/></inertial>
     <visual><geometry><cylinder radius="0.05" length="0.4"/></geometry></visual>
   </link>
-  <link name="second"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  <link name="second"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+    </inertial>
     <visual><geometry><sphere radius="0.1"/></geometry></visual></link>
-  <joint name="turn" type="revolute"><parent link="ground"/><child link="first"/><origin xyz="0.1 0 0"/><axis xyz="0 1 1"/>
+  <joint name="turn" type="revolute"><parent link="ground"/><child link="first"/><origin xyz="0.1 0 0"/>
+    <axis xyz="0 1 1"/>
     <limit lower="-1" upper="2" effort="5" velocity="3"/><dynamics damping="0.7" friction="0"/></joint>
-  <joint name="slide" type="prismatic"><parent link="first"/><child link="second"/><axis xyz="0 0 2"/><mimic joint="turn" multiplier="2" offset="0.1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="first"/><child link="second"/><axis xyz="0 0 2"/>
+    <mimic joint="turn" multiplier="2" offset="0.1"/></joint>
 </robot>
 """
 MJCF = """
@@ -39,7 +43,8 @@ MJCF = """
   <worldbody><geom type="box" size="1 1 1" pos="0 0 -1"/>
     <body name="a" pos="0 0 1" euler="0 0 1"><joint name="first" class="heavy" axis="0 1 0" range="-1 1"/>
       <inertial mass="2" pos="0 0 -0.4" diaginertia="0.1 0.1 0.01"/>
-      <body name="b" pos="0 0 -0.8"><joint name="second" axis="0 1 0" stiffness="5" springref="0.3"/><geom name="g" size="0.1" rgba="1 0 0 1"/></body>
+      <body name="b" pos="0 0 -0.8"><joint name="second" axis="0 1 0" stiffness="5" springref="0.3"/>
+        <geom name="g" size="0.1" rgba="1 0 0 1"/></body>
     </body>
     <body name="c"><freejoint name="loose"/><geom size="0.1"/></body>
   </worldbody>

@@ -36,18 +36,14 @@ def possible_tensor(draw: np.random.Generator, thin) -> np.ndarray:
 def tree(seed, legs, joints, tensor):
     """A trunk with legs, each a chain of revolute joints, its links with what `tensor` draws."""
     draw = np.random.default_rng(seed)
-    parts = [
-        "<link"
-        f' name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]]))}</link>'
-    ]
+    moments = np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]])
+    parts = [f'<link name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), moments)}</link>']
     for leg in range(legs):
         names = ["trunk", *(f"l{leg}{k}" for k in range(joints))]
         for k, (parent, name) in enumerate(itertools.pairwise(names)):
             at, axis = draw.normal(size=3) * 0.1, "1 0 0" if k == 0 else "0 1 0"
-            parts.append(
-                "<link"
-                f' name="{name}">{inertial(draw.uniform(0.05, 0.5), 0.03 * draw.normal(size=3), tensor(draw))}</link>'
-            )
+            inside = inertial(draw.uniform(0.05, 0.5), 0.03 * draw.normal(size=3), tensor(draw))
+            parts.append(f'<link name="{name}">{inside}</link>')
             parts.append(
                 f'<joint name="j{leg}{k}" type="revolute"><parent link="{parent}"/><child link="{name}"/>'
             )

@@ -20,7 +20,7 @@ needs_llvmlite = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reaso
 
 @needs_llvmlite
 def test_rows_of_a_large_scene_have_the_derivatives_of_the_scenes_own():
-    """Machine code returns the entries that are not zero: a whole Jacobian goes beyond the end of its stack."""
+    """Machine code returns the nonzero entries: a whole Jacobian goes beyond the end of its stack."""
     scene, generator = jj.models.TrailerChain(trailers=16), np.random.default_rng(0)
     q, u, dq = (jnp.asarray(generator.normal(size=len(scene.coordinate_names))) for _ in range(3))
     inputs = jnp.zeros(len(scene.inputs))

@@ -79,7 +79,7 @@ def test_no_lane_goes_through_a_row_that_is_lost(name, options):
 
 @pytest.mark.parametrize("backend", ["native", "xla"])
 def test_no_step_is_so_long_that_it_misses_the_loss(backend):
-    """Whatever the tolerance and the saved times: a step may begin as far before the loss as it ends behind."""
+    """For any tolerance and saved times: a step may begin as far before the loss as it ends behind."""
     row, speeds = ROWS["speed"]
 
     def code(ts, tolerance):

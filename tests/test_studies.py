@@ -79,7 +79,7 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
 
-def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with_and_what_never_has_a_value_has_no_statistics(
+def test_a_sample_shows_outputs_with_the_name_of_a_start_and_an_output_without_values_has_no_statistics(
     tmp_path,
 ):
     outputs = {"lean": End("lean"), "never": EventTime("fallen")}

@@ -654,9 +654,11 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
     assert digest(output(made(2))) != digest(output(made(3)))
 
 
-PENDULUM = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
-<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="pivot" type="continuous">
-<parent link="base"/><child link="arm"/><axis xyz="{}"/></joint></robot>"""
+PENDULUM = """<robot name="arm"><link name="base"/><link name="arm">
+<inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="pivot" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="{}"/>
+</joint></robot>"""
 
 
 def test_scenes_of_other_tools_count_by_what_they_were_made_from(tmp_path):
@@ -722,8 +724,10 @@ import sys
 import jourdain_jax as jj
 from jourdain_jax.studies import task
 
+
 def spread(motion, allowed=frozenset({"lean", "yaw", "spin", "x"})):
     return motion.q_end[3] - motion.q_end[2] if "lean" in allowed and "q" not in {"a", "b", "c"} else 0.0
+
 
 if __name__ == "__main__":
     study = jj.Study(
@@ -733,7 +737,9 @@ if __name__ == "__main__":
         seed=3,
     )
     outputs = {"lean": jj.studies.End("lean"), "spread": spread}
-    study.run(sys.argv[1], t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, processes=int(sys.argv[2]))
+    study.run(
+        sys.argv[1], t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, processes=int(sys.argv[2])
+    )
 """
 
 

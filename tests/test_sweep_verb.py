@@ -66,13 +66,27 @@ import tomllib
 from jourdain_jax.cli import main
 from jourdain_jax.cli.sweep_verbs import described_study
 
-WRONG = [datetime.date(2020, 1, 1), datetime.datetime(2020, 1, 1, 12), datetime.time(1), 1e30, 10**400, float("nan"), -1, "text", True, [], {}]
+WRONG = [
+    datetime.date(2020, 1, 1),
+    datetime.datetime(2020, 1, 1, 12),
+    datetime.time(1),
+    1e30,
+    10**400,
+    float("nan"),
+    -1,
+    "text",
+    True,
+    [],
+    {},
+]
 WRONG += [[datetime.date(2020, 1, 1)], {"a": {"b": [1]}}, [10**400, 1.0]]
+
 
 def places(x, around=()):
     for key, value in x.items() if isinstance(x, dict) else enumerate(x) if isinstance(x, list) else ():
         yield (*around, key)
         yield from places(value, (*around, key))
+
 
 asked = tomllib.loads(sys.argv[1]) | {"seed": 3, "save": "outputs", "keep_every": 1}
 for *way, last in places(asked):
@@ -87,7 +101,11 @@ for *way, last in places(asked):
             made.task(**{name: x for name, x in how.items() if name != "chunk"})
             print("taken")
         except Exception as error:
-            print("refused" if isinstance(error, ValueError) else f"{way} {last} {value!r:.40}: {type(error).__name__} {error}")
+            print(
+                "refused"
+                if isinstance(error, ValueError)
+                else f"{way} {last} {value!r:.40}: {type(error).__name__} {error}"
+            )
 for file in sys.argv[2:]:
     print(main(["sweep", file, "--quiet"]), file)
 """

@@ -49,7 +49,7 @@ class TwoBlades(jj.Scene):
 
 
 class Slope(OnPlane):
-    """A bead on a slope: level by default, where its place does not matter; a wind across, none by default."""
+    """A bead on a slope, level by default, where its place does not matter; a side wind, none by default."""
 
     mass: float = jj.parameter(2.0, unit="kg", positive=True)
     slope: float = jj.parameter(0.0, unit="1/m")

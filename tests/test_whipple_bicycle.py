@@ -22,7 +22,7 @@ LEAN, STEER = NAMES.index("lean"), NAMES.index("steer")
 
 
 def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
-    """The admissible state with the front wheel rolling at `speed`; the pitch follows from the front contact."""
+    """The admissible state with the front wheel rolling at `speed`; the front contact gives the pitch."""
     q = project_positions(
         bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES])
     )

@@ -52,5 +52,6 @@ def motion(t, *, m1, m2, l1, l2, gravity, th1, th2, th1_rate, th2_rate, t_end=No
     energy = (m1 * (vx1**2 + vy1**2) + m2 * (vx2**2 + vy2**2)) / 2 + gravity * (m1 * y1 + m2 * y2)
     return {
         "th1": p, "th2": q, "th1_rate": u, "th2_rate": v, "x1": x1, "y1": y1, "x2": x2, "y2": y2,
-        "vx1": vx1, "vy1": vy1, "vx2": vx2, "vy2": vy2, "tension1": tension1, "tension2": tension2, "energy": energy,
+        "vx1": vx1, "vy1": vy1, "vx2": vx2, "vy2": vy2,
+        "tension1": tension1, "tension2": tension2, "energy": energy,
     }  # fmt: skip

@@ -15,7 +15,8 @@ PARAMETERS = {
     "w": "1.02", "c": "0.08", "lam": "pi/10", "g": "9.81",
     "rR": "0.3", "mR": "2", "IRxx": "0.0603", "IRyy": "0.12",
     "xB": "0.3", "zB": "-0.9", "mB": "85", "IBxx": "9.2", "IByy": "11", "IBzz": "2.8", "IBxz": "2.4",
-    "xH": "0.9", "zH": "-0.7", "mH": "4", "IHxx": "0.05892", "IHyy": "0.06", "IHzz": "0.00708", "IHxz": "-0.00756",
+    "xH": "0.9", "zH": "-0.7", "mH": "4",
+    "IHxx": "0.05892", "IHyy": "0.06", "IHzz": "0.00708", "IHxz": "-0.00756",
     "rF": "0.35", "mF": "3", "IFxx": "0.1405", "IFyy": "0.28",
 }  # fmt: skip
 BENCHMARK = {key: np.pi / 10 if key == "lam" else float(text) for key, text in PARAMETERS.items()}
