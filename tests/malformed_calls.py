@@ -168,7 +168,7 @@ OPTIONS |= {
     "calls['fit'](ts=TS)": ("TypeError", "each `Experiment` states start, times and inputs"),
     "calls['fit'](retry=True)": ("TypeError", "its motions are compiled"),
     "calls['log_likelihood'](events=False)": ("TypeError", "ends with its last sample"),
-    "calls['Study.run'](parameters=None)": ("TypeError", "what is stored is chosen by `outputs` and `save`"),
+    "calls['Study.run'](parameters=None)": ("TypeError", "`outputs` and `save` choose the stored results"),
     "calls['simulate'](backend='native', solver=diffrax.Heun())": (
         "'native' cannot integrate `ChaplyginSleigh`: the solver is"
     ),
@@ -325,7 +325,7 @@ INERTIAS = {
         "entry 11 of its inertia is made of `moments`, expected one parameter times a constant"
     ),
     "inertia(lambda s: jnp.diag(s.moments) + s.first * crossing(0, 1) + s.second * crossing(0, 2))": (
-        "it has 2 products of inertia and 3 moments that differ"
+        "it has 2 products of inertia and 3 different moments, expected"
     ),
     "inertia(lambda s: jnp.diag(s.moments) + s.moments[0] * crossing(0, 1))": (
         "one parameter serves as a moment and a product"

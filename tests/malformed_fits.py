@@ -120,7 +120,7 @@ FITS: dict[str, str] = {
     ): ("without `if`"),
     "run(ts=np.where(TS[4] == TS, np.nan, TS))": "`ts` must be finite and strictly increasing",
     "jj.Experiment(TS[:0], {'x': TS}, 1.0, start={})": "expected a vector of at least one time",
-    "run(t0=1.0)": "the start at t0 = 1.0 s comes after the first sample",
+    "run(t0=1.0)": "`t0` is 1.0 s, expected at most the time of the first sample",
     "run(unknown_start=('y',))": "unknown start value `y` has no first guess",
     "run(sensors={'place': lambda motion: motion.q.x})": "sensor `place` has no measured values",
     "jj.bounds(2.0, 1.0)": "expected finite numbers low < high",
@@ -218,7 +218,7 @@ SENSORS: dict[str, str] = {
         " `x_rate`"
     ),
     "fitted(delay=0.3)": (
-        "`gyro` of run 0 of `Cart` starts at 0.2 s; minus its delay of up to 0.3 s, this is before the start"
+        "`gyro` of run 0 of `Cart` starts at 0.2 s, with a delay of up to 0.3 s: its first samples are of"
         " of the motion at t0 = 0 s"
     ),
     "fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5)))": (

@@ -268,7 +268,7 @@ def test_report_answers_what_it_cannot_write(fitted, tmp_path):
         fit.report(tmp_path / "fit.pdf")
     with pytest.raises(ValueError, match="expected the fit's"):
         fit.report(tmp_path / "fit.html", [data, data])
-    with pytest.raises(ValueError, match="differ from those of the fit"):
+    with pytest.raises(ValueError, match="are not the data of the fit"):
         fit.report(tmp_path / "fit.html", measured(7))
     with pytest.raises(ValueError, match="computed from the fitted runs"):
         fit.report(tmp_path / "fit.html", profiles=True)
@@ -352,7 +352,7 @@ def test_profiles_answer_wrong_names_and_other_data():
     fit = jj.fit(TRUTH, data := run(), ("offset",))
     with pytest.raises(KeyError, match="`ofset` was not estimated; did you mean `offset`"):
         fit.profiles(data, "ofset")
-    with pytest.raises(ValueError, match="differ from those of the fit"):
+    with pytest.raises(ValueError, match="are not the data of the fit"):
         fit.profiles(run(noise=9))
     with pytest.raises(ValueError, match="expected the fit's"):
         fit.profiles(run(unknown=()))

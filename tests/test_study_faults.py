@@ -275,7 +275,7 @@ def test_an_option_is_not_named_for_the_place_of_a_function_in_memory(tmp_path):
         )
 
     study()
-    with pytest.raises(ValueError, match=r"what differs: options \(`rtol`\); give"):
+    with pytest.raises(ValueError, match=r"different are options \(`rtol`\); give"):
         study(rtol=1e-6)
 
 
@@ -292,7 +292,7 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
 
 
 def test_other_chunks_than_the_study_began_with_are_refused(whole):
-    with pytest.raises(ValueError, match="begun with chunks of 32 lanes"):
+    with pytest.raises(ValueError, match="begun with chunks of 32 samples"):
         run(whole.store.path, chunk=64)
 
 

@@ -1,10 +1,12 @@
 """Differentiable dynamics of holonomic and nonholonomic mechanical systems, by Jourdain's principle of
 virtual power.
 
-Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is set to
-0; asks for at least 16 threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile small
-loops on the CPU into one function each, unless XLA_FLAGS holds `xla_backend_extra_options`. The last two take
-effect if JAX has not computed anything yet.
+Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is 0. If
+JAX has not computed anything yet, it also
+
+- requests at least 16 threads on the CPU, unless PJRT_NPROC or NPROC is set;
+- lets XLA compile a small loop on the CPU into one function, unless XLA_FLAGS holds
+  `xla_backend_extra_options`.
 
 Every name is imported on first use (`__init__.pyi` lists them).
 """

@@ -1,9 +1,9 @@
 """The study of measured bicycles: from parameter files to stability speeds with their uncertainty, and
 simulated rides.
 
-For each file: build the nonlinear Whipple bicycle and linearise it; find weave, capsize and double-root
-speeds; propagate the measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits; and simulate
-hands-free rides below, inside and above the stable range.
+For each file, the nonlinear Whipple bicycle is built and linearised. Its weave, capsize and double-root
+speeds have 2.5 and 97.5 % limits, by Monte Carlo from the measured standard deviations. Hands-free rides are
+simulated below, inside and above the stable range.
 """
 
 import json
@@ -30,8 +30,8 @@ SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; higher speeds count as none
 CAVEAT = (
     "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is the share "
-    "of these samples. Sigmas count as\nindependent, because parameter files contain no covariance; raw "
-    "measurements, `*Measured.txt`, have one, which is used.\nA missing sigma counts as zero. Speeds above "
+    "of these samples.\nSigmas of parameter files count as independent, since these contain no covariance; "
+    "raw measurements, `*Measured.txt`,\ncontain one. A missing sigma counts as zero. Speeds above "
     f"{MAX_SPEED:g} m/s count as none."
 )
 

@@ -144,12 +144,14 @@ def _column(what: str, part: str, numbers: Indices, y: Values) -> PerHanging:
 
 
 def _geometry(y: Values, known: Values, by_table: bool) -> Values:
-    """Return wheelbase, trail and tilt of the steer axis from the lengths a of the rear frame and b of the
-    fork, both across the steer axis, and d between the wheels along it,
+    """Return wheelbase w, trail and tilt lam of the steer axis.
 
         w = (a + b) cos lam + d sin lam
         rR - rF = d cos lam - (a + b) sin lam = sqrt(d^2 + (a + b)^2) cos(lam + atan((a + b) / d))
         trail = (rF sin lam - b) / cos lam
+
+    a, b: lengths of the rear frame and of the fork across the steer axis; d: distance of the wheel centres
+    along it; rR, rF: radii of the wheels.
     """
     if not by_table:
         w, lam, b = y["w"], jnp.deg2rad(90 - y["gamma"]), y["f"]

@@ -112,10 +112,10 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
         bicycle = read_bicycle(shipped_bicycles()["Browser"])
         bicycle.values["c"], bicycle.sigmas["c"]  # trail and its standard deviation, m
 
-    **Raises** ValueError, with file, line and parameter, for an unreadable file; a malformed line; an unknown
-    (with the nearest valid one), repeated or missing name; a value that is not a finite number; a negative
-    sigma; and a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of
-    inertia).
+    **Raises** ValueError, with file, line and parameter, for an unreadable file, a malformed line, a value
+    that is not a finite number, and a negative sigma. Names must be known, complete and without repetition.
+    The bicycle must be possible: radii, masses, wheelbase and gravity are positive, moments of inertia not
+    negative.
     """
     path = Path(files.name_of(path))
     text = read_lines(path)
@@ -173,8 +173,8 @@ def text_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
-    """Yield numbers and content of the lines of a YAML file, in the format of a text file, from the section
-    `values`, or from the whole file if it has none.
+    """Yield numbers and content of the lines of a YAML file, in the format of a text file. The lines are
+    those of the section `values`, or all lines if there is no such section.
     """
     lines = [
         (number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)

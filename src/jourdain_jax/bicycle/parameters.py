@@ -46,6 +46,7 @@ def doubts(values: Mapping[str, float]) -> Sentences:
 
     The inertia matrix of a body should be positive definite, and each principal moment of inertia at most the
     sum of the other two.
+
     **Arguments:** `values`: number for every name of `PARAMETER_NAMES`.
     """
     found = []

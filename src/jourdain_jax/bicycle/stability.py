@@ -279,8 +279,8 @@ def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
 def _widest_stable_range(
     matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Return the widest interval between neighbouring crossing speeds in which all eigenvalues decay, without
-    derivative; NaN if there is none.
+    """Return the ends of the widest interval between neighbouring crossing speeds with only decaying modes,
+    or NaN. They have no derivative.
     """
     matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
     ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))

@@ -20,7 +20,7 @@ from jourdain_jax.calculus.reals import Scalar
 
 
 class ParameterSamples(eqx.Module):
-    """Sampled parameters of one bicycle, in SI units, with marks of the possible ones."""
+    """Sampled parameters of one bicycle, in SI units."""
 
     values: Float[Array, "samples parameters"]  # columns in the order of `PARAMETER_NAMES`
     physical: Bool[Array, " samples"]  # False for a sample with a negative radius, for example

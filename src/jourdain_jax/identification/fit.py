@@ -161,9 +161,9 @@ def fit(
       `free=measured_bicycle("Browser").prior`; for parameters that were measured together, use
       `joint_normal(means, covariance)`. The name of a body, with `possible_inertia()`, frees its moments of
       inertia. Unknowns in `unknown_start`, sensors and actuators of the runs are free as well.
-    - `guesses`: number of first guesses, fitted as a batch: the scene's and the runs', and others on a Latin
-      hypercube over the bounds of all unknowns, or within a factor of five of a `positive()` one. The lowest
-      minimum counts; `Fit.agreeing` is the number of guesses that led to it.
+    - `guesses`: number of first guesses, fitted as a batch. The first is the scene's and the runs'; others
+      lie on a Latin hypercube within the bounds, or within a factor of five of a `positive()` unknown. The
+      lowest minimum counts; `Fit.agreeing` is the number of guesses that led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic
       motions: the runs are fitted in pieces with their own starts, and continuity between them is an
       equation. The objective is unchanged.
@@ -191,8 +191,8 @@ def fit(
     unstable motions. The lower minimum counts; `Fit.grown` is True if it came from growing spans.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals, residuals, the fitted scene, and
-    sentences on undetermined combinations. Given sigmas count as known; if they are None, or under a robust
-    loss, intervals are those of Student's t. An unknown at its bound has a one-sided interval, by profile
+    sentences on undetermined combinations. Given sigmas count as known. Sigmas that are None, and robust
+    losses, give intervals of Student's t. An unknown at its bound has a one-sided interval, by profile
     likelihood. `converged` is False if no minimum was found. Runs of equal structure share one compiled
     program, independent of their number and lengths; time and memory are proportional to the number of runs.
 

@@ -179,8 +179,8 @@ class Design(Printed):
             return np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:
             raise ValueError(
-                f"no quantities have these correlations: the matrix\n{matrix}\nis not positive "
-                "definite; make them smaller"
+                f"these correlations contradict each other: the matrix\n{matrix}\nis not positive "
+                "definite; make some of them smaller"
             ) from None
 
     @property

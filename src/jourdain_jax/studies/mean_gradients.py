@@ -42,8 +42,8 @@ class MeanGradients(Printed):
       number of a distribution, such as "radius.sigma"; "radius.shift" shifts all values of a table or grid by
       the same amount.
     - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the
-      output over that of the number. Standard errors assume independent samples (a Sobol sequence or a Latin
-      hypercube has smaller ones). NaN where the derivative does not exist.
+      output over the unit of the number. Standard errors assume independent samples (a Sobol sequence or a
+      Latin hypercube has smaller ones). NaN where the derivative does not exist.
     - `lanes`: the number of samples of each output; `failed`: the number of failed motions, which are
       omitted; `warnings`: reasons to doubt the numbers.
     """
@@ -176,7 +176,7 @@ def _gathered(
     failed = int(np.sum(ends == -2))
     if failed:
         warned.append(
-            f"{failed} of {len(values)} motions failed and are omitted (`run` would try them in another way)"
+            f"{failed} of {len(values)} motions failed and are omitted (`run` repeats them by another method)"
         )
     if np.unique(ends[ends != -2]).size > 1:
         of_event = np.array([isinstance(output, OfEvent) for output in task.outputs.values()])

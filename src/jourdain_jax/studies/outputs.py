@@ -219,7 +219,7 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
         if not printable or not re.fullmatch(r"[^/\\_.][^/\\]*", name):
             raise ValueError(
                 f"an output is called {shortened(repr(name))}, expected printable text of at most "
-                "200 bytes without `/` and `\\` that begins with neither `_` nor `.`"
+                "200 bytes, without `/` and `\\`, and without `_` or `.` at its beginning"
             )
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
             raise ValueError(

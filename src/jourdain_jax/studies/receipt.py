@@ -46,7 +46,7 @@ class Receipt:
         another error of the reader, for damaged bytes.
         """
         if not content.startswith(_BEGIN) or content != with_checksum(content[:-4]):
-            raise ValueError("the receipt of a chunk is torn")
+            raise ValueError("the receipt of a chunk is incomplete")
         end = content.index(b"\n", len(_BEGIN))
         head, at, arrays = json.loads(content[len(_BEGIN) : end]), end + 1, {}
         for name, dtype, shape in head.pop("arrays"):

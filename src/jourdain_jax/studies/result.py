@@ -170,8 +170,8 @@ class StudyResult(Printed):
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
     def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the histogram, and marks of its cells that extend beyond the grid, in which the position of
-        samples is unknown.
+        """Return the histogram (counts, edges), and whether each cell extends beyond the grid. In such a cell
+        the position of samples is unknown.
         """
         (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
         return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])

@@ -3,8 +3,8 @@ every operation rounded separately.
 
 Sums, quotients and roots are rounded identically everywhere. On some machines, however, compilers fuse a
 product and a sum into one operation with one rounding; `product` prevents this. The normal distribution and
-its inverse are those of Cephes, as in SciPy, with the exponential and the logarithm of fdlibm (errors of at
-most one unit in the last place). One pair of polynomials serves each tail of the inverse (accurate to 3e-15
+its inverse are from Cephes, as in SciPy. The exponential and the logarithm are from fdlibm, with errors of at
+most one unit in the last place. One pair of polynomials serves each tail of the inverse (accurate to 3e-15
 for u > 1e-16, to 1e-13 for u > 1e-22).
 """
 

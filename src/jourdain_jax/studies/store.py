@@ -43,7 +43,7 @@ MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
 @dataclass(frozen=True)
 class Column:
     """One array of a study: its type, its axes after the first (name, length), its value for missing entries,
-    and its attributes. `every`: it stores every so many samples.
+    and its attributes. `every`: the interval of stored samples.
     """
 
     dtype: str

@@ -235,10 +235,10 @@ class Study(Printed):
         chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies with
         other block sizes differ in their last digits.
 
-        Raises ValueError if the folder holds another study, or if its disk or the memory is too small (a
-        sample takes 8 bytes per stored number; at most 2^44 samples by default), MemoryError if it was
-        exceeded, `InUseError` if another process runs the study, and OSError if the folder cannot be written.
-        On Ctrl-C the current chunk is finished and all results are stored; then KeyboardInterrupt is raised.
+        Raises ValueError if the folder holds another study, or if its disk or the memory is too small. A sample
+        takes 8 bytes per stored number; there are at most 2^44 samples by default. Raises MemoryError if the
+        memory was exceeded, `InUseError` if another process runs the study, and OSError if the folder cannot
+        be written. Ctrl-C finishes the current chunk, stores all results, and raises KeyboardInterrupt.
         """
         task = self.task(**what)
         if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:

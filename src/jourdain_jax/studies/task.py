@@ -1,9 +1,9 @@
 """The computation of a study: samples in blocks of a fixed size, each by one `rollout` and one compiled
 program of outputs.
 
-Block b holds samples b B to (b + 1) B - 1, independently of the chunks in which results are stored; the last
-one is padded with copies of its last sample. All blocks run the same compiled programs on arrays of the same
-shapes, so the numbers of a sample do not depend on chunks, order or processes.
+Block b of B samples holds samples b B to (b + 1) B - 1, independently of the chunks in which results are
+stored. The last block is padded with copies of its last sample. All blocks run the same compiled programs on
+arrays of the same shapes, so the numbers of a sample do not depend on chunks, order or processes.
 """
 
 import math

@@ -138,7 +138,7 @@ def _plot_motions(
 
 
 def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
-    """Draw every further name against the first: stable parts solid, others dashed, special points marked."""
+    """Draw all other names against the first: stable parts solid, others dashed, special points as signs."""
     if len(names) < 2:
         raise ValueError(
             "`plot` of a family needs a name for the horizontal axis and at least one for the "

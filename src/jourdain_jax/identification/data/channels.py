@@ -216,8 +216,8 @@ class LoadCell(Instrument):
     Its channel has shape (times, 3): two components along the tangents of the ground, then one along its
     normal, as in `Trajectory.contact_forces`.
 
-    **Raises** ValueError unless `contact` is a name; with a scene, if the contact does not exist or the
-    constraints do not determine its force.
+    **Raises** ValueError unless `contact` is a name. `fit` raises it for a scene without this contact, or if
+    the constraints do not determine its force.
     """
 
     contact: str = static()

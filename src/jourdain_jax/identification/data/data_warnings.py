@@ -56,7 +56,7 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
     if spans:
         yield (
             f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "
-            "repeat that value in its samples, otherwise give more samples, or shorter measurements"
+            "add a sample with that value, otherwise give more samples, or shorter measurements"
         )
     usual = float(np.median(intervals))
     (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # missing intervals

@@ -52,8 +52,8 @@ class Range:
     interval: float = 0.0  # h, s, for a correlation time
 
     def least_size(self, guess: float) -> float:
-        """Return the size of a large change of an unknown near zero: its typical change if there is one, else
-        a hundredth of the first guess or of the width of the range.
+        """Return the size of a large change of an unknown near zero: its typical change, if given; else a
+        hundredth of the first guess, or of the width of the range.
         """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0

@@ -61,8 +61,8 @@ class Experiment(eqx.Module):
       time, both in s: `events={"has_fallen": (1.83, 0.005)}`. The difference between simulated and observed
       time is a residual. Later samples do not count.
 
-    **Raises** ValueError for times that do not increase, infinite values, channels without any value, sigmas
-    that are not positive, names that do not match, more than one event, an event that is not after the start,
+    **Raises** ValueError for times that do not increase, infinite values, channels without values, sigmas
+    that are not positive, and unknown names. Raises it also for several events, an event before the start,
     and samples that may refer to times before the start.
     """
 
@@ -142,8 +142,8 @@ class Experiment(eqx.Module):
     def __check_init__(self):
         if not holds(lambda t0, ts: (t0 <= ts[0]) & (t0 < ts[-1]), self.t0, self.ts):
             raise ValueError(
-                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s) or is not "
-                f"before the last one ({self.ts[-1]} s); give an earlier `t0`"
+                f"`t0` is {self.t0} s, expected at most the time of the first sample ({self.ts[0]} s) and "
+                f"less than the last ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
             raise ValueError(
@@ -216,7 +216,7 @@ Data = Experiment | Sequence[Experiment]
 
 
 def _reals(
-    what: str, given: Mapping, advice: str = "check how it is put together", shape: tuple[()] | None = None
+    what: str, given: Mapping, advice: str = "check its elements", shape: tuple[()] | None = None
 ) -> dict[str, Array | np.ndarray]:
     return {
         name: checked_unless_traced(value, f"{what} `{name}`", shape, advice=advice)

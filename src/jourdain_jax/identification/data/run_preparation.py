@@ -103,9 +103,9 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     first, t0 = float(run.ts[np.argmax(at_times)]), float(run.t0)
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
-            f"channel `{name}` of {where} starts at {first:g} s; minus its delay of up to {latest(delay):g} "
-            f"s, this is before the start of the motion at t0 = {t0:g} s; give an earlier `t0` with the "
-            "start there, or NaN for the first samples"
+            f"channel `{name}` of {where} starts at {first:g} s, with a delay of up to {latest(delay):g} s: "
+            f"its first samples are of times before t0 = {t0:g} s; give an earlier `t0` with its start, "
+            "or NaN for these samples"
         )
 
 

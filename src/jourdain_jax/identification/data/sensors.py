@@ -53,11 +53,11 @@ class Sensor(eqx.Module):
     Each number may be an `Estimate`. By default an estimated lag is positive, and gain and bias are
     unbounded; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, the motion (or, with `shooting`, a piece of it) is computed at equal intervals, at
-    least 64 and none longer than the median interval of the samples. It is interpolated by polynomials of
-    degree 5. For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude.
-    Near a jump J of the slope (a speed under a force that steps) the error is up to 0.26 J h; near a jump J
-    of the second derivative, up to 0.08 J h^2.
+    With a delay or a lag, the motion (with `shooting`, each piece of it) is computed at equal intervals.
+    There are at least 64, none longer than the median interval of the samples. The motion is interpolated by
+    polynomials of degree 5. For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of
+    the amplitude. Near a jump J of the slope, as of a speed under a force that steps, the error is up to 0.26
+    J h. Near a jump J of the second derivative, it is up to 0.08 J h^2.
 
     Under `jit`, where times are unknown, the number of intervals is twice that of the samples: give a first
     sample at or near `t0`.
@@ -109,8 +109,8 @@ class Actuator(eqx.Module):
     The low-pass filter is exact at the samples of the command and linear in between. A held command therefore
     needs a lag of at least one interval. The output ends with the last sample.
 
-    **Raises** ValueError for a command of another type, a `hold` that is neither True nor False, numbers that
-    are not finite, and negative delays or lags.
+    **Raises** ValueError for a command or `hold` of another type, numbers that are not finite, and negative
+    delays or lags.
     """
 
     command: Sampled

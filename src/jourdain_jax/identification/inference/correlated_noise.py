@@ -35,11 +35,10 @@ SHORTEST = 0.1  # in shortest intervals: below this tau, the noise is white
 def chain(
     weight: Float[Entries, "times *rest"], ts: Float[Entries, "times"], xp=np
 ) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Return two arrays for a channel: the index of the previous sample that is not missing (the sample's own
-    index if there is none), and the time since that sample in s.
+    """Return two arrays for a channel: the index of the previous available sample, and the time (s) since it.
 
-    The time is infinite for missing samples and without a predecessor. `weight` is zero for a missing sample.
-    Results have its shape.
+    Without a predecessor, and for missing samples, the index is the sample's own, and the time is infinite.
+    `weight` is zero for a missing sample. Results have its shape.
     """
     index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
     last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)

@@ -16,7 +16,7 @@ _REFUSED = dict.fromkeys(
     ("start", "t0", "t1", "ts", "inputs", "events", "work"),
     "each `Experiment` states start, times and inputs, and its motion ends with its last sample",
 )
-_REFUSED["retry"] = "its motions are compiled, in one way"
+_REFUSED["retry"] = "it computes each motion by one compiled method"
 
 
 def as_fit_options(

@@ -246,12 +246,12 @@ def _in_words(
     if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < close):
         of_own = ["" if abs(e - 1) < close else f"^{e:.3g}" for e in exponents]
         return (
-            f"{text}; determined is "
+            f"{text}; determined is only "
             f"{', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
         )
     moved = np.where(relative, row * values, row)[involved]
     if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < close * abs(moved[0]):
-        return f"{text}; determined is their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
+        return f"{text}; determined is only their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
     return text
 
 

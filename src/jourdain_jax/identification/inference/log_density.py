@@ -229,16 +229,16 @@ def log_density(
     **by_name: Unpack[OptionFields],
 ) -> LogDensity:
     """Return the posterior density of the unknowns of `fit`, as a function of an unconstrained vector, for
-    samplers such as those of BlackJAX and NumPyro.
+    samplers of BlackJAX, NumPyro and others.
 
     **Arguments**
 
     - `scene`, `data`, `free`, `options`, `by_name`: as in `fit`. Unknowns are free parameters, unknown start
       values, estimated numbers of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
     - Priors: `Normal` if an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
-      itself, in the logarithm of a sigma, and in arcsin rho, rho = exp(-h / tau), of an estimated correlation
-      time tau, where h is the shortest interval between samples of its channel. A flat prior without bounds
-      has no integral: if the data do not determine an unknown, the posterior has none either, and a sampler
+      itself, and in the logarithm of a sigma. For a correlation time tau it is flat in arcsin(exp(-h / tau)),
+      where h is the shortest interval between samples of the channel. A flat prior without bounds has no
+      integral: if the data do not determine an unknown, the posterior has no integral either, and a sampler
       diverges.
 
     **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain`

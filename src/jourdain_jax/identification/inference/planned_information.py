@@ -3,9 +3,9 @@
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior
     cov(theta) >= F^-1      (Cramer and Rao)
 
-y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. log det F of some unknowns is
-computed from their block of F^-1, with all others estimated as well. Source: A. C. Atkinson, A. N. Donev and
-R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
+y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. For some of the unknowns, log
+det F follows from their block of F^-1: all others are estimated as well. Source: A. C. Atkinson, A. N. Donev
+and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -123,7 +123,7 @@ def planned_information(
     **Arguments**
 
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and
-      sensors. Their `values` do not matter, except that NaN marks a missing sample.
+      sensors. Their `values` have no effect; NaN marks a missing sample.
     - `free`, `options`, `by_name`: as in `fit`. Start values in `unknown_start` and estimated numbers of
       sensors are unknowns, too, and priors count.
 

@@ -6,7 +6,7 @@ differences between runs.
 
 e: standard error; n: degrees of freedom. q: 97.5 % quantile of the normal distribution, or of Student's t if
 noise is estimated, times the root of the contribution of estimated correlation times and channel weights.
-w: e over the value predicted by F alone, in which sigma is estimated from all samples, without allowing for
+w: e over the standard error that F alone predicts. F estimates sigma from all samples, without allowing for
 the unknowns.
 
 With one channel of unknown sigma, no prior and a linear motion, both are the interval of Student's t of

@@ -223,7 +223,7 @@ def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, st
 
 
 def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
-    about = "For residuals without the correlation of the noise, if that was estimated or given."
+    about = "Residuals are whitened if the correlation time of their noise was estimated or given."
     rows = [
         (
             "channel",
@@ -246,7 +246,7 @@ def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
         if fit.errors == "sigmas":
             allowed = ""
         else:
-            allowed = " Those given here are based on differences between runs, and allow for it."
+            allowed = " The intervals of this fit use differences between runs, which include this effect."
         about = (
             "Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in"
             f" the last column.{allowed} {about}"

@@ -83,7 +83,8 @@ class Fit(Estimates):
 
         - `data`: the fitted runs; their samples are drawn with the prediction, with R^2 = 1 - sum (prediction
           - value)^2 / sum (value - mean)^2. The report shows the share of each run, channel and time span in
-          the information on each unknown: a_k^2 / sum a^2, a = C J', of the variance of the estimate.
+          the information on each unknown. The share of sample k is a_k^2 / sum a^2, with a = C J', the
+          covariance C and the derivatives J.
         - `held_out`: other runs, predicted as by `predict`.
         - `profiles`: True or names, to compute them now; or the result of `profiles`.
         - `units`: channel -> unit, for labels, such as `{"x": "m"}`, since a scene states units only of

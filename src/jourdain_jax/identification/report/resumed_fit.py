@@ -74,7 +74,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
             )
             if here.shape != r.shape or largest(np.nan_to_num(r) - here) >= 0.01:
                 raise ValueError(
-                    "`data` differ from those of the fit (the residuals disagree); give the runs of the fit"
+                    "`data` are not the data of the fit, whose residuals differ; give the runs of the fit"
                 )
     return problem, Minimum.begun(theta, at, "")
 

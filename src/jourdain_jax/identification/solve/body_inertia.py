@@ -158,8 +158,8 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
         )
     if len(there) == 2 or (there and len(seen) < 3):
         what = (
-            f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one"
-            " or three products, and three moments with any"
+            f"it has {len(there)} products of inertia and {len(seen)} different moments, expected no product,"
+            " or one or three products with three different moments"
         )
         raise ValueError(_refusal(scene, name, what))
     found = BodyInertia(name, tuple(entries), tuple(axes), there)
@@ -170,8 +170,8 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
         )
         raise ValueError(
             f"no body of nonzero thickness has the moments of inertia of body `{name}` of "
-            f"`{type(scene).__name__}`, {moments} kg m^2 with its products: principal ones must be positive, "
-            "each less than the sum of the other two; for a flat body, reduce the largest slightly"
+            f"`{type(scene).__name__}`, {moments} kg m^2 with its products: principal moments must be "
+            "positive, each less than the sum of the other two; for a flat body, reduce the largest slightly"
         )
     return found
 

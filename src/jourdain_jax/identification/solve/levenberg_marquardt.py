@@ -90,7 +90,7 @@ class Minimum(ByMember):
         )
 
     def arrived(self, here: Members, done: Flags) -> np.ndarray:
-        """Stop the converged members, and return those that try a step."""
+        """Stop the converged members (`done`), and return all others."""
         self.converged[here[done]], self.going[here[done]] = True, False
         self.steps[here[~done]] += 1
         return here[~done]
@@ -104,7 +104,7 @@ class Minimum(ByMember):
             self.trace[b] = ((what, (*costs, float(self.at.cost[b]))),)
 
     def give_up(self, members) -> None:
-        """Stop members for which no step was found."""
+        """Stop these members, which have found no step."""
         self.stuck[members], self.going[members] = True, False
 
     def lowest(self) -> "Minimum":

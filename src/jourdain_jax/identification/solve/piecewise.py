@@ -296,8 +296,8 @@ class Piecewise(Problem):
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """Return a context in which the objective may be evaluated at other unknowns; on exit the pieces are
-        restored.
+        """Return a context in which the objective can be evaluated at other unknowns. Its exit restores the
+        pieces.
         """
         kept = self.at.of(np.arange(len(self.at.theta)))
         yield

@@ -73,12 +73,12 @@ class MultipleShooting:
       a factor of two to five.
     - `pieces`: number of pieces of each run; give either this or `duration`.
 
-    Use it for motions that are unstable or chaotic over the whole run: the steps are those of an almost
-    linear problem. The objective and its minimum equal those of a fit without `shooting`. Pieces begin at
-    samples; if a sensor has a delay, they overlap by its largest possible value.
+    Use it for motions that are unstable or chaotic over the whole run: over a piece, the problem is almost
+    linear. The objective and its minimum are the same without `shooting`. Pieces begin at samples; if a
+    sensor has a delay, they overlap by its largest possible value.
 
-    **Raises** ValueError unless exactly one of the two is given: a positive finite duration, or at least two
-    pieces. Raises it in `fit` for a run with too few samples.
+    **Raises** ValueError unless either a positive finite duration or at least two pieces are given. `fit`
+    raises it for a run with too few samples.
     """
 
     pieces: int | None = None

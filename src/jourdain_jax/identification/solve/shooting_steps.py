@@ -1,11 +1,10 @@
 """Minimisation of a fit by multiple shooting: first with gaps between pieces, then without.
 
-1. first guesses of nodes from measurements (`first_nodes`)
-2. gaps c_i as residuals of decreasing width, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
-3. c_i = 0 as equations, by sequential quadratic programming with the Gauss-Newton Hessian (generalised
-   Gauss-Newton method):
-   minimise |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), with ds_i = L_i d + g_i;
-   steps are full unless residuals change much
+1. First guesses of nodes come from measurements (`first_nodes`).
+2. Gaps c_i are residuals of decreasing width: minimise F + sum (c_i / width)^2 / 2 by Levenberg-Marquardt.
+3. Gaps are closed, c_i = 0, by sequential quadratic programming with the Gauss-Newton Hessian: minimise
+   |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), where nodes change by
+   ds_i = L_i d + g_i. Steps are full unless residuals change much.
 
 With step 2, all 20 first guesses of a chaotic double pendulum lead to the minimum; without it, 17, 16 and 8
 do (5, 10, 20 s of `bench/identification.py`). A fit has converged if a step changes residuals by at most

@@ -129,11 +129,11 @@ def unknowns_of(
 ) -> Unknowns:
     """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
 
-    A parameter for which `free` has a function of the scene is no unknown but depends on the others (`ties`).
+    If `free` has a function of the scene for a parameter, this parameter depends on the unknowns (`ties`).
     The unknowns of a single run count as shared unless `apart`.
 
     Raises ValueError for unknown names, guesses outside their bounds, a parameter with a value per run,
-    different estimates of a shared number, and if nothing is free.
+    different estimates of a shared number, and a fit without unknowns.
     """
     parameters = {name: about for name, _, about in parameters_of(scene)}
     shared: list[tuple[str, Kind, _Entry]] = []
@@ -314,7 +314,7 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
     elif given is not None:
         raise ValueError(
             f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, "
-            "`Normal(...)`, `Estimate(...)`, None, or, to tie it to other parameters, a function of the scene"
+            "`Normal(...)`, `Estimate(...)`, None, or a function of the scene that gives its value"
         )
     if guess.shape != value.shape:
         raise ValueError(
